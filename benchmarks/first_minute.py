@@ -4,7 +4,7 @@ A fresh virtual environment, the package's own install with `constraints.txt`, f
 and then with PyTorch, sizes and seconds, the largest packages; after each what it can do of the
 README's first commands, in an empty folder with an empty cache, and again. Packages come from the
 registry or from pip's cache; the clock's seconds are those of the machine as it is, shared or not.
-Prints the table of docs/results/first_minute.md.
+Prints the table of docs/results/speed.md.
 """
 
 import os

@@ -40,7 +40,7 @@ def main() -> None:
         )  # fmt: skip
         if told is None or true is None or told.interval is None:
             continue
-        before, after = true.misfits[told.since].rms, true.misfits[-1].rms
+        before, after = true.misfits[told.baseline].rms, true.misfits[-1].rms
         explained, (low, high) = 1 - (after / before) ** 2, told.interval
         holds.append(bool(low <= explained <= high))
         sides.append(explained - told.explained)

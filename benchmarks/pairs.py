@@ -28,7 +28,7 @@ from real_rings import imported, sources
 
 import tmlattice
 from tmlattice import Cause, read_measurement
-from tmlattice.diagnosis.families.dispersion import errors_beside, kicks_astray
+from tmlattice.diagnosis.families.dispersion import errors_beside, fitted_orbit_kicks
 from tmlattice.diagnosis.response import procedure
 from tmlattice.effects import apply
 from tmlattice.errors import TmlatticeError
@@ -53,11 +53,11 @@ KICK = 2e-5
 """rad; of AT's steps, small enough for orbits in proportion to them."""
 
 
-class Known(NamedTuple):
+class DistributedErrors(NamedTuple):
     """What was fitted to the first day: causes, and kicks that only the dispersion has."""
 
     causes: list[Cause]
-    astray: np.ndarray | None
+    orbit_kicks: np.ndarray | None
 
 
 def drawn(ring, rng, null):
@@ -113,7 +113,7 @@ def first_day(ring, measured):
     causes = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
     data = response_data(ring, measured)
     fitted = Predicted(data, errors_beside(data, found.dispersion).with_causes(data, causes))
-    known = Known(causes, kicks_astray(fitted))
+    known = DistributedErrors(causes, fitted_orbit_kicks(fitted))
     model = simulated(ring, known, measured)
     read, told, kicks = as_kicked(measured, model)
     good = stranger(read, told, 1) < STRANGE
@@ -152,12 +152,13 @@ def simulated(ring, known, measured, changes=()):
         rf_step=0.0 if rf is None or rf.orbit is None else rf.step,
     ).measured  # fmt: skip
     made = made.select(monitors=[m.name for m in ring.monitors if m.name in measured.monitors])
-    if known.astray is None:
+    if known.orbit_kicks is None:
         return made.select(monitors=measured.monitors)
     data = response_data(ring, made)
     errors = Errors.none(data).with_causes(data, causes)
     with_kicks, without = (
-        Predicted(replace(data, astray=astray), errors).read for astray in (known.astray, None)
+        Predicted(replace(data, orbit_kicks=orbit_kicks), errors).read
+        for orbit_kicks in (known.orbit_kicks, None)
     )
     more = with_kicks - without
     rf = made.rf

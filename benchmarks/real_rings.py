@@ -204,7 +204,7 @@ def _amounts(found):
             if number not in numbers:
                 numbers.add(number)
                 out[cause.effect][str(cause.element)] = (cause.amount, error)
-    reasons = () if found.reasons is None else found.reasons.reasons
+    reasons = () if found.common_factors is None else found.common_factors.common_factors
     out["shared gradient"] = {
         own.name: (own.amount, own.amount_sigma) for own in reasons if own.kind != "magnet"
     }

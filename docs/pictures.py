@@ -186,8 +186,8 @@ def table(page, first):
 
 
 def tables():
-    """Tables of measured figures as plots: blind cases, steps of PETRA III's response."""
-    head, *rows = table("trajectories.md", "single faults (tier A)")
+    """The table of blind cases as a plot."""
+    head, *rows = table("blind_challenge.md", "single faults (tier A)")
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.8), sharey=True, layout="constrained")
     blocks = [i for i, row in enumerate(rows) if row[0].startswith("signal to noise")]
     for ax, start in zip(axes, blocks, strict=True):
@@ -203,22 +203,6 @@ def tables():
     figure.legend(*axes[0].get_legend_handles_labels(), ncols=5, loc="outside upper center",
                   fontsize="small", frameon=False)  # fmt: skip
     yield "blind-rates", figure
-
-    head, *rows = table("orbit_responses.md", "step")
-    steps = [row for row in rows if "/" in row[2]]
-    figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
-    for k in range(2, len(head)):
-        values = np.array([[float(v) for v in row[k].split("/")] for row in steps])
-        for seed, style in enumerate(("o-", "o:")):
-            label = head[k] if seed == 0 else None
-            ax.plot(values[:, seed], style, ms=3, lw=1, color=f"C{k - 2}", label=label)
-    ax.set_yscale("log")
-    ax.set_ylabel("held-out rms [µm], seeds 1 and 2")
-    names = [row[0].replace(", ", ",\n").replace(" (", "\n(") for row in steps]
-    ax.set_xticks(range(len(steps)), names, rotation=30, ha="right", fontsize=8)
-    ax.grid(alpha=0.25)
-    ax.legend(fontsize="small", frameon=False)
-    yield "petra3-steps", figure
 
 
 MAKERS = (diagnosis, credible, tunes, optics, response, together, report, real_ring, tables)

@@ -9,6 +9,7 @@ import time
 import psutil
 import pytest
 
+import tmlattice
 from tmlattice import batch
 from tmlattice.batch import fingerprint, finished, run_batch
 from tmlattice.errors import TmlatticeError
@@ -128,6 +129,42 @@ def test_a_scheduler_without_its_package_says_how_to_install_it(tmp_path, monkey
         run_batch(dict, cases(a={}), tmp_path, scheduler="tcp://127.0.0.1:9", progress=False)
     found = run_batch(dict, cases(a={"n": 1}, b={"n": 2}), tmp_path, jobs=2, progress=False)
     assert found == {"a": {"n": 1}, "b": {"n": 2}}
+
+
+def test_many_measurements_are_diagnosed_with_one_file_each(tmp_path, small_ring):
+    """On local processes, on a scheduler and here alike; what is done is not done again, but of
+    other data or options; one that cannot be read stops no other."""
+    from distributed import LocalCluster
+
+    for i, name in enumerate(("QD::5", "QF::2")):
+        fault = [tmlattice.Cause("quadrupole_gradient", name, 0.05)]
+        made = tmlattice.simulate(small_ring, fault, shots=4, amplitude=1e-4, noise=1e-6,
+                                  engine="ocelot", seed=i)  # fmt: skip
+        made.write(tmp_path / "shift" / str(i), progress=False)
+    paths = [*sorted((tmp_path / "shift").iterdir()), tmp_path / "nowhere"]
+
+    def run(out, **where):
+        files = batch.diagnose(small_ring, paths, tmp_path / out, progress=False, **where)
+        return {name: json.loads(path.read_text()) for name, path in files.items()}
+
+    local = run("local", jobs=2)
+    assert [local[n]["findings"][0]["element"] for n in "01"] == ["QD::5", "QF::2"]
+    assert "no measurement folder" in local["nowhere"]["error"]
+    with LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        remote = run("remote", scheduler=cluster.scheduler_address)
+    here = run("here", jobs=1)
+    for other in (remote, here):
+        assert [other[n]["findings"] for n in "01"] == [local[n]["findings"] for n in "01"]
+    times = {path: path.stat().st_mtime_ns for path in (tmp_path / "here").iterdir()}
+    run("here", jobs=1)
+    same = [path.stem for path, at in times.items() if path.stat().st_mtime_ns == at]
+    assert sorted(same) == ["0", "1"]  # what failed is tried again
+    (tmp_path / "shift" / "0" / "readings.csv").unlink()
+    again = run("here", jobs=1, seed=1)
+    assert "error" in again["0"]
+    assert again["1"]["provenance"]["seed"] == 1
+    with pytest.raises(TmlatticeError, match="one name"):
+        batch.diagnose(small_ring, [paths[0], tmp_path / "x" / "0"], tmp_path / "twice")
 
 
 def suicidal(case):

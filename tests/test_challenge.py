@@ -17,7 +17,7 @@ from tmlattice.challenge import make, read_case, read_truth, run, score
 from tmlattice.challenge.baselines import baselines
 from tmlattice.challenge.case import Truth, ring_of
 from tmlattice.challenge.figures import calibration, confusion, pulls, summary
-from tmlattice.challenge.oracle import Oracle, judge
+from tmlattice.challenge.oracle import Oracle, evaluate
 from tmlattice.challenge.record import Places, baseline_answer, exact, one_action
 from tmlattice.challenge.score import row_of
 from tmlattice.effects import Cause
@@ -138,7 +138,7 @@ def test_the_oracle_finds_something_in_noise_at_the_stated_rate(tmp_path):
 def test_the_oracle_of_several_causes_is_told_the_others(tmp_path):
     make("C", 1, 2, tmp_path, lattice=LATTICE, effects=EFFECTS, signal=(30, 60), progress=False)
     case, truth = read_case(tmp_path, "0000"), read_truth(tmp_path, "0000")
-    judged = judge((case, truth))
+    judged = evaluate((case, truth))
     assert len(judged["oracles"]) == len(truth.causes) > 1
     for cause, said in zip(truth.causes, judged["oracles"], strict=True):
         assert (cause.effect, cause.element) in {
@@ -408,6 +408,8 @@ def test_a_damaged_result_or_truth_is_told_and_not_fatal(made, tmp_path):
     found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)
     assert found["not_run"] == ["0002"]
     (folder / "cases" / "0002" / "case.json").write_text("[]")
-    done = tmlattice("challenge", "run", folder, "--jobs", 1, "--lattice", LATTICE, cwd=tmp_path)
+    done = tmlattice(
+        "dev", "challenge", "run", folder, "--jobs", 1, "--lattice", LATTICE, cwd=tmp_path
+    )
     assert done.returncode == 1
     assert "case 0002" in done.stdout

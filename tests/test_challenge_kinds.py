@@ -14,7 +14,7 @@ from tmlattice.challenge import kinds, make, read_case, read_truth, run, score
 from tmlattice.challenge.case import Truth
 from tmlattice.challenge.draw import Draw
 from tmlattice.challenge.figures import summary
-from tmlattice.challenge.ideal import weighed
+from tmlattice.challenge.ideal import refitted
 from tmlattice.challenge.kinds import Ruler, problem_of
 from tmlattice.challenge.record import Places
 from tmlattice.challenge.score import row_of
@@ -101,7 +101,7 @@ def test_scoring_again_reads_no_turns(several, monkeypatch):
 
 def test_the_oracle_weighs_the_truth_by_the_full_model(several):
     case, truth = read_case(several, "0000"), read_truth(several, "0000")
-    found = weighed(case, truth)
+    found = refitted(case, truth)
     (cause,) = truth.causes
     at = found.seen.hypotheses.index((cause.effect, cause.element))
     assert found.statistic[at] > found.statistic.max() - 9
@@ -150,7 +150,7 @@ def test_the_supply_of_a_family_of_sextupoles_is_one_change(small_ring, tmp_path
     assert set(case.before) == {"closed_orbit"}
     (one,) = truth.causes
     assert {e.family for e in small_ring.elements if e.kind == "sextupole"} >= {one.element}
-    assert (one.effect, one.element) in weighed(case, truth).seen.hypotheses
+    assert (one.effect, one.element) in refitted(case, truth).seen.hypotheses
     finding = {
         "effect": one.effect, "element": one.element, "s": None,
         "amount": one.amount, "amount_sigma": 0.01, "probability": 1.0, "mass": 1.0,
@@ -223,11 +223,13 @@ def test_kinds_that_make_no_sense_are_a_sentence(tmp_path):
 
 def test_the_command_makes_kinds(tmp_path):
     tmlattice(
-        "challenge", "make", "E", "--kind", "tunes", "--cases", "2", "--out", "e", "--lattice",
-        LATTICE, cwd=tmp_path, check=0,
+        "dev", "challenge", "make", "E", "--kind", "tunes", "--cases", "2", "--out", "e",
+        "--lattice", LATTICE, cwd=tmp_path, check=0,
     )  # fmt: skip
-    tmlattice("challenge", "run", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0)
+    tmlattice(
+        "dev", "challenge", "run", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
+    )
     told = tmlattice(
-        "challenge", "score", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
+        "dev", "challenge", "score", "e", "--jobs", "1", "--lattice", LATTICE, cwd=tmp_path, check=0
     )
     assert "false alarms" in told.stdout

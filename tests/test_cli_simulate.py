@@ -113,8 +113,6 @@ def test_simulate_as_a_process_is_silent_when_asked_and_ends_with_2(tmp_path):
         (["--amplitude", "0"], "--amplitude"),
         (["--amplitude", "1"], "smaller amplitude"),
         (["--engine", "madx"], "--engine"),
-        (["--launch-sigma", "1e-4,1e-4"], "five rms values"),
-        (["--launch-sigma", "1e-4,x,0,0,0"], "five rms values"),
         (["--settings", "wrong.json"], "should be a list"),
         (["--settings", "broken.json"], "not JSON"),
         (["--settings", "three.json"], "3 settings do not fit 6 shots"),

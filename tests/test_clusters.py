@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tmlattice.inference.clusters import (
-    Found,
+    LinearFit,
     Rows,
     _mismatches,
     _of_columns,
     _of_monitors,
-    widened,
+    cluster_robust_errors,
 )
 from tmlattice.inference.normal import normal_equations, solve
 from tmlattice.inference.priors import Group
@@ -42,7 +42,7 @@ def solved(rows, residual, weight):
     normal = normal_equations(residual, weight, *rows)
     size = len(normal.vector)
     found = solve(normal, [Group("all", np.eye(size), 0.1, fixed=True)], rounds=0)
-    return found, Found.of(normal.matrix, found.spread @ found.covariance @ found.spread.T)
+    return found, LinearFit.of(normal.matrix, found.spread @ found.covariance @ found.spread.T)
 
 
 def readings(rows, values):
@@ -53,7 +53,7 @@ def readings(rows, values):
 
 
 @pytest.mark.parametrize("lacking", ["nothing", "columns", "monitors"])
-def test_stated_errors_hold_where_readings_share_what_is_lacking(lacking):
+def test_stated_errors_hold_where_readings_share_model_discrepancy(lacking):
     """Posterior ones are 2.9 times too small there; of real rings up to seven times."""
     rng = np.random.default_rng(4)
     pulls, plain = [], []
@@ -63,7 +63,7 @@ def test_stated_errors_hold_where_readings_share_what_is_lacking(lacking):
         weight = np.full(noise.shape, 1 / np.mean(noise**2))
         residual = readings(rows, truth) + noise
         found, there = solved(rows, residual, weight)
-        sigma = widened(rows, weight, residual - readings(rows, found.values), there)
+        sigma = cluster_robust_errors(rows, weight, residual - readings(rows, found.values), there)
         assert (sigma >= found.sigma * (1 - 1e-9)).all()
         pulls.append(((found.values - truth) / sigma)[-ERRORS:])
         plain.append(((found.values - truth) / found.sigma)[-ERRORS:])
@@ -96,5 +96,5 @@ def test_readings_far_above_their_noise_have_errors_all_the_same(rng):
     noise *= 1e-8
     weight = np.full(noise.shape, 1 / np.mean(noise**2))
     found, there = solved(rows, noise, weight)
-    sigma = widened(rows, weight, noise - readings(rows, found.values), there)
+    sigma = cluster_robust_errors(rows, weight, noise - readings(rows, found.values), there)
     assert (sigma < 20 * found.sigma).all()

@@ -20,7 +20,7 @@ from tmlattice.diagnosis.twin import known_document
 from tmlattice.effects import Cause, apply, find
 from tmlattice.errors import ChoiceError, MeasurementError, TmlatticeError, UnknownNameError
 from tmlattice.files import write_json
-from tmlattice.inference.among import Known
+from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.lattice import save_ring, write_ring
 from tmlattice.lattice.at_file import quiet_at
 from tmlattice.machine.at_engine import AtEngine
@@ -147,7 +147,9 @@ def test_the_rf_frequency_moves_the_energy(small_ring):
 # --- uncertain rings ------------------------------------------------------------------------------
 def posterior(names, rms, mean=None):
     amounts = np.zeros(len(names)) if mean is None else np.asarray(mean)
-    known = Known.usual([("quadrupole_gradient", n) for n in names], {"quadrupole_gradient": rms})
+    known = DistributedErrors.usual(
+        [("quadrupole_gradient", n) for n in names], {"quadrupole_gradient": rms}
+    )
     return replace(known, amounts=amounts)
 
 

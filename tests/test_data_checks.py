@@ -224,11 +224,11 @@ RESPONSE = {
 @pytest.mark.parametrize("name", RESPONSE)
 def test_what_is_wrong_everywhere_in_an_orbit_response_is_named(small_ring, steps, name):
     monitors = [monitor.name for monitor in small_ring.monitors]
-    undone = RESPONSE[name]
-    if undone is None:
+    compensated = RESPONSE[name]
+    if compensated is None:
         data = replace(steps, kicks=1e3 * steps.kicks)
     else:
-        data = assume(steps, [undone], monitors)
+        data = assume(steps, [compensated], monitors)
     (check,) = told(check_data(small_ring, data))
     assert name in check.assume or f"--assume {name}" in check.sentence
     assert check_data(small_ring, data, assumed=check.assume).reported == ()

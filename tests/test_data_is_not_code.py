@@ -204,9 +204,9 @@ def test_an_object_has_a_key_once_and_values_of_its_types(tmp_path, read):
     path.write_text('{"unit": "mm", "unit": "m"}')
     with pytest.raises(TmlatticeError, match="stands twice"):
         read(path, TmlatticeError)
-    path.write_text('{"unit": ["mm"]}')
-    with pytest.raises(TmlatticeError, match="unit is"):
-        check_shape(path, read(path, TmlatticeError), "map", TmlatticeError)
+    path.write_text('{"data": {"unit": ["mm"]}}')
+    with pytest.raises(TmlatticeError, match=r"data\.unit is"):
+        check_shape(path, read(path, TmlatticeError), "machine", TmlatticeError)
 
 
 def test_archives_of_arrays_are_not_compressed(tmp_path, small_ring):
@@ -270,6 +270,6 @@ def test_a_case_runs_no_lattice_that_is_not_named(tmp_path, monkeypatch):
     assert "say --lattice evil.py" in told["0000"]["error"]
     with pytest.raises(TmlatticeError, match="is Python code, which would be run"):
         run(Path("set"), jobs=1, progress=False)
-    done = tmlattice("challenge", "run", "set", "-q", cwd=tmp_path, check=2)
+    done = tmlattice("dev", "challenge", "run", "set", "-q", cwd=tmp_path, check=2)
     assert "say --lattice small_ring.py" in done.stderr
     assert not Path("MARK").exists()

@@ -192,9 +192,7 @@ def test_reference_and_single_shot(folders, tmp_path, schema):
         ([SMALL, "weak", "--background", "quadrupole_roll=a"], "is no rms"),
         ([SMALL, "weak", "--background", "gradient_absolute"], "has no usual size"),
         ([SMALL, "weak", "--background", "nothing=1"], "no effect 'nothing'"),
-        ([SMALL, "weak", "--holdout", "1"], "--holdout"),
         ([SMALL, "weak", "--max-effects", "0"], "--max-effects"),
-        ([SMALL, "weak", "--sequence", "loop"], "no sequence"),
         ([SMALL, "weak", "--json", "/no/such/folder/a.json"], "cannot write"),
     ],
 )

@@ -10,9 +10,9 @@ from tmlattice.beam.model import Model
 from tmlattice.diagnosis.findings import sensitivity
 from tmlattice.effects import CATALOGUE, Cause
 from tmlattice.inference import scan as scanning
+from tmlattice.inference.alternatives import linear_evidence
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import fit
-from tmlattice.inference.rivals import linear_evidence
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.machine import simulate
 from tmlattice.observe.data import of_measurement

@@ -28,10 +28,10 @@ def blocks(page, language):
     return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
-def run(page, place):
-    """Each command of a tutorial, and what it did, in order."""
+def run(page, place, folder="tutorials/"):
+    """Each command of a page, and what it did, in order."""
     said = []
-    for block in blocks(f"tutorials/{page}.md", "sh"):
+    for block in blocks(f"{folder}{page}.md", "sh"):
         for line in block.replace("\\\n", " ").splitlines():
             program, *words = shlex.split(line.removeprefix("$ "), comments=True)
             if program == "tmlattice":
@@ -106,6 +106,39 @@ def test_in_python_too(place, monkeypatch):
     diagnosis = names["diagnosis"]
     (finding,) = diagnosis.findings
     right(finding.recommended_action)
+
+
+def test_objects_of_other_packages(place, monkeypatch):
+    monkeypatch.chdir(place)
+    before = sorted(place.iterdir())
+    names = {}
+    exec("\n".join(blocks("objects.md", "python")), names)
+    (finding,) = names["diagnosis"].findings
+    right(finding.recommended_action)
+    tunes, design = (names[k].get_tune()[:2] for k in ("estimated", "lattice"))
+    assert abs(tunes - design).max() > 1e-3
+    assert names["magnet"] in names["family"]
+    assert names["table"].mux.iloc[-1] == pytest.approx(names["optics"].total_tunes[0])
+    assert sorted(place.iterdir()) == before
+
+
+def test_a_machine_file_from_a_lattice_and_a_file_of_data(place, tmp_path, monkeypatch):
+    """The commands of the page in a folder of their own; its files of TOML are read."""
+    for name in ("ring.mat", "readings.csv"):
+        (tmp_path / name).write_bytes((place / name).read_bytes())
+    said = [done for _, done in run("machine_file", tmp_path, "")]
+    assert [len(done.stderr.splitlines()) for done in said] == [0, 1, 1, 1, 1]
+    assert MAGNET in said[3].stdout
+    assert (tmp_path / "settings" / "settings.csv").exists()
+    for text in blocks("machine_file.md", "toml"):
+        (tmp_path / "other.toml").write_text(text)
+        supplies = package.load_machine_file(tmp_path / "other.toml").supplies
+        assert supplies == tmp_path / "knobs.csv" or supplies[0]["curve"]
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec("\n".join(blocks("machine_file.md", "python")), names)
+    (finding,) = names["diagnosis"].findings
+    right(finding.remedy)
 
 
 def test_what_several_measurements_say_together(place, monkeypatch):

@@ -55,8 +55,8 @@ def test_a_plain_install_simulates_diagnoses_and_reports(tmp_path):
     ("command", "package", "extra"),
     [
         (["tune-fit", SMALL], "torch", "network"),
-        (["study", "tune-fit", SMALL, "--workers", "1"], "torch", "network"),
-        (["reproduce", "lotka-volterra"], "torch", "reproduce"),
+        (["dev", "study", "tune-fit", SMALL, "--jobs", "1"], "torch", "network"),
+        (["dev", "reproduce", "lotka-volterra"], "torch", "reproduce"),
     ],
 )
 def test_a_command_that_needs_an_extra_names_it(tmp_path, command, package, extra):

@@ -13,7 +13,7 @@ from tmlattice import Measurement, TaylorNetwork, fine_tune, one_turn_optics
 from tmlattice.beam.strengths import ring_strengths
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.fitting.experiment import perturbed_ring
-from tmlattice.fitting.many import TurnReadings
+from tmlattice.fitting.map_fit import TurnReadings
 from tmlattice.fitting.study import run_case
 from tmlattice.maps import ring_matrix
 from tmlattice.network import SymplecticNetwork

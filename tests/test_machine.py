@@ -230,7 +230,7 @@ def test_background_that_cannot_be_is_refused(wanted, words):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"shots": 0}, "ask for one at least"),
+        ({"shots": 0}, "give at least one"),
         ({"amplitude": 0.0}, "above 0 m"),
         ({"engine": "madx"}, "no engine 'madx'; there are at and ocelot"),
         ({"noise": -1e-5}, "zero or more"),

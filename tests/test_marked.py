@@ -103,20 +103,21 @@ def test_a_ring_without_monitors_ends_in_the_sentence_that_mends_it(file, tmp_pa
         ["simulate", file, "--out", "day"],
         ["simulate", file, "--kind", "orbit-response", "--out", "day"],
         ["tune-fit", file, "--out", "fit"],
-        ["study", "tune-fit", file, "--out", "study"],
+        ["dev", "study", "tune-fit", file, "--out", "study"],
     ):
         done = tmlattice(*command, cwd=tmp_path, check=2)
         assert "has no monitor; say which" in done.stderr, command
-        assert "--monitors 'BPM*'" in done.stderr
+        assert "monitors = ['BPM*'] in tmlattice.toml" in done.stderr
         assert "such as 'pos'" in done.stderr
     assert list(tmp_path.glob("*/measurement.json")) == []
     ring = load_ring(file)
     for work in (simulate, simulate_response):
         with pytest.raises(LatticeError, match="has no monitor; say which"):
             work(ring)
-    words = [file, "--monitors", "POS", "--shots", 2, "--amplitude", "1e-5"]
-    tmlattice("simulate", *words, "--out", "day", "-q", cwd=tmp_path, check=0)
-    done = tmlattice("info", *words[:3], "--json", "info.json", cwd=tmp_path, check=0)
+    tmlattice("init", file, "--monitors", "POS", "-q", cwd=tmp_path, check=0)
+    words = ["--shots", 2, "--amplitude", "1e-5", "--out", "day", "-q"]
+    tmlattice("simulate", *words, cwd=tmp_path, check=0)
+    done = tmlattice("info", "--json", "info.json", "-q", cwd=tmp_path, check=0)
     assert json.loads((tmp_path / "info.json").read_text())["counts"]["monitor"] == 16
     assert done.stderr == ""  # nothing of AT's own warnings
 
@@ -135,10 +136,12 @@ def test_an_output_does_not_write_over_what_is_read(file, tmp_path):
         done = tmlattice("info", "ring.json", "--json", out, cwd=tmp_path, check=2)
         assert "is read, and would be written over" in done.stderr
         assert copy.read_bytes() == file.read_bytes()
-    words = ["ring.json", "--monitors", "POS", "--amplitude", "1e-5", "--shots", 2]
+    tmlattice("init", "ring.json", "--monitors", "POS", "-q", cwd=tmp_path, check=0)
+    words = ["ring.json", "--amplitude", "1e-5", "--shots", 2]
     tmlattice("simulate", *words, "--out", "day", "-q", cwd=tmp_path, check=0)
-    done = tmlattice("diagnose", *words[:3], "day", "--json", "day/readings.csv",
-                     cwd=tmp_path, check=2)  # fmt: skip
-    assert "is read, and would be written over" in done.stderr
+    for words in (["diagnose", "day"], ["info"]):
+        for out in ("day/readings.csv", "tmlattice.toml", "ring.json")[words == ["info"] :]:
+            done = tmlattice(*words, "--json", out, cwd=tmp_path, check=2)
+            assert "is read, and would be written over" in done.stderr
     tmlattice("info", "ring.json", "--json", "/dev/null", "-q", cwd=tmp_path, check=0)
     assert not (tmp_path / "/dev/null").is_file()

@@ -19,7 +19,7 @@ from tmlattice.diagnosis.families.dispersion import (
     HorizontalKicks,
     VerticalKicks,
     dispersion_by_kicks,
-    kicks_astray,
+    fitted_orbit_kicks,
     patterns_of_kicks,
 )
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
@@ -351,11 +351,11 @@ def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_rin
     differences, to what these are good for."""
     design = ResponseModel(small_ring)
     where = kicking(small_ring, plane)
-    astray = np.zeros((len(small_ring.magnets), 2))
-    astray[where, plane] = 1e-4 * np.random.default_rng(0).standard_normal(len(where))
-    model = ResponseModel(small_ring, astray=astray)
+    orbit_kicks = np.zeros((len(small_ring.magnets), 2))
+    orbit_kicks[where, plane] = 1e-4 * np.random.default_rng(0).standard_normal(len(where))
+    model = ResponseModel(small_ring, orbit_kicks=orbit_kicks)
     more = (model.rf_response() - design.rf_response())[:, plane]
-    made = dispersion_of_kicks(design, 1.0, plane) @ astray[where, plane]
+    made = dispersion_of_kicks(design, 1.0, plane) @ orbit_kicks[where, plane]
     assert np.std(made) > 1e-3
     assert more == pytest.approx(made, abs=2e-3 * np.abs(made).max())  # first order in the kicks
     assert model.path == pytest.approx(design.path, abs=1e-12)  # no orbit
@@ -394,8 +394,11 @@ def test_the_ring_of_a_change_has_the_dispersion_that_was_fitted(small_ring, fam
     where = kicking(small_ring, family.plane)
     design[where, family.plane] = values @ family.patterns(data).kicks
     left = {}
-    for name, astray in (("own", kicks_astray(Predicted(data, errors))), ("design", design)):
-        orbits = response_change(data, errors, data, astray).orbits
+    for name, orbit_kicks in (
+        ("own", fitted_orbit_kicks(Predicted(data, errors))),
+        ("design", design),
+    ):
+        orbits = response_change(data, errors, data, orbit_kicks).orbits
         left[name] = np.std((orbits - fitted)[-1, :, family.plane])
     made = np.std((fitted - without)[-1, :, family.plane])
     assert made > 1e-7

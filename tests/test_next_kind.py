@@ -12,8 +12,8 @@ from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis import next_kind as module
 from tmlattice.diagnosis.kinds import How
 from tmlattice.diagnosis.next_kind import KINDS, minutes_of, next_kind
+from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.rivals import Rival
 from tmlattice.report.next_shot import next_text
 from tmlattice.report.text import to_do
 
@@ -96,7 +96,9 @@ def test_what_a_kind_cannot_see_it_does_not_part(small_ring, tunes):
             point = replace(fit.point, causes=(cause,))
             known = 1e-16 + 0 * fit.covariance  # its amount is not free to take it up
             pair.append(
-                Rival((cause.effect, cause.element), replace(fit, point=point, covariance=known))
+                Alternative(
+                    (cause.effect, cause.element), replace(fit, point=point, covariance=known)
+                )
             )
         separation = module._separation(KINDS[kind](small_ring, asked), tuple(pair))
         assert (separation > 10) is parts

@@ -27,7 +27,7 @@ from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.priors import EVEN
+from tmlattice.inference.priors import LOG_UNIFORM
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -327,7 +327,7 @@ def test_what_the_readings_want_nothing_of_is_no_change():
     slope, noise = 1e3 * rng.normal(size=400), rng.normal(size=400)
     unseen = noise - slope * (slope @ noise) / (slope @ slope)
     problem = SimpleNamespace(
-        amounts=EVEN, first=None, at=lambda causes, start: SimpleNamespace(residual=noise)
+        amounts=LOG_UNIFORM, first=None, at=lambda causes, start: SimpleNamespace(residual=noise)
     )
     changes = SingleChange(SimpleNamespace(problem=problem))
     hypothesis = ("quadrupole_gradient", "any")

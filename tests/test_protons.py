@@ -126,9 +126,9 @@ def test_the_particle_may_be_said(ring, tmp_path):
     silent = replace(ring, mass=ELECTRON_GEV)
     save_ring(silent, tmp_path / "ring.json")
     assert load_ring(tmp_path / "ring.json").mass == ELECTRON_GEV
-    words = ["info", "ring.json", "--json", "info.json"]
     for more, mass in (([], ELECTRON_GEV), (["--particle", "proton"], PROTON_GEV)):
-        done = tmlattice(*words, *more, cwd=tmp_path, check=0)
+        tmlattice("init", "ring.json", *more, "--force", cwd=tmp_path, check=0)
+        done = tmlattice("info", "--json", "info.json", cwd=tmp_path, check=0)
         assert ("particles of 0.938272 GeV" in " ".join(done.stdout.split())) == bool(more)
         assert json.loads((tmp_path / "info.json").read_text())["mass_gev"] == mass
     with pytest.raises(UnknownNameError, match="no particle 'prton'; did you mean 'proton'"):

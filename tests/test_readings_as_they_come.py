@@ -15,7 +15,8 @@ from tmlattice import Cause, read_measurement, simulate
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.importers import Options, bring_in
 from tmlattice.importers.readings import place_of
-from tmlattice.importers.told import Told, read_told
+from tmlattice.importers.told import Told
+from tmlattice.machine_file import load_machine_file
 
 
 @pytest.fixture(scope="module")
@@ -186,16 +187,17 @@ def test_sdds_arrays(small_ring, data, tmp_path):
     same(bring_in([path], Options(ring=small_ring)), data)
 
 
-def test_the_map_says_names_unit_noise_and_what_is_bad(small_ring, data, tmp_path):
+def test_a_machine_file_states_names_unit_noise_and_bad_bpms(small_ring, data, tmp_path):
     alias = {m: f"P{i:02d}" for i, m in enumerate(data.monitors)}
     path = wide(tmp_path / "a.csv", data, lambda m, p: f"{alias[m]}:{p}")
-    with pytest.raises(MeasurementError, match=r"no monitor 'P00'.*--map.*--example"):
+    with pytest.raises(MeasurementError, match=r"no monitor 'P00'.*\[channels\].*--example"):
         bring_in([path], Options(ring=small_ring))
-    names = "\n".join(f"  {alias[m]}: {m}" for m in data.monitors)
-    (tmp_path / "map.yaml").write_text(
-        f"unit: mm\nnoise: 2 um\nnames:\n{names}\nbad: [{data.monitors[2]}, 'P03']\n"
+    names = "\n".join(f'"{alias[m]}" = "{m}"' for m in data.monitors)
+    (tmp_path / "tmlattice.toml").write_text(
+        f'[data]\nunit = "mm"\nnoise = "2 um"\nbad = ["{data.monitors[2]}", "P03"]\n'
+        f"[channels]\n{names}\n"
     )
-    told = read_told(tmp_path / "map.yaml")
+    told = load_machine_file(tmp_path / "tmlattice.toml").told
     brought = bring_in([path], Options(ring=small_ring, told=told))
     own = brought.measurement
     left = [m for i, m in enumerate(data.monitors) if i not in (2, 3)]
@@ -206,7 +208,7 @@ def test_the_map_says_names_unit_noise_and_what_is_bad(small_ring, data, tmp_pat
     assert any("left out as told" in sentence for sentence in brought.assumed)
 
 
-def test_a_map_may_say_that_devices_are_in_beam_order(small_ring, data, tmp_path):
+def test_a_machine_file_may_state_that_devices_are_in_beam_order(small_ring, data, tmp_path):
     ordered = data.in_order_of([m.name for m in small_ring.monitors])
     alias = {m: f"P{i:02d}" for i, m in enumerate(ordered.monitors)}
     path = wide(tmp_path / "a.csv", ordered, lambda m, p: f"{alias[m]}:{p} [mm]")
@@ -217,24 +219,7 @@ def test_a_map_may_say_that_devices_are_in_beam_order(small_ring, data, tmp_path
         bring_in([path], Options(ring=small_ring, told=Told(in_order=True)))
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("colour: red", 'the key "colour"; known are unit, noise, names, bad, columns'),
-        ("unit: inch", 'unit is "inch"; it should be one of "m", "mm", "um"'),
-        ("noise: loud", "noise is 'loud'; give a length"),
-        ("- a\n- b", "should be an object"),
-        ("a: [1", "is no YAML"),
-        ("columns: {bpm: x}", 'columns has the key "bpm"; known are monitor, plane'),
-    ],
-)
-def test_a_wrong_map_is_a_sentence(tmp_path, text, words):
-    (tmp_path / "map.yaml").write_text(text)
-    with pytest.raises(MeasurementError, match=words):
-        read_told(tmp_path / "map.yaml")
-
-
-def test_a_map_with_a_monitor_that_is_not_there(small_ring, data, tmp_path):
+def test_a_channel_of_a_bpm_that_is_not_there(small_ring, data, tmp_path):
     path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m} {p}")
     with pytest.raises(UnknownNameError, match="no monitor 'end_99'; did you mean"):
         bring_in([path], Options(ring=small_ring, told=Told(names={"a": "end_99"})))
@@ -296,7 +281,7 @@ def test_from_templates_to_a_name(tmp_path):
     tmlattice("import", "--example", "--lattice", SMALL, "--out", "ex", cwd=tmp_path, check=0)
     named = set()
     for name, more in (
-        ("readings_wide.csv", ["--map", "ex/map.yaml"]),
+        ("readings_wide.csv", ["--machine", "ex/tmlattice.toml"]),
         ("readings_long.csv", []),
         ("readings.h5", []),
     ):

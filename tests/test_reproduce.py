@@ -1,4 +1,4 @@
-"""`tmlattice reproduce` as a user runs it."""
+"""`tmlattice dev reproduce` as a user runs it."""
 
 import json
 from importlib.resources import files
@@ -24,7 +24,7 @@ def test_table_json_and_figure(system, tmp_path):
     out = tmp_path / "out"
     done = CliRunner().invoke(
         tmlattice,
-        ["reproduce", system, "--small", "--out", str(out), "--json", str(tmp_path / "r.json")],
+        ["dev", "reproduce", system, "--small", "--out", str(out)],
         catch_exceptions=False,
     )
     assert done.exit_code == 0
@@ -34,11 +34,10 @@ def test_table_json_and_figure(system, tmp_path):
     result = json.loads((out / "reproduction.json").read_text())
     schema = files("tmlattice") / "schemas" / "reproduction.schema.json"
     jsonschema.validate(result, json.loads(schema.read_text()))
-    assert result == json.loads((tmp_path / "r.json").read_text())
     assert [entry["system"] for entry in result["systems"]] == [system]
 
 
 def test_an_unknown_system_is_refused():
-    done = CliRunner().invoke(tmlattice, ["reproduce", "pendulums"])
+    done = CliRunner().invoke(tmlattice, ["dev", "reproduce", "pendulums"])
     assert done.exit_code == 2
     assert "pendulum" in done.output

@@ -82,7 +82,7 @@ def test_command_line(tmp_path):
     folder, truth = tmp_path / "response", tmp_path / "truth.json"
     done = run(
         "simulate", SMALL, "--kind", "orbit-response", "--engine", "ocelot", "--corrector", "v1",
-        "--corrector", "generated_a", "--kick", "2e-5", "--seed", "1", "--out", folder,
+        "--corrector", "generated_a", "--seed", "1", "--out", folder,
         "--truth", truth, "--effect", "quadrupole_gradient QF::3 0.01",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -97,7 +97,7 @@ def test_command_line(tmp_path):
 def test_options_of_the_other_kind_are_refused(tmp_path):
     for words, said in (
         (["--kind", "orbit-response", "--shots", "3"], "--shots has no meaning"),
-        (["--kick", "1e-5"], "--kick has no meaning for --kind trajectory"),
+        (["--corrector", "v1"], "--corrector has no meaning for --kind trajectory"),
     ):
         done = run_failing("simulate", SMALL, *words, "--out", tmp_path / "no")
         assert said in done

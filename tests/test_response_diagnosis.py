@@ -33,7 +33,7 @@ from tmlattice.network import TaylorNetwork
 from tmlattice.observe.calibration import calibrated_response, read_calibration
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_noise import Places, learnt_noise
+from tmlattice.observe.response_noise import Places, estimated_noise
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes, twiss
 from tmlattice.report.plain import report_text
@@ -170,11 +170,11 @@ def test_noise_that_nobody_states_is_learnt_from_neighbours(small_ring, rng, noi
     read = orbits + noise * rng.standard_normal(orbits.shape)
     measured = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), monitors, read)
     kicked = np.array([small_ring[name].s for name in names])
-    found = learnt_noise(measured, Places(s, kicked, small_ring.length))[0, 1]
+    found = estimated_noise(measured, Places(s, kicked, small_ring.length))[0, 1]
     assert 0.6 < found / noise < 1.5  # of 16 columns
     both = [name + own for name in monitors for own in ("", " again")]
     twice = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), both, np.repeat(read, 2, axis=1))
-    assert learnt_noise(twice, Places(np.repeat(s, 2), kicked, small_ring.length))[0, 1] == found
+    assert estimated_noise(twice, Places(np.repeat(s, 2), kicked, small_ring.length))[0, 1] == found
 
 
 def test_readings_that_resemble_nothing_are_named_and_left_out(small_ring, measured, rng):

@@ -10,14 +10,14 @@ from tmlattice.diagnosis.families.steps import FAMILIES
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.hierarchical import fit_families
-from tmlattice.diagnosis.response.inconsistent_steps import torn
+from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.outliers import common_modes, messages
 from tmlattice.diagnosis.response.swaps import (
     correctors_back,
-    exchanged,
     monitors_back,
     swapped_monitors,
+    swaps,
 )
 from tmlattice.diagnosis.response.unlike_model import ODD, unlike_model
 from tmlattice.effects import Cause
@@ -150,7 +150,7 @@ def test_a_kick_elsewhere_is_an_orbit(small_ring, clean):
     response[y[3]] *= -1
     response[y[4]] = 0.0
     moved = response_data(small_ring, replace(clean, response=response))
-    assert not torn(fit_families(moved, split, [*FAMILIES[:2], FAMILIES[3]]).state).any()
+    assert not inconsistent(fit_families(moved, split, [*FAMILIES[:2], FAMILIES[3]]).state).any()
 
 
 def test_a_larger_step_is_not_odd(small_ring):
@@ -257,10 +257,10 @@ def test_an_rf_orbit_that_no_monitor_read_is_left_out(small_ring, clean):
 def test_exchanged_neighbours_are_named_and_put_right(small_ring, clean):
     """Pohang: two columns seemed displaced by 1.2 and 1.3 m; 1.68 m lie between them."""
     state = fitted(small_ring, clean)
-    assert exchanged(state) == {}
+    assert swaps(state) == {}
     pair = ("v5", "v6")
     wrong = correctors_back(clean, [pair])
-    assert list(exchanged(fitted(small_ring, wrong))) == [pair]
+    assert list(swaps(fitted(small_ring, wrong))) == [pair]
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
     assert any("v5 and v6" in said for said in found.warnings)
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
@@ -277,7 +277,7 @@ def test_two_that_answer_as_others_should_are_no_strangers(small_ring, clean):
         state = fitted(small_ring, measured)
         assert unlike_model(state).correctors == ()
         assert unlike_model(state, ODD).correctors == ("v5", "v7")
-        assert list(exchanged(state, {"v5", "v7"})) == pairs
+        assert list(swaps(state, {"v5", "v7"})) == pairs
 
 
 def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):

@@ -12,7 +12,7 @@ from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.small_errors import sizes_in, small_errors
 from tmlattice.diagnosis.response.sparse import sparse_fit
 from tmlattice.diagnosis.response.state import begin
-from tmlattice.diagnosis.response.swaps import planes_back, swapped
+from tmlattice.diagnosis.response.swaps import planes_back, swapped_planes
 from tmlattice.effects import background_rms
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.at_engine import AtEngine
@@ -128,9 +128,9 @@ def test_exchanged_planes_of_a_monitor_are_put_back_and_told(small_ring, measure
     """They were a bad monitor, left out without a reason."""
     measured = measured_with(Cause("monitor_swap", "end_6", 1.0))
     data, split = parted(small_ring, measured)
-    assert swapped(begin(data, split)) == ["end_6"]
+    assert swapped_planes(begin(data, split)) == ["end_6"]
     right, split = parted(small_ring, planes_back(measured, ["end_6"]))
-    assert swapped(begin(right, split)) == []
+    assert swapped_planes(begin(right, split)) == []
     result = diagnose(small_ring, measured)
     (found,) = result.findings
     assert (found.effect, found.element, found.verdict) == ("monitor_swap", "end_6", "identified")

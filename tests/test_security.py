@@ -282,14 +282,14 @@ MODULES = (
     "numba", "yaml", "h5py", "concurrent", "distributed", "dask", "torch", "matplotlib",
 )  # fmt: skip
 SIMULATE = ("simulate", "ring.json", "--shots", "66", "--engine", "ocelot", "--jobs", "2", "-q")
-STUDY = ("study", "tune-fit", "ring.json", "--magnets", "2", "--methods", "sparse", "-q")
+STUDY = ("dev", "study", "tune-fit", "ring.json", "--magnets", "2", "--methods", "sparse", "-q")
 COMMANDS = {
     "info": ("info", "ring.py"),
     "diagnose": ("diagnose", "ring.json", "M", "--out", "R"),
     "simulate": (*SIMULATE, "--out", "N", "--force"),
-    "challenge run": ("challenge", "run", "set", "--jobs", "2", "-q"),
-    "study": (*STUDY, "--workers", "2", "--out", "study"),
-    "challenge score": ("challenge", "score", "set", "--jobs", "2", "-q"),
+    "challenge run": ("dev", "challenge", "run", "set", "--jobs", "2", "-q"),
+    "study": (*STUDY, "--jobs", "2", "--out", "study"),
+    "challenge score": ("dev", "challenge", "score", "set", "--jobs", "2", "-q"),
 }
 
 
@@ -300,7 +300,7 @@ def beside(tmp_path_factory):
     (folder / "ring.py").write_bytes(SMALL.read_bytes())
     write_ring(load_ring(SMALL), folder / "ring.json")
     tmlattice("simulate", "ring.json", "--shots", 3, "--out", "M", "-q", cwd=folder, check=0)
-    tmlattice("challenge", "make", "A", "--cases", 2, "--lattice", "ring.json", "--shots", 2,
+    tmlattice("dev", "challenge", "make", "A", "--cases", 2, "--lattice", "ring.json", "--shots", 2,
               "--out", "set", "-q", cwd=folder, check=0)  # fmt: skip
     for module in MODULES:
         (folder / f"{module}.py").write_text(f"open({str(folder / 'MARK')!r}, 'a').write(__file__)")

@@ -78,7 +78,7 @@ def assert_pulls(values):
 def test_amplitudes_tunes_and_noise_hold_their_errors(rng):
     readings, amplitude = signal(rng)
     result = found(readings)
-    assert result.said == ()
+    assert result.warnings == ()
     assert_pulls(pulls(result, amplitude))
     assert_allclose(np.nanmean(np.abs(result.amplitude) / np.abs(amplitude)), 1, rtol=1e-2)
     assert_allclose(result.noise, NOISE, rtol=0.12)  # 1800 readings: 1.7 % each
@@ -162,7 +162,7 @@ def test_bad_monitors_harm_no_other(rng):
     result = found(readings)
     good = [i for i in range(MONITORS) if i not in (2, 6, 8, 10, 12)]
     assert_pulls(pulls(result, amplitude, good))  # that with spikes too
-    said = " ".join(result.said)
+    said = " ".join(result.warnings)
     assert "monitor 'b2' stands still" in said
     assert "more than 8 times the noise off" in said
     assert result.noise[8].min() > 20 * NOISE
@@ -182,8 +182,8 @@ def test_beam_that_is_lost_is_used_until_then(rng):
     assert np.isnan(result.amplitude[1]).all()
     assert np.isnan(result.tune[1]).all()
     assert (result.envelope[0, :, 200:] == 0).all()
-    assert "shot 0: the beam is read for 200 turns of 600" in " ".join(result.said)
-    assert "shot 1: 12 turns are too few for a tune" in " ".join(result.said)
+    assert "shot 0: the beam is read for 200 turns of 600" in " ".join(result.warnings)
+    assert "shot 1: 12 turns are too few for a tune" in " ".join(result.warnings)
     with pytest.raises(TooFewTurnsError, match="no shot has 16 turns"):
         found(readings[[1]])
 
@@ -222,7 +222,7 @@ def test_one_plane_alone(rng):
     result = found(readings)
     assert np.isnan(result.amplitude[:, :, 1]).all()
     assert_pulls(pulls(result, amplitude))
-    assert "no monitor reads y" in " ".join(result.said)
+    assert "no monitor reads y" in " ".join(result.warnings)
 
 
 def test_mode_that_was_not_kicked_is_missing_and_said(rng):
@@ -230,16 +230,16 @@ def test_mode_that_was_not_kicked_is_missing_and_said(rng):
     assert np.isfinite(result.tune[:, 0]).all()
     assert np.isnan(result.tune[:, 1]).all()
     assert np.isnan(result.amplitude[..., 1]).all()
-    assert "no line of the mode nearer to y is seen" in result.said[0]
+    assert "no line of the mode nearer to y is found" in result.warnings[0]
 
 
 def test_tunes_that_are_not_parted_are_said(rng):
     near = found(signal(rng, tunes=(0.2, 0.2 + 1.5 / TURNS), turns=TURNS)[0])
     assert np.isnan(near.amplitude).all()
-    assert "600 turns do not part their lines" in near.said[0]
+    assert "600 turns do not resolve their lines" in near.warnings[0]
     nearer = found(signal(rng, tunes=(0.2, 0.2 + 0.4 / TURNS), turns=TURNS)[0])
-    said = " ".join(nearer.said)
-    assert "do not part" in said or "nearly equal" in said or "is in both planes" in said
+    said = " ".join(nearer.warnings)
+    assert "do not resolve" in said or "nearly equal" in said or "is in both planes" in said
     readings, amplitude = signal(rng, tunes=(0.2, 0.2 + 4 / TURNS))
     assert_pulls(pulls(found(readings), amplitude))
 
@@ -248,7 +248,7 @@ def test_noise_has_no_lines(rng):
     for _ in range(5):
         result = found(NOISE * rng.standard_normal((SHOTS, 200, 20, 2)))
         assert np.isnan(result.tune).all()
-        assert "no betatron line stands above the noise" in result.said[0]
+        assert "no betatron line exceeds the noise" in result.warnings[0]
 
 
 def test_noise_that_is_stated_wrongly_is_said(rng):

@@ -259,7 +259,7 @@ def command(*words):
         ("turn-by-turn", ["--turns", "32", "--shots", "2", "--amplitude", "1e-4"], "readings.csv",
          TurnByTurn),
         ("closed-orbit", ["--shots", "2", "--noise", "1e-6"], "readings.csv", ClosedOrbit),
-        ("dispersion", ["--rf-step", "200", "--one-sided"], "readings.csv", Dispersion),
+        ("dispersion", [], "readings.csv", Dispersion),
         ("tunes", ["--noise", "1e-4"], "tunes.csv", TuneReading),
     ],
 )  # fmt: skip
@@ -293,8 +293,7 @@ def test_command_has_the_kinds_own_defaults(tmp_path, small_ring):
         (["--kind", "tunes", "--turns", "30"], "--turns has no meaning for --kind tunes"),
         (["--kind", "closed-orbit", "--engine", "ocelot"], "--engine has no meaning"),
         (["--particles", "10"], "take it out, or give --kind turn-by-turn"),
-        (["--kind", "turn-by-turn", "--emittance", "1e-9"], "give two emittances in m rad"),
-        (["--kind", "dispersion", "--kick", "1e-4"], "or give --kind orbit-response"),
+        (["--kind", "dispersion", "--corrector", "v1"], "or give --kind orbit-response"),
     ],
 )
 def test_options_of_other_kinds_are_refused(tmp_path, words, said):

@@ -165,7 +165,7 @@ NAN = math.nan
             lambda: Dispersion((RfStep(5e8, 10, 1.0, [[math.inf, 0]]),), ("a",)),
             "an orbit change is infinite",
         ),
-        (lambda: TuneReading([0.1, 0.2]), r"it should be \[shots, 2\]"),
+        (lambda: TuneReading([0.1, 0.2, 0.3]), r"it should be \[shots, 2\]"),
         (lambda: TuneReading([[37.12, 0.2]]), r"37.12 is no fraction of the full tune"),
         (lambda: TuneReading([[0.1, 0.2]], [[0.0, 1e-3]]), "error of the tune is 0"),
         (lambda: TuneReading([[NAN, NAN]]), "every tune is missing"),

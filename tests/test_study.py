@@ -27,12 +27,11 @@ QUICK = {"launch": (1e-4, 0.0, 1e-4, 0.0), "change": -0.02, "noise": 1e-6}
 
 def test_study_prints_writes_and_goes_on(tmp_path):
     command = [
-        "study", "tune-fit", SMALL, "--magnets", "2",
-        "--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--noise", "1e-6", "--epochs", "20",
-        "--methods", "adam,map,sparse", "--json", "study.json", "--workers", "1",
+        "dev", "study", "tune-fit", SMALL, "--magnets", "2",
+        "--change", "-0.02", "--epochs", "20", "--methods", "adam,map,sparse", "--jobs", "1",
     ]  # fmt: skip
     done = tmlattice(*command, cwd=tmp_path, check=0)
-    result = json.loads((tmp_path / "study.json").read_text())
+    result = json.loads((tmp_path / "study-tune-fit" / "study.json").read_text())
     schema = (files("tmlattice") / "schemas" / "study-tune-fit.schema.json").read_text()
     jsonschema.validate(result, json.loads(schema))
     assert list(result["methods"]) == ["adam", "map", "sparse"]
@@ -52,7 +51,7 @@ def test_study_prints_writes_and_goes_on(tmp_path):
     assert tmlattice(*command, "--quiet", cwd=tmp_path, check=0).stdout == ""
     assert kept[3].exists()
     assert {path: path.stat().st_mtime_ns for path in times} == times
-    again = json.loads((tmp_path / "study.json").read_text())
+    again = json.loads((tmp_path / "study-tune-fit" / "study.json").read_text())
     assert [r["abs_dq"] for r in again["results"]] == [r["abs_dq"] for r in result["results"]]
     with pytest.raises(TmlatticeError, match="other options"):
         study_tune_fit(SMALL, ["sparse"], 2, shots=2, folder=folder)

@@ -114,7 +114,7 @@ def test_a_fit_that_leaves_more_than_the_noise_says_so(small_ring):
 def test_one_method_alone_takes_its_own_options(small_ring):
     """`told` knows which magnets may have changed, which no other method asks for."""
     outcome = tune_fit(
-        small_ring, "QD::5", -0.03, launch=(1e-4, 0, 1e-4, 0), noise=1e-6, method="told",
+        small_ring, "QD::5", -0.03, launch=(1e-4, 0, 1e-4, 0), noise=1e-6, methods=["told"],
         candidates=["QD::5", "QD::6"], progress=False,
     )  # fmt: skip
     assert [m.method for m in outcome.methods] == ["told"]

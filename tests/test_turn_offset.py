@@ -8,9 +8,9 @@ import pytest
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.effects import background_rms, find
 from tmlattice.errors import EffectError
-from tmlattice.inference.among import Known, small_errors_of
-from tmlattice.inference.newton import fit, settled
-from tmlattice.inference.rivals import best_start
+from tmlattice.inference.alternatives import best_start
+from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
+from tmlattice.inference.newton import fit, fit_nuisances
 from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.observe.turn_by_turn import many_turns
 
@@ -63,7 +63,7 @@ def test_lines_of_the_model_are_those_that_are_read(small_ring, late):
     """The model at the truth leaves noise; a count that is off by one more leaves far more."""
     measured = simulate_turns(small_ring, [offset(late)], shots=2, turns=400, seed=2).measured
     problem = many_turns(small_ring, measured, {})
-    left = [settled(problem, [offset(n)], problem.first).chi2 for n in (late, late + 1, 0)]
+    left = [fit_nuisances(problem, [offset(n)], problem.first).chi2 for n in (late, late + 1, 0)]
     assert left[0] < 1.5 * problem.freedom
     assert min(left[1:]) > 100 * left[0]
 
@@ -120,8 +120,8 @@ def test_among_small_errors_a_first_guess_is_the_right_turn(small_ring):
     ).measured
     turns = many_turns(small_ring, measured, {})
     everywhere = [(n, p) for n in rms for p in find(n).places(small_ring) if turns.sees((n, p))]
-    known = Known.usual(everywhere, rms)
-    among = small_errors_of(turns, known, turns.first, [offset(1)], learn=False).problem
+    known = DistributedErrors.usual(everywhere, rms)
+    among = fit_distributed_errors(turns, known, turns.first, [offset(1)], learn=False).problem
     start = fit(among, (), among.first)
     assert best_start(among, start, ("monitor_turn_offset", MONITOR)).amount == 1
 

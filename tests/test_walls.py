@@ -14,7 +14,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "tmlattice"
 ORDER = (
     "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
-    "inference", "observe", "diagnosis", "correction", "importers", "fitting", "machine",
+    "inference", "observe", "diagnosis", "correction", "importers", "machine_file", "fitting",
+    "machine",
     "challenge", "systems", "plots", "report", "cli",
 )  # fmt: skip
 BESIDE = {

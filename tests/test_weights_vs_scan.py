@@ -313,8 +313,8 @@ def test_study_names_the_place_by_normalised_gradient(tmp_path):
 
     file = tmp_path / "study.json"
     arguments = [
-        "study", "localisation", str(SMALL), "--cases", "4", "--shots", "2", "--epochs", "20",
-        "--signal-to-noise", "40", "--json", str(file), "--quiet",
+        "dev", "study", "localisation", str(SMALL), "--cases", "4", "--shots", "2", "--epochs",
+        "20", "--signal-to-noise", "40", "--json", str(file), "--quiet",
     ]  # fmt: skip
     done = CliRunner().invoke(tmlattice, arguments, catch_exceptions=False)
     assert done.exit_code == 0, done.output

@@ -19,7 +19,9 @@ from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import write_measurement
 from tmlattice.optics import ring_tunes
 
-FORMATS = ("ring.json", "ring.at.json", "ring.madx", "ring.seq", "ring.py")
+FORMATS = ("ring.json", "ring.at.json", "ring.xsuite.json", "ring.madx", "ring.seq", "ring.py")
+NUMBERED = (".xsuite.json", ".madx", ".seq")
+"""Formats of definitions, in which members of a family that differ have names of their own."""
 FOREIGN = FORMATS[1:]
 
 
@@ -36,7 +38,7 @@ def uneven(small_ring):
 
 @pytest.mark.parametrize("file", FORMATS)
 def test_ring_that_is_read_back_has_the_same_maps(uneven, file, tmp_path):
-    assert write_ring(uneven, tmp_path / file) == () or file.endswith((".madx", ".seq"))
+    assert write_ring(uneven, tmp_path / file) == () or file.endswith(NUMBERED)
     back = load_ring(tmp_path / file)
     assert back.energy == uneven.energy
     assert [e.kind for e in back.elements] == [e.kind for e in uneven.elements]
@@ -129,18 +131,33 @@ def test_errors_that_a_format_can_say_are_written(small_ring, file, tmp_path):
 @pytest.mark.parametrize("file", FOREIGN)
 def test_errors_that_a_format_has_no_place_for_are_told(small_ring, file, tmp_path):
     causes = [
-        Cause("quadrupole_offset_x", "QF::3", 1e-4),
+        Cause("corrector_position", "v5", 0.02),
         Cause("gradient_absolute", "QD::5", 4e-3),
     ]
     told = write_ring(apply(small_ring, causes), tmp_path / file)
-    assert any("dx of QF::3" in sentence for sentence in told)
+    assert any("ds of v5 cannot be written" in sentence for sentence in told)
     assert any("thin gradients in the middle of QD::5" in sentence for sentence in told)
     back = load_ring(tmp_path / file)
     magnet = small_ring["QD::5"]
-    name = "qd..5" if file.endswith((".madx", ".seq")) else "QD::5"
+    name = "qd..5" if file.endswith(NUMBERED) else "QD::5"
     assert back[name].k1 == pytest.approx(magnet.k1 + 4e-3 / magnet.length)
     assert write_ring(apply(small_ring, causes), tmp_path / "own.json") == ()
-    assert load_ring(tmp_path / "own.json")["QF::3"].errors.dx == 1e-4
+    assert load_ring(tmp_path / "own.json")["v5"].errors.ds == 0.02
+
+
+@pytest.mark.parametrize("file", FOREIGN)
+def test_misalignments_are_written(small_ring, file, tmp_path):
+    causes = [
+        Cause("quadrupole_offset_x", "QF::3", 1e-4),
+        Cause("quadrupole_offset_y", "QD::7", -2e-4),
+        Cause("sextupole_offset_x", "sf::6", 5e-4),
+    ]
+    ring = apply(small_ring, causes)
+    write_ring(ring, tmp_path / file)
+    back = load_ring(tmp_path / file)
+    orbits = [Chain.from_ring(r).closed_orbit()[0] for r in (ring, back)]
+    assert np.abs(orbits[0]).max(0)[[0, 2]].min() > 1e-4
+    np.testing.assert_allclose(orbits[1], orbits[0], rtol=0, atol=1e-12)
 
 
 def test_skew_gradient_of_a_quadrupole_is_written_as_its_tilt(small_ring, tmp_path):

@@ -56,6 +56,7 @@ from typing import TYPE_CHECKING, Any
 from tmlattice.version import __version__
 
 if TYPE_CHECKING:
+    from tmlattice import batch as batch
     from tmlattice import challenge as challenge
     from tmlattice import correction as correction
     from tmlattice import diagnosis as diagnosis
@@ -86,17 +87,26 @@ if TYPE_CHECKING:
     from tmlattice.fitting import tune_fit as tune_fit
     from tmlattice.harmonics import Tunes as Tunes
     from tmlattice.harmonics import tunes as tunes
+    from tmlattice.importers import import_data as import_data
     from tmlattice.importers import read_measurement as read_measurement
     from tmlattice.lattice import Element as Element
     from tmlattice.lattice import Ring as Ring
     from tmlattice.lattice import load_ring as load_ring
+    from tmlattice.lattice import save_ring as save_ring
     from tmlattice.machine import Machine as Machine
     from tmlattice.machine.simulate import simulate as simulate
+    from tmlattice.machine_file import MachineFile as MachineFile
+    from tmlattice.machine_file import load_machine_file as load_machine_file
     from tmlattice.maps import TaylorMap as TaylorMap
     from tmlattice.maps import element_map as element_map
     from tmlattice.maps import ring_maps as ring_maps
+    from tmlattice.measurement import ClosedOrbit as ClosedOrbit
+    from tmlattice.measurement import Dispersion as Dispersion
     from tmlattice.measurement import Measurement as Measurement
     from tmlattice.measurement import OrbitResponse as OrbitResponse
+    from tmlattice.measurement import RfStep as RfStep
+    from tmlattice.measurement import TuneReading as TuneReading
+    from tmlattice.measurement import TurnByTurn as TurnByTurn
     from tmlattice.measurement import write_measurement as write_measurement
     from tmlattice.network import TaylorNetwork as TaylorNetwork
     from tmlattice.network import symplectic_penalty as symplectic_penalty
@@ -104,6 +114,7 @@ if TYPE_CHECKING:
     from tmlattice.optics import off_momentum as off_momentum
     from tmlattice.optics import one_turn_optics as one_turn_optics
     from tmlattice.optics import twiss as twiss
+    from tmlattice.report.compare import compare as compare
 
 _HOME = {
     "correction": ["Correction", "correct"],
@@ -112,12 +123,23 @@ _HOME = {
     "errors": ["TmlatticeError"],
     "harmonics": ["Tunes", "tunes"],
     "fitting": ["FitResult", "TuneFit", "fine_tune", "tune_fit"],
-    "importers": ["read_measurement"],
-    "lattice": ["Element", "Ring", "load_ring"],
+    "importers": ["import_data", "read_measurement"],
+    "lattice": ["Element", "Ring", "load_ring", "save_ring"],
     "machine": ["Machine", "simulate"],
+    "machine_file": ["MachineFile", "load_machine_file"],
     "maps": ["TaylorMap", "element_map", "ring_maps"],
-    "measurement": ["Measurement", "OrbitResponse", "write_measurement"],
+    "measurement": [
+        "ClosedOrbit",
+        "Dispersion",
+        "Measurement",
+        "OrbitResponse",
+        "RfStep",
+        "TuneReading",
+        "TurnByTurn",
+        "write_measurement",
+    ],
     "network": ["TaylorNetwork", "symplectic_penalty"],
+    "report.compare": ["compare"],
     "optics": ["Optics", "off_momentum", "one_turn_optics", "twiss"],
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
@@ -125,7 +147,7 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 _ROOMS = (
     "lattice", "maps", "effects", "beam", "optics", "network", "harmonics", "measurement",
     "inference", "observe", "diagnosis", "correction", "importers", "fitting", "machine",
-    "challenge", "systems", "plots", "report", "errors",
+    "challenge", "systems", "plots", "report", "errors", "batch",
 )  # fmt: skip
 
 __all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604  (they are strings)

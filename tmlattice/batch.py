@@ -2,18 +2,22 @@
 
 Every case has a JSON file of its own, which appears when the case is done. A second run does what
 is missing, and what has failed, again.
+
+>>> files = diagnose("ring.json", Path("shift").iterdir(), "found", jobs=4)
+>>> files = diagnose("ring.json", Path("shift").iterdir(), "found", scheduler="tcp://HOST:8786")
 """
 
 import hashlib
 import logging
 import os
+import pickle
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm.auto import tqdm
 
@@ -21,6 +25,9 @@ from tmlattice.errors import TmlatticeError, missing_package
 from tmlattice.files import OutputError, output_file, write_json
 from tmlattice.input_files import json_of
 from tmlattice.workers import Caught, Processes, caught, heard
+
+if TYPE_CHECKING:
+    from tmlattice.lattice import Ring
 
 log = logging.getLogger(__name__)
 
@@ -32,8 +39,90 @@ PATIENCE = 60.0
 Work = Callable[[Any], dict[str, Any]]
 
 
-def finished(folder: Path) -> dict[str, dict[str, Any]]:
-    """The results that are there, by case; failed ones have a key "error"."""
+def diagnose(
+    ring: "Ring | str | Path",
+    measurements: Mapping[str, Any] | Iterable[str | Path],
+    folder: str | Path,
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: bool = True,
+    **options: Any,
+) -> dict[str, Path]:
+    """Diagnose many measurements of one ring, each by itself, with one result file each.
+
+    What is there already, of the same ring, data, options and version, is not done again. No more
+    measurements and results are in memory than the workers need.
+
+    Args:
+        ring: the design, a built-in name, or a path.
+        measurements: paths of measurement folders or files of readings; or by name, paths or
+            measurements. Of a path the last part is the name.
+        folder: of the results: NAME.json, as `Diagnosis.as_json` makes it.
+        jobs, scheduler, progress: see `run_batch`.
+        options: of `tmlattice.diagnose`.
+
+    Returns:
+        The result files by name. That of a measurement that cannot be diagnosed holds "error".
+
+    Raises:
+        LatticeError: no such ring.
+        OutputError: the folder cannot be written.
+        TmlatticeError: two measurements of one name, no scheduler answers, or Dask is not
+            installed.
+    """
+    from tmlattice.importers.speaking import measured
+    from tmlattice.lattice import Ring, load_ring
+    from tmlattice.lattice.load import contents
+    from tmlattice.version import __version__
+
+    design = ring if isinstance(ring, Ring) else load_ring(ring)
+    place = Path(folder)
+    named: dict[str, Any]
+    if isinstance(measurements, Mapping):
+        named = dict(measurements)
+    else:
+        paths = [Path(path) for path in measurements]
+        named = {path.resolve().name: path for path in paths}
+        if len(named) < len(paths):
+            raise TmlatticeError("two of the measurements have one name; give them by name")
+    of_all = (__version__, contents(design), pickle.dumps(options))
+
+    def load(given: Any) -> Any:
+        return measured(given, design) if isinstance(given, str | os.PathLike) else given
+
+    def mark(given: Any) -> str:
+        if not isinstance(given, str | os.PathLike):
+            return fingerprint(*of_all, pickle.dumps(given))
+        path = Path(given)
+        return fingerprint(*of_all, *(sorted(path.iterdir()) if path.is_dir() else [path]))
+
+    done = run_batch(
+        partial(_diagnosed, design, options),
+        {name: partial(load, given) for name, given in named.items()},
+        place,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+        made_by={name: mark(given) for name, given in named.items()},
+        keep=("error",),
+    )
+    return {name: place / f"{name}.json" for name in done}
+
+
+def _diagnosed(ring: "Ring", options: dict[str, Any], measurement: Any) -> dict[str, Any]:
+    from tmlattice.diagnosis import diagnose as run
+
+    return run(ring, measurement, **options).as_json()
+
+
+def finished(folder: Path, keep: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
+    """The results that are there, by case; failed ones have a key "error".
+
+    Args:
+        folder: of the results.
+        keep: keys to keep of each; None: all.
+    """
     results = {}
     for path in sorted(folder.glob("*.json")):
         try:
@@ -41,7 +130,7 @@ def finished(folder: Path) -> dict[str, dict[str, Any]]:
         except TmlatticeError:
             result = None  # another program's, or cut off: done again
         if isinstance(result, dict):
-            results[path.stem] = result
+            results[path.stem] = _kept(result, keep)
         else:
             log.warning("%s is no result; it is left aside", path)
     return results
@@ -56,6 +145,7 @@ def run_batch(
     scheduler: str | None = None,
     progress: bool = True,
     made_by: Mapping[str, str] | None = None,
+    keep: Iterable[str] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """The result of every case.
 
@@ -69,6 +159,7 @@ def run_batch(
         progress: show a bar where there is a terminal.
         made_by: what each result depends on, see `fingerprint`; one that depends on anything else
             is done again.
+        keep: keys of the results that are returned, for many large ones; None: all.
 
     Returns:
         By case, with "made_by" where that is given; a failed one has only "error" and "seconds".
@@ -82,7 +173,8 @@ def run_batch(
     except OSError as error:
         raise OutputError(f"cannot write to '{folder}': {error.strerror or error}") from error
     marks = made_by or {}
-    there = {n: r for n, r in finished(folder).items() if n in cases and "error" not in r}
+    some = None if keep is None else (*keep, "error", MADE_BY)
+    there = {n: r for n, r in finished(folder, some).items() if n in cases and "error" not in r}
     done = {n: r for n, r in there.items() if n not in marks or r.get(MADE_BY) == marks[n]}
     if len(done) < len(there):
         log.warning("%d results are of other data or options; done again", len(there) - len(done))
@@ -94,9 +186,13 @@ def run_batch(
                 result = {**result, MADE_BY: marks[name]}  # noqa: PLW2901
             with output_file(folder / f"{name}.json") as path:
                 write_json(path, result)
-            done[name] = result
+            done[name] = _kept(result, some)
             bar.update()
     return {name: done[name] for name in cases}
+
+
+def _kept(result: dict[str, Any], keep: Iterable[str] | None) -> dict[str, Any]:
+    return result if keep is None else {key: result[key] for key in keep if key in result}
 
 
 def _results(
@@ -221,8 +317,8 @@ def _cluster(work: Work, address: str) -> Iterator[_Cluster]:
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
-        instead = "without --scheduler, local processes do the work"
-        raise missing_package(error, "--scheduler needs", "dask", instead) from error
+        instead = "without it, local processes do the work"
+        raise missing_package(error, "a Dask scheduler needs", "dask", instead) from error
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is one sentence of ours
     try:

@@ -1,4 +1,4 @@
-"""A built-in name or a path where a ring is taken, a path where a measurement is.
+"""All that `load_ring` takes where a ring is taken, a path where a measurement is.
 
 >>> @by_name
 ... def diagnose(ring, measurement): ...
@@ -15,47 +15,53 @@ from tmlattice.late import Method
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-MEASURED = ("measurement", "data", "reference")
+MEASURED = ("measurement", "data", "reference", "heldout")
 """Parameters that are measurements."""
 
-_open = Method("tmlattice.importers.speaking", "measured", "A measurement by its path.")
+_open = Method("tmlattice.importers.speaking", "measured", "A measurement by its path or frame.")
 
 
 def by_name(function: F) -> F:
-    """The function, which takes a built-in name or a path too where it takes a ring, and a path
-    where it takes a measurement: `ring`, `measurement`, `data`, `reference`."""
+    """The function, which takes all that `load_ring` does where it takes a ring, and a path, a
+    DataFrame or an xarray Dataset where it takes a measurement (`MEASURED`)."""
     signature = inspect.signature(function)
-    more = "options" in signature.parameters
-    wanted = [name for name in ("ring", *MEASURED) if more or name in signature.parameters]
+    wanted = [name for name in ("ring", *MEASURED) if name in signature.parameters]
 
     @functools.wraps(function)
     def taken(*arguments: Any, **options: Any) -> Any:
         bound = signature.bind_partial(*arguments, **options)
         given = bound.arguments
         for name in wanted:
-            given_to = given if name in given else given.get("options", {})
-            value = given_to.get(name)
-            ring = given.get("ring", given.get("options", {}).get("ring"))
+            value = given.get(name)
             if name == "ring":
-                if _is_path(value):
-                    given_to[name] = _ring(value)
-            elif _is_path(value):
-                given_to[name] = _open.function(value, ring)
-            elif isinstance(value, Mapping):
-                given_to[name] = {
-                    key: _open.function(own, ring) if _is_path(own) else own
-                    for key, own in value.items()
-                }
+                if value is not None:
+                    given[name] = _ring(value)
+                continue
+            ring = given.get("ring", getattr(given.get("network"), "ring", None))
+            if isinstance(value, Mapping) and not is_frame(value):  # a Dataset is a Mapping
+                given[name] = {key: _measured(own, ring) for key, own in value.items()}
+            else:
+                given[name] = _measured(value, ring)
         return function(*bound.args, **bound.kwargs)
 
     return cast("F", taken)
+
+
+def _measured(value: Any, ring: Any) -> Any:
+    return _open.function(value, ring) if _is_path(value) or is_frame(value) else value
+
+
+def is_frame(value: Any) -> bool:
+    """Whether it is a pandas DataFrame, or an xarray Dataset or DataArray."""
+    frame = hasattr(value, "columns") and hasattr(value, "reset_index")
+    return frame or (hasattr(value, "dims") and hasattr(value, "to_dataframe"))
 
 
 def _is_path(value: Any) -> bool:
     return isinstance(value, str | os.PathLike)
 
 
-def _ring(name: Any) -> Any:
+def _ring(lattice: Any) -> Any:
     from tmlattice.lattice import load_ring
 
-    return load_ring(name)
+    return load_ring(lattice)

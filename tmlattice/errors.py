@@ -64,6 +64,10 @@ class MeasurementError(TmlatticeError):
     """A measurement that does not fit the ring, or is not a measurement."""
 
 
+class MachineFileError(TmlatticeError):
+    """A machine file that cannot be read, or that names what is not there."""
+
+
 class OtherFormatError(MeasurementError):
     """A file that is not of the kind that it was read as; it may be of another."""
 

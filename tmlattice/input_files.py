@@ -4,9 +4,13 @@ Everything that a user or another program hands over is opened here, or by
 `tmlattice.lattice.mat_file`.
 """
 
+import difflib
 import json
+import math
 import os
+import re
 import stat
+import tomllib
 from functools import cache
 from importlib.resources import files
 from io import BytesIO
@@ -207,6 +211,39 @@ def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:
         raise error(f"'{path}' is no YAML that is read ({said})") from problem
 
 
+def toml_of(path: Path, error: type[TmlatticeError]) -> dict[str, Any]:
+    """The value of a TOML file, of the size and depth that a YAML file may have.
+
+    Raises:
+        error: as of `text_of`, or no TOML, with the line; a number that is not finite; or too much
+            of it.
+    """
+    if check_regular(path, error) > MOST_YAML:
+        raise error(f"'{path}' is larger than {MOST_YAML >> 20} MB; write less of it")
+    text = text_of(path, error)
+    for number, line in enumerate(text.splitlines(), 1):
+        # a key of many parts: its reader takes a time that grows with their square
+        keys = [line] if line.lstrip().startswith("[") else line.split("=")[:-1]
+        parts = [part for key in keys for part in re.split("[,{]", key)]
+        if any(part.count(".") > DEEPEST for part in parts):
+            raise error(f"{path}, line {number}: a key of more than {DEEPEST} parts; shorten it")
+    try:
+        made = tomllib.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{path}: no TOML that is read ({plain(str(problem), 200)})") from problem
+    level: list[Any] = [made]
+    for _ in range(DEEPEST):
+        if any(isinstance(v, float) and not math.isfinite(v) for v in level):
+            raise error(f"{path}: nan and inf are not numbers here; leave the key out")
+        inner = [
+            v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)
+        ]
+        level = [item for items in inner for item in items]
+        if not level:
+            return made
+    raise error(f"{path}: nested more than {DEEPEST} deep; write it flatter")
+
+
 # --- shapes -------------------------------------------------------------------------------------
 @cache
 def schema_of(name: str) -> Any:
@@ -259,7 +296,12 @@ def _explain(error: Any) -> str:
     if kind == "additionalProperties":
         known = error.schema.get("properties", {})
         strange = next((name for name in value if name not in known), "?")
-        return f'{place or "it"} has the key "{plain(strange, 60)}"; known are {", ".join(known)}'
+        near = difflib.get_close_matches(strange, known, 1)
+        offer = f'did you mean "{near[0]}"? ' if near else ""
+        return (
+            f'{place or "it"} has the key "{plain(strange, 60)}"; {offer}known are '
+            f"{', '.join(known)}"
+        )
     if kind == "anyOf" and all("type" in one for one in wanted):
         kind, wanted = "type", [one["type"] for one in wanted]
     if kind == "type":

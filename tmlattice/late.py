@@ -37,3 +37,11 @@ class Method:
     def function(self) -> Callable[..., Any]:
         """The function, its module loaded now."""
         return cast("Callable[..., Any]", getattr(import_module(self.module), self.name))
+
+
+class ClassMethod(Method):
+    """The same of a class: the first argument is the class."""
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        """Bound to the class."""
+        return MethodType(self.function, owner)

@@ -5,25 +5,29 @@ along the closed orbit, the betas and phases come from carrying its eigenvectors
 
 >>> optics = one_turn_optics(network)
 >>> optics.tunes                                   # fractions of Qx, Qy
->>> functions = twiss(network)
+>>> functions = twiss(ring)                        # or of a network
 >>> functions.total_tunes                          # with their integers
+>>> functions.betx, functions.to_dataframe()       # columns as MAD-X names them
 >>> off_momentum(TaylorNetwork.from_ring(ring, 6)).chromaticity
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.assembly import Assembly
-from tmlattice.beam.chain import LayerChain, products
+from tmlattice.beam.chain import Chain, LayerChain, products
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
-from tmlattice.lattice import Ring
-from tmlattice.maps.magnets import ring_matrix
+from tmlattice.lattice import Ring, load_ring
+from tmlattice.maps.magnets import LayerMaps, ring_matrix
 from tmlattice.maps.taylor import symplectic_form
+from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -68,25 +72,65 @@ class Optics:
         return np.asarray(2 * (states[..., :4] - self.closed_orbit[:4]) @ np.linalg.inv(both)[:2].T)
 
 
-@dataclass(frozen=True)
-class Twiss:
-    """Optical functions at the start and at the exit of every layer.
+@dataclass(frozen=True, eq=False, repr=False)
+class Twiss(Speaks):
+    """Optical functions along a ring: a column for each attribute, as MAD-X names them.
+
+    The first row is the start of the ring, each further one the exit of an element: of all elements
+    of a ring, of the layers (magnets) of a network.
 
     Attributes:
-        s: m, [layer + 1].
-        beta: m, [layer + 1, 2].
-        alpha: [layer + 1, 2].
-        phase: turns since the start, [layer + 1, 2].
+        name: "$start", then the names of the elements, [row].
+        s: m, [row].
+        betx, alfx, mux: beta (m), alpha, and phase since the start (in units of 2 pi) of the mode
+            that is mostly in x, on the closed orbit, [row].
+        bety, alfy, muy: those of the other mode, [row].
+        x, px, y, py: the closed orbit, m and units of the reference momentum, [row].
+        dx, dpx, dy, dpy: its derivatives by pt = dE / (p0 c), as MAD-X's; of a ring whose particles
+            are as fast as light those by delta. NaN of a network of four coordinates, [row].
         total_tunes: Qx, Qy with their integers, [2].
-        orbit: the closed orbit (x, y), m, [layer + 1, 2].
     """
 
+    name: tuple[str, ...]
     s: Array
-    beta: Array
-    alpha: Array
-    phase: Array
+    betx: Array
+    alfx: Array
+    mux: Array
+    bety: Array
+    alfy: Array
+    muy: Array
+    x: Array
+    px: Array
+    y: Array
+    py: Array
+    dx: Array
+    dpx: Array
+    dy: Array
+    dpy: Array
     total_tunes: Array
-    orbit: Array
+
+    @property
+    def beta(self) -> Array:
+        """Both betas, m, [row, 2]."""
+        return np.column_stack([self.betx, self.bety])
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame, its index the names, its columns from `s` to `dpy`."""
+        pandas = import_module("pandas")
+        columns = {f.name: getattr(self, f.name) for f in fields(self)[1:-1]}
+        return pandas.DataFrame(columns, index=pandas.Index(self.name, name="name"))
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.name)
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        qx, qy = self.total_tunes
+        return "", {
+            "rows": str(len(self)),
+            "tunes": f"{qx:.5f}, {qy:.5f}",
+            "largest beta": f"{self.betx.max():.1f} m, {self.bety.max():.1f} m",
+        }
 
 
 @dataclass(frozen=True)
@@ -253,35 +297,64 @@ def _alpha_beta(vectors: ComplexArray) -> tuple[Array, Array]:
     return -np.real(x.conj() * p), np.abs(x) ** 2
 
 
-def twiss(network: LayerChain) -> Twiss:
-    """Betas, alphas and phases along the ring, and the tunes with their integers.
+def twiss(ring: Ring | LayerChain | Any) -> Twiss:
+    """Return the optical functions at the exits of a ring's elements, or of a network's layers.
 
     The phase of each step is that of the eigenvector, taken between -0.1 and 2 pi - 0.1: every
-    layer advances the phase, except for rounding (drifts of slightly negative length), which
+    element advances the phase, except for rounding (drifts of slightly negative length), which
     must not count as a whole turn.
+
+    Args:
+        ring: a ring, all that `load_ring` takes, or a network.
 
     Raises:
         UnstableRingError: no closed orbit, or no tune.
     """
-    path, total = _on_closed_orbit(network)
-    values, modes = normal_modes(total[-1, :4, :4])
+    if isinstance(ring, LayerChain):
+        names, s = ring.layers, ring.maps.s
+        path, total = _on_closed_orbit(ring)
+        end = total[-1]
+        path, total = path[:-1], total[:-1]
+    else:
+        ring = load_ring(ring)
+        names = tuple(element.name for element in ring.elements)
+        s = np.cumsum([element.length for element in ring.elements])
+        path, total = _through(ring, _on_closed_orbit(Chain.from_ring(ring, 6))[0][0])
+        end = total[-1]
+    values, modes = normal_modes(end[:4, :4])
     vectors = total[:, :4, :4] @ modes
     position = np.stack([vectors[:, 0, 0], vectors[:, 2, 1]], axis=-1)
-    steps = np.angle(position[1:] / position[:-1])
+    last = (end[:4, :4] @ modes)[[0, 2], [0, 1]]
+    steps = np.angle(np.concatenate([position[1:], last[None]]) / position)
     steps = (steps + 0.1) % (2 * np.pi) - 0.1
     phase = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) / (2 * np.pi)
-    alpha, beta = _alpha_beta(vectors[:-1])
+    alpha, beta = _alpha_beta(vectors)
     fraction = _fractions(values)
-    whole = np.round(phase[-1] - fraction)
-    s = np.concatenate([[0.0], network.maps.s])
+    dispersion = np.full((len(total), 4), np.nan)
+    if total.shape[-1] == 6:
+        start = np.linalg.solve(np.eye(4) - end[:4, :4], end[:4, 5])
+        dispersion = total[:, :4, :4] @ start + total[:, :4, 5]
+    (ax, ay), (bx, by), (mx, my) = alpha.T, beta.T, phase[:-1].T
+    x, px, y, py = path[:, :4].T
+    dx, dpx, dy, dpy = dispersion.T
     return Twiss(
-        s=s,
-        beta=beta,
-        alpha=alpha,
-        phase=phase[:-1],
-        total_tunes=whole + fraction,
-        orbit=path[:-1, [0, 2]],
-    )
+        ("$start", *names), np.concatenate([[0.0], s]), bx, ax, mx, by, ay, my, x, px, y, py,
+        dx, dpx, dy, dpy, total_tunes=np.round(phase[-1] - fraction) + fraction,
+    )  # fmt: skip
+
+
+def _through(ring: Ring, start: Array) -> tuple[Array, Array]:
+    """States [element + 1, 6] at the start and at the exits of all elements, and the matrices from
+    the start to there [element + 1, 6, 6]."""
+    layers = LayerMaps(ring, 6)
+    path, total = [start], [np.eye(6)]
+    for element in ring.elements:
+        own = layers.map(element)
+        x = path[-1]
+        bent = np.zeros((6, 6)) if own.T is None else own.T @ x
+        path.append(own.B + (own.R + bent) @ x)
+        total.append((own.R + 2 * bent) @ total[-1])
+    return np.array(path), np.array(total)
 
 
 def off_momentum(network: LayerChain, length: float, delta: float = 1e-4) -> OffMomentum:

@@ -11,16 +11,16 @@ from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.next_measurement import LEAST, next_measurement
 from tmlattice.diagnosis.recommended_actions import (
+    compensated,
     credible,
     leading,
     recommended_action,
     recommended_actions,
-    undone,
 )
 from tmlattice.diagnosis.result import Finding, faults_of
 from tmlattice.effects import CATALOGUE, Effect, apply
+from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.newton import fit
-from tmlattice.inference.rivals import Rival
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import off_momentum, ring_tunes, twiss
@@ -191,7 +191,7 @@ def test_wrong_quadrupole_of_the_at_machine_is_one_finding(small_ring, cause):
     ids=str,
 )
 def test_ring_with_the_settings_acts_as_designed(small_ring, cause, left):
-    mended, by_hand = undone(small_ring, [cause])
+    mended, by_hand = compensated(small_ring, [cause])
     assert by_hand == ()
     there = apply(mended, [cause])
     if left is None:
@@ -209,7 +209,7 @@ def test_ring_with_the_settings_acts_as_designed(small_ring, cause, left):
     ids=str,
 )
 def test_kick_is_taken_away_by_the_opposite_setting(small_ring, cause):
-    mended, by_hand = undone(small_ring, [cause])
+    mended, by_hand = compensated(small_ring, [cause])
     assert by_hand == ()
     orbits = [
         np.abs(Chain.from_ring(ring).closed_orbit()[0][:, [0, 2]]).max()
@@ -226,7 +226,7 @@ def test_what_no_setting_mends_is_handed_back(small_ring):
         Cause("corrector_kick_x", "v3", 1e-5),  # a vertical corrector
         Cause("monitor_swap", "end_3", 1.0),
     ]
-    mended, by_hand = undone(small_ring, causes)
+    mended, by_hand = compensated(small_ring, causes)
     assert list(by_hand) == causes
     assert mended.elements == small_ring.elements
 
@@ -295,7 +295,7 @@ def rivals_of(ring, data, *causes):
     of = of_measurement(ring, data)
     model = Model(ring, of.settings)
     problem = FirstTurns(model=model, data=of, places={c.effect: 1 for c in causes})
-    return of, [Rival((c.effect, c.element), fit(problem, [c], of.launches)) for c in causes]
+    return of, [Alternative((c.effect, c.element), fit(problem, [c], of.launches)) for c in causes]
 
 
 def test_next_measurement_is_silent_where_it_tells_nothing(small_ring):

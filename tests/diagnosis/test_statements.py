@@ -13,7 +13,7 @@ import pytest
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.diagnosis.assessment import STATEMENTS, Block, assess, compared_of
 from tmlattice.effects import background_rms
-from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.machine.response import simulate_response
 from tmlattice.report.page import page
 

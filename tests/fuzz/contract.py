@@ -134,7 +134,8 @@ def broken(words, folder, tally):
     if code not in (0, 1, 2, None):
         return f"exit code {code}"
     if code == 2:
-        sentences = [s for s in errors.splitlines() if not s.startswith("tmlattice: warning")]
+        told = ("tmlattice: warning", "tmlattice: machine file")
+        sentences = [s for s in errors.splitlines() if not s.startswith(told)]
         if not sentences or not sentences[0].startswith("tmlattice: "):
             return f"no sentence: {errors[:300]!r}"
     if found := STEERS.search(out + errors):

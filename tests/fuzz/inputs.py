@@ -68,6 +68,7 @@ def write_all(folder, challenges=True, more=True):
         at.save_lattice(lattice, folder / name)
     (folder / "ring.seq").write_text(MADX)
     (folder / "ring.lte").write_text(ELEGANT)
+    (folder / "lte.toml").write_text('[lattice]\nfile = "ring.lte"\nenergy = 3\n')
     shots = {"shots": 3, "engine": "ocelot", "seed": 1, "amplitude": 5e-4}
     write_measurement(folder / "turns", simulate(ten, [], **shots).measurement())
     measured = simulate_response(ten, [], seed=1, progress=False, engine="ocelot").measured
@@ -76,8 +77,8 @@ def write_all(folder, challenges=True, more=True):
         unsealed(folder / kind)
     xsuite = Path(__file__).parent.parent / "lattices" / "xtrack_line.json"
     shutil.copy(xsuite, folder / "xsuite.json")
-    score = ["challenge", "score", "set", "--no-oracle", "--jobs", "1"]
-    run = ["challenge", "run", "set", "--jobs", "1", "-q"]
+    score = ["dev", "challenge", "score", "set", "--no-oracle", "--jobs", "1"]
+    run = ["dev", "challenge", "run", "set", "--jobs", "1", "-q"]
     info = lambda name, *more: (["info", name, *more], name)  # noqa: E731
     found = {
         "own JSON": info("own.json"),
@@ -86,7 +87,8 @@ def write_all(folder, challenges=True, more=True):
         "AT .m": info("at.m"),
         "AT .repr": info("at.repr"),
         "MAD-X": info("ring.seq"),
-        "elegant": info("ring.lte", "--energy", "3"),
+        "elegant": info("ring.lte", "--machine", "lte.toml"),
+        "machine file": (["info", "--machine", "lte.toml"], "lte.toml"),
         "Xsuite": info("xsuite.json"),
         "turns, JSON": (["diagnose", "ring.json", "turns"], "turns/measurement.json"),
         "turns, table": (["diagnose", "ring.json", "turns"], "turns/readings.csv"),

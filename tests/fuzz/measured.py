@@ -83,13 +83,13 @@ def write_control_room(folder):
     tmlattice(*words, "-q", cwd=folder, check=0)
     turns = read_measurement(folder / "turns")
     write_sdds(folder / "room/readings.sdds", turns.monitors, turns.readings[:, 0])
-    wide = ["diagnose", "ring.json", "room/readings_wide.csv", "--map", "room/map.yaml"]
+    wide = ["diagnose", "room/readings_wide.csv", "--machine", "room/tmlattice.toml"]
     tmlattice("import", "room/response.csv", "--lattice", "ring.json", "--out", "bring", "-q",
               cwd=folder, check=0)  # fmt: skip
     check = lambda name: (["check", "ring.json", name], name)  # noqa: E731
     return {
         "table, a row a shot": (wide, "room/readings_wide.csv"),
-        "map of a table": (wide, "room/map.yaml"),
+        "machine file of a table": (wide, "room/tmlattice.toml"),
         "table, a row a reading": check("room/readings_long.csv"),
         "table, HDF5": check("room/readings.h5"),
         "table, SDDS": check("room/readings.sdds"),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.clusters import Found, Rows, widened
-from tmlattice.inference.common import amounts, beside, common
+from tmlattice.inference.clusters import LinearFit, Rows, cluster_robust_errors
+from tmlattice.inference.common import amounts, common, times_precision
 from tmlattice.inference.normal import normal_equations
 
 COLUMNS, MONITORS, ERRORS, PATTERNS = 6, 9, 3, 2
@@ -38,7 +38,9 @@ def test_inverse_covariance_and_its_determinant(problem):
     taken, scale = common(weight, patterns)
     _, V, seen = dense(rows, weight, patterns)
     expected = np.linalg.solve(V, left.ravel()[seen])
-    np.testing.assert_allclose(beside(weight, taken, left).ravel()[seen], expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        times_precision(weight, taken, left).ravel()[seen], expected, rtol=1e-9
+    )
     whole = np.linalg.slogdet(V)[1] + np.log(weight.ravel()[seen]).sum()
     assert scale.sum() == pytest.approx(whole, rel=1e-9)
 
@@ -53,7 +55,7 @@ def test_normal_equations_are_generalised_least_squares(problem):
     )
 
 
-def test_likeliest_amounts(problem):
+def test_most_probable_amounts(problem):
     _, weight, patterns, left = problem
     likely, covariance = amounts(weight, patterns, np.where(weight > 0, left, np.nan))
     for c in range(COLUMNS):
@@ -75,8 +77,9 @@ def test_errors_of_clusters_are_those_of_fits_without_them(problem):
     value = covariance @ (J.T @ np.linalg.solve(V, left.ravel()[seen]))
     rest = np.zeros(weight.size)
     rest[seen] = left.ravel()[seen] - J @ value
-    sigma = widened(rows, weight, rest.reshape(weight.shape), Found.of(matrix, covariance),
-                    common(weight, patterns)[0])  # fmt: skip
+    fit = LinearFit.of(matrix, covariance)
+    left_over = rest.reshape(weight.shape)
+    sigma = cluster_robust_errors(rows, weight, left_over, fit, common(weight, patterns)[0])
     column, monitor = np.divmod(seen, MONITORS)
     expected = np.zeros(len(value))
     for cluster in (column, monitor):

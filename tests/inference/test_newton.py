@@ -42,7 +42,7 @@ def test_a_settled_fit_finds_the_amount(problem):
     assert abs(found.causes[0].amount - FAULT.amount) < 4 * sigma < 0.005
 
 
-def test_too_few_steps_are_said(problem):
+def test_too_few_steps_are_reported(problem):
     found = fit(problem, [replace(FAULT, amount=0.2)], problem.data.launches, steps=1)
     assert found.outcome is Outcome.STEPS
 
@@ -133,7 +133,7 @@ def test_most_probable_amounts_are_ridge_regression_where_all_is_linear(rng):
     problem = Straight(J, J @ true + 0.1 * rng.standard_normal(20), 0.1)
     found = most_probable(problem, Student(0.3, np.inf), np.zeros(50))
     ridge = np.linalg.solve(J.T @ J / 0.1**2 + np.eye(50) / 0.3**2, J.T @ problem.measured / 0.1**2)
-    assert found.settled
+    assert found.converged
     np.testing.assert_allclose(found.amounts, ridge, atol=1e-9)
 
 

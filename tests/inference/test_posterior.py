@@ -13,9 +13,14 @@ from tmlattice import Cause, simulate
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import background_rms, find
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference import among
+from tmlattice.inference import distributed
 from tmlattice.inference import posterior as module
-from tmlattice.inference.among import ROWS, Known, kept, small_errors_of
+from tmlattice.inference.distributed import (
+    ROWS,
+    DistributedErrors,
+    fit_distributed_errors,
+    sampled_rows,
+)
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.metric import Metric
 from tmlattice.inference.posterior import posterior
@@ -62,7 +67,7 @@ def same(one, other, tolerance):
 
 
 def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
-    monkeypatch.setattr(response_metric, "ROOM", PIECE)
+    monkeypatch.setattr(response_metric, "MAX_NUMBERS", PIECE)
     point = response.at((Cause("monitor_roll", "end_1", 0.02),), response.first)
     some = [*everywhere[::3], ("energy_spread", None), ("skew_gradient", "QF::5")]
     metric = response.metric(point)
@@ -75,17 +80,17 @@ def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
     assert len(seen) > 2
 
 
-def test_sums_leave_known_what_all_signatures_do(response, everywhere, monkeypatch):
-    monkeypatch.setattr(response_metric, "ROOM", PIECE)
-    usual = Known.usual(everywhere, USUAL)
-    direct = small_errors_of(response, usual, response.first)
-    summed = posterior(response, usual)
-    assert summed.sizes == pytest.approx(direct.sizes, rel=1e-8)
-    assert summed.errors == pytest.approx(direct.errors, rel=1e-8)
+def test_sums_give_the_posterior_of_all_signatures(response, everywhere, monkeypatch):
+    monkeypatch.setattr(response_metric, "MAX_NUMBERS", PIECE)
+    usual = DistributedErrors.usual(everywhere, USUAL)
+    direct = fit_distributed_errors(response, usual, response.first)
+    sums_at = posterior(response, usual)
+    assert sums_at.sizes == pytest.approx(direct.sizes, rel=1e-8)
+    assert sums_at.errors == pytest.approx(direct.errors, rel=1e-8)
     known = direct.problem.learnt(direct.before)
-    same(summed.known, known, 1e-8)
+    same(sums_at.known, known, 1e-8)
     # and once more, from what is known
-    again = small_errors_of(response, known, response.first, learn=False)
+    again = fit_distributed_errors(response, known, response.first, learn=False)
     twice = posterior(response, known, learn=False)
     same(twice.known, again.problem.learnt(again.before), 1e-7)
 
@@ -95,12 +100,12 @@ def test_nuisances_are_projected_out(small_ring, everywhere):
     each in its own noise."""
     measured = simulate(small_ring, background=USUAL, machine_seed=5, shots=3, seed=3).measurement()
     turns = prepare(small_ring, measured, None, False, None, DEFAULT).problem
-    usual = Known.usual(everywhere, USUAL)
-    direct = small_errors_of(turns, usual, turns.first, learn=False)
-    summed = posterior(turns, usual, learn=False).known
+    usual = DistributedErrors.usual(everywhere, USUAL)
+    direct = fit_distributed_errors(turns, usual, turns.first, learn=False)
+    sums_at = posterior(turns, usual, learn=False).known
     known = direct.problem.learnt(direct.before)
-    assert_allclose(summed.errors, known.errors, rtol=0.02)
-    assert_allclose((summed.amounts - known.amounts) / known.errors, 0, atol=0.1)
+    assert_allclose(sums_at.errors, known.errors, rtol=0.02)
+    assert_allclose((sums_at.amounts - known.amounts) / known.errors, 0, atol=0.1)
 
 
 def test_memory_does_not_grow_with_readings():
@@ -121,10 +126,12 @@ def test_memory_does_not_grow_with_readings():
     problem = SimpleNamespace(
         everywhere=lambda: SimpleNamespace(metric=lambda point: Many(projection))
     )
-    known = Known.usual([("dipole_field", str(i)) for i in range(count)], {"dipole_field": 1.0})
+    known = DistributedErrors.usual(
+        [("dipole_field", str(i)) for i in range(count)], {"dipole_field": 1.0}
+    )
     point = SimpleNamespace(residual=residual, projection=projection)
     tracemalloc.start()
-    sums = module.summed(problem, point, known, np.zeros(count), np.array([3, size + 7]))
+    sums = module.sums_at(problem, point, known, np.zeros(count), np.array([3, size + 7]))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20e6
@@ -139,15 +146,17 @@ def test_too_large_small_errors_are_a_sentence(response, everywhere, monkeypatch
     def lost(*_):
         return replace(response.at((), response.first), projection=None, lost="no orbit")
 
-    monkeypatch.setattr(among, "settled", lost)
-    with pytest.raises(UnstableRingError, match="no orbit with the small errors"):
-        posterior(response, Known.usual(everywhere, USUAL))
+    monkeypatch.setattr(distributed, "fit_nuisances", lost)
+    with pytest.raises(
+        UnstableRingError, match="no orbit with the most probable distributed errors"
+    ):
+        posterior(response, DistributedErrors.usual(everywhere, USUAL))
 
 
 def test_rows_for_sizes_have_both_planes():
     """Every second row was one plane of all monitors: the other had no say in any size."""
     for count in (2 * ROWS, 4 * ROWS - 3, 12 * ROWS):
-        rows = kept(count)
+        rows = sampled_rows(count)
         assert len(rows) == ROWS == len(set(rows.tolist()))
         assert 0.4 < np.mean(rows % 2) < 0.6
-    assert_allclose(kept(ROWS), np.arange(ROWS))
+    assert_allclose(sampled_rows(ROWS), np.arange(ROWS))

@@ -10,9 +10,9 @@ import pytest
 from tmlattice import diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.inference import search as own
+from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.newton import fit
 from tmlattice.inference.options import Option
-from tmlattice.inference.rivals import Detection
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 
@@ -39,19 +39,19 @@ def measured(ring):
 @pytest.fixture
 def looks(monkeypatch):
     """How often a search looks; one without an end ends here."""
-    look, count = own._look, []
+    look, count = own._scan_all, []
 
     def counted(*arguments):
         count.append(1)
         assert len(count) < MOST, "the search goes on and on"
         return look(*arguments)
 
-    monkeypatch.setattr(own, "_look", counted)
+    monkeypatch.setattr(own, "_scan_all", counted)
     return count
 
 
 @pytest.mark.parametrize(("shot", "monitor"), [(1, 1), (0, 2), (2, 0)])
-def test_a_reading_of_a_metre_is_left_out_and_is_no_finding(ring, measured, looks, shot, monitor):
+def test_a_reading_of_a_metre_is_rejected_and_is_no_finding(ring, measured, looks, shot, monitor):
     """Launches are spoilt by it, so that a scan about their fit takes it for a gain or a magnet; to
     set the monitor aside and to name its gain took turns for ever."""
     readings = measured.readings.copy()
@@ -72,7 +72,7 @@ def test_a_search_ends_where_it_has_been(ring, measured, looks, monkeypatch):
     def options(search, state, look):
         return [Option("monitor", "another", 10.0, seen, where=len(state.monitors))]
 
-    def revised(search, state, doubted=False):
+    def revised(search, state, quick=False):
         return replace(state, monitors={0: seen})
 
     monkeypatch.setattr(own, "_options", options)

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from tmlattice.inference.levels import Levels
+from tmlattice.inference.common_factors import FactorModel
 from tmlattice.inference.sets import likely_sets, over_sets
 
 FAMILIES = np.kron(np.eye(4), np.ones((10, 1)))
@@ -20,7 +20,7 @@ def levels(means, noise=0.1, candidates=CANDIDATES, seed=0):
     values = FAMILIES @ np.array(means, dtype=float)
     values = values + noise * np.random.default_rng(seed).standard_normal(40)
     information = np.eye(40) / noise**2
-    return Levels(
+    return FactorModel(
         information,
         information @ values,
         candidates,
@@ -75,7 +75,7 @@ def own_score(noise):
     return (values + noise * np.random.default_rng(0).standard_normal(40)) / noise**2
 
 
-def test_an_amount_that_hangs_on_the_set_is_told_with_such_an_error():
+def test_an_amount_that_depends_on_the_set_has_such_an_error():
     """2, or 1 beside the 1 that three share."""
     own = two_ways([2, 1, 1, 3])
     sets = likely_sets(own, 5)
@@ -90,7 +90,7 @@ def test_an_amount_that_hangs_on_the_set_is_told_with_such_an_error():
     assert sum(one.probability for one in inside) == pytest.approx(0.5, abs=0.05)
 
 
-def test_sets_are_told_though_likelier_ones_are_not_clear():
+def test_significant_sets_are_reported_though_others_are_more_probable():
     """One more candidate that explains less than is asked for, and more than it costs."""
     own = two_ways([2, 1, 1, 3])
     before = likely_sets(own, 5)
@@ -101,7 +101,7 @@ def test_sets_are_told_though_likelier_ones_are_not_clear():
     values[17] += 4.7 * noise - (values[17] - 1)
     information = np.eye(40) / noise**2
     slab = np.append(np.full(5, 3.0), 0.5)
-    other = Levels(information, information @ values, more, np.full(40, 1e-12), slab)
+    other = FactorModel(information, information @ values, more, np.full(40, 1e-12), slab)
     other.cost[:5] = own.cost
     other.cost[5] = -8.0
     sets = likely_sets(other, 5)
@@ -110,7 +110,7 @@ def test_sets_are_told_though_likelier_ones_are_not_clear():
     assert sets[1].probability > 0.1
 
 
-def test_sets_that_span_the_same_are_one_told_in_parts():
+def test_sets_of_the_same_span_are_one_reported_in_parts():
     """All by 1 and three by 1 more: the fourth alone by 1, the three by 2."""
     own = levels([2, 2, 2, 1])
     own.cost[ALL] -= 3.0  # else it is found so at once
@@ -121,20 +121,20 @@ def test_sets_that_span_the_same_are_one_told_in_parts():
     told = {one.candidate: one for one, _ in over_sets(own, sets)}
     assert told[FIRST_THREE].amount == pytest.approx(2, abs=0.1)
     assert told[D].amount == pytest.approx(1, abs=0.1)
-    assert told[D].rivals == ((D, 1.0),)
+    assert told[D].alternatives == ((D, 1.0),)
 
 
-def test_where_nothing_is_there_the_empty_set_is_told():
+def test_without_factors_the_empty_set_is_reported():
     own = levels([0, 0, 0, 0])
     sets = likely_sets(own, 7)
     assert sets[0].chosen == ()
     assert over_sets(own, sets) == []
 
 
-def test_amounts_are_told_over_whether_a_neighbour_is_there():
+def test_amounts_are_averaged_over_an_uncertain_neighbour():
     """Two numbers that are hardly told apart, one of which is clear: by enumeration."""
     information = np.array([[4.0, 3.9], [3.9, 4.0]]) * 1e2
-    own = Levels(
+    own = FactorModel(
         information, information @ [0.8, 0.5], np.eye(2), np.full(2, 1e-12), np.full(2, 3.0)
     )
     alone, both = own.fitted([0]), own.fitted([0, 1])

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.triangles import SMALL, inverse_of_lower, lower_factor
+from tmlattice.inference.triangles import MAX_LAPACK, inverse_of_lower, lower_factor
 
 
-@pytest.mark.parametrize("n", [1, 7, SMALL, SMALL + 1, 3 * SMALL + 5, 431])
+@pytest.mark.parametrize("n", [1, 7, MAX_LAPACK, MAX_LAPACK + 1, 3 * MAX_LAPACK + 5, 431])
 def test_factor_and_inverse_are_numpys(n: int) -> None:
     rows = np.random.default_rng(n).normal(size=(n, n + 20))
     matrix = rows @ rows.T
@@ -18,6 +18,6 @@ def test_factor_and_inverse_are_numpys(n: int) -> None:
     assert np.allclose(inverse.T @ inverse, np.linalg.inv(matrix), rtol=0, atol=1e-9)
 
 
-def test_what_is_not_positive_is_told() -> None:
+def test_a_matrix_that_is_not_positive_is_an_error() -> None:
     with pytest.raises(np.linalg.LinAlgError, match="not positive"):
         lower_factor(np.diag([1.0, -1.0]))

@@ -1,4 +1,4 @@
-"""The beam in a ring, without torch: states, tangents, closed orbits, and what errors do to them.
+"""The beam in a ring, without torch: states, tangents, closed orbits and effects of errors.
 
 >>> model = Model(ring, settings=[{}])                   # a ring as a measurement's shots saw it
 >>> model.readings(launches, [Cause("quadrupole_gradient", "qd::12", -0.2)])

@@ -1,4 +1,4 @@
-"""How far a trajectory may go before it counts as lost."""
+"""The aperture beyond which a trajectory is lost."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from tmlattice.maps import RingMaps
 Array = NDArray[np.float64]
 
 APERTURE = 1.0
-"""m and rad: far outside any beam pipe, and where second-order maps have lost all meaning."""
+"""m and rad: far outside any beam pipe, where second-order maps are meaningless."""
 
 
 def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) -> None:

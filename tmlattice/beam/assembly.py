@@ -1,7 +1,7 @@
-"""A ring with known causes, and what a shot's settings and further causes change in its layers.
+"""A ring with known causes, and its layers with a shot's settings and further causes.
 
-Settings come first, then what is known, then what is asked: a corrector's calibration error acts on
-the kick that was set, whoever knows of it.
+The order is settings, known causes, further causes: a corrector's calibration error acts on the
+kick that was set.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,18 +28,18 @@ from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
-"""An effect and the place where it might sit."""
+"""An effect and its place."""
 
 MADE = 10_000
-"""Changed layers that are remembered: some 20 MB."""
+"""Changed layers in memory: some 20 MB."""
 KEPT = 4
-"""Rings with something known that are kept with a ring."""
-FEW = 10
-"""Known causes of which a ring is worth keeping."""
+"""Rings with known causes that are cached with a ring."""
+MAX_CHANGES = 10
+"""Known causes up to which a ring is cached."""
 
 
 def on_ring(causes: Sequence[Cause]) -> list[Cause]:
-    """Those that act on elements."""
+    """Causes that act on elements."""
     return [cause for cause in causes if isinstance(find(cause.effect), RingEffect)]
 
 
@@ -48,8 +48,8 @@ class Assembly:
     """A ring with known causes, its layers, and the directions of hypotheses in them.
 
     Attributes:
-        design, known: what it was made from.
-        ring: with what is known.
+        design, known: arguments.
+        ring: with the known causes.
         layers, maps: of that ring.
         rf: see `rf_of`.
     """
@@ -65,7 +65,7 @@ class Assembly:
 
     @cached_property
     def _known_at(self) -> Mapping[int, list[Cause]]:
-        """Known causes by the place that they sit on."""
+        """Known causes by the index of their element."""
         found: dict[int, list[Cause]] = {}
         for cause in on_ring(self.known):
             for place in _members(self.design, cause):
@@ -74,18 +74,18 @@ class Assembly:
 
     @cached_property
     def loss(self) -> float:
-        """Relative energy that the design orbit loses in a turn, by what is known."""
+        """Relative energy that the design orbit loses in a turn by the known causes."""
         return sum(element.errors.loss for element in self.ring.elements)
 
     def set(self, settings: Settings) -> dict[int, Element]:
-        """The elements that settings change, with what is known of them."""
+        """Return the elements that settings change, with the known causes."""
         changed = set_elements(self.design, settings)
         for place in changed:
             changed[place] = self._with(changed[place], self._known_at.get(place, ()))
         return changed
 
     def changed(self, settings: Settings, causes: Sequence[Cause]) -> dict[int, Element]:
-        """The elements that settings and further causes change."""
+        """Return the elements that settings and further causes change."""
         changed = self.set(settings)
         for cause in on_ring(causes):
             for place in _members(self.design, cause):
@@ -101,12 +101,12 @@ class Assembly:
         return element
 
     def layers_with(self, replaced: Mapping[int, Element]) -> dict[int, LayerParts]:
-        """The layers that hold these elements."""
+        """Return the layers of these elements."""
         touched = {int(self.layers.layer_of[place]) for place in replaced}
         return {k: self.layers.layer(k, replaced) for k in sorted(touched)}
 
     def layers_of(self, cause: Cause) -> tuple[int, ...]:
-        """The layers that a cause touches."""
+        """Layers that a cause changes."""
         key = (cause.effect, cause.element)
         if key not in self._touched:
             members = _members(self.design, cause)
@@ -114,7 +114,7 @@ class Assembly:
         return self._touched[key]
 
     def cavities(self, settings: Settings, causes: Sequence[Cause] = ()) -> Cavities:
-        """The RF of a shot: it makes good what the design orbit loses, these causes there."""
+        """Return the RF of a shot: it replaces the design orbit's loss with these causes."""
         lost = (self.turn_loss(cause) * cause.amount for cause in causes)
         return cavities(
             self.design, self.rf, self.layers.layer_of, self.loss + sum(lost),
@@ -130,8 +130,8 @@ class Assembly:
         return sum(b.errors.loss - a.errors.loss for a, b in zip(members, one, strict=True))
 
     def directions(self, hypotheses: Sequence[Hypothesis]) -> Directions:
-        """Of hypotheses, without settings, about the design: small errors everywhere turn a
-        hypothesis's direction by as little as they are large."""
+        """Return directions of hypotheses without settings, at the design: distributed errors turn
+        a direction by as little as they are large."""
         key = tuple(hypotheses)
         if key not in self._directions:
             design = assembly(self.design, (), self.layers.dimension).layers
@@ -144,10 +144,10 @@ def _members(ring: Ring, cause: Cause) -> list[int]:
 
 
 def assembly(ring: Ring, known: Sequence[Cause] = (), dimension: int = 6) -> Assembly:
-    """A ring with known causes; where they are few, kept with the ring."""
+    """Return a ring with known causes; cached with the ring if they are few."""
     known = tuple(known)
     key = ("model", known, dimension)
-    few = len(known) < FEW
+    few = len(known) < MAX_CHANGES
     if few and key in ring.memory:
         kept: Assembly = ring.memory[key]
         return kept
@@ -158,7 +158,7 @@ def assembly(ring: Ring, known: Sequence[Cause] = (), dimension: int = 6) -> Ass
     made = Assembly(ring, known, with_known, layers, maps, rf_of(ring), shared)
     if few:
         others = [k for k in ring.memory if k[0] == "model" and k[1]]
-        if len(others) >= KEPT:  # a study that tells each case something would fill the memory
+        if len(others) >= KEPT:  # a study with other causes in each case would fill the memory
             del ring.memory[others[0]]
         ring.memory[key] = made
     return made
@@ -171,8 +171,8 @@ class Group:
         number: of the group.
         shots: of it.
         settings: theirs.
-        active: whether causes are there.
-        there: the ring with what is known.
+        active: whether causes act.
+        there: the ring with the known causes.
     """
 
     def __init__(
@@ -200,12 +200,11 @@ class Group:
         causes: Sequence[Cause],
         made: dict[tuple[int, tuple[Cause, ...], int], LayerParts],
     ) -> dict[int, LayerParts]:
-        """The layers that causes touch, as they are with them.
+        """Return the layers of causes, with these causes.
 
         Args:
             causes: that act on elements.
-            made: remembers them: groups share what no setting touches, and what one fit needed the
-                next one finds.
+            made: cache: groups share layers without settings, and one fit those of the next.
         """
         touching: dict[int, list[Cause]] = {}
         for cause in causes:
@@ -226,7 +225,7 @@ class Group:
         return found
 
     def directions(self, hypotheses: Sequence[Hypothesis]) -> Directions:
-        """Of hypotheses, those anew that sit on what the settings change."""
+        """Return directions of hypotheses, anew for those on elements that the settings change."""
         base = self.there.directions(hypotheses)
         key = tuple(hypotheses)
         if not self.touched:
@@ -239,6 +238,6 @@ class Group:
         layers = LayerMaps(set_ring, self.there.layers.dimension)
         fresh = directions(layers, [key[i] for i in again])
         found = base.replaced(again, fresh)
-        if len(key) > FEW:
+        if len(key) > MAX_CHANGES:
             self._latest = (key, found)
         return found

@@ -25,13 +25,13 @@ Array = NDArray[np.float64]
 
 
 NO_ORBIT = (
-    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
+    "no closed orbit: the search does not converge; the ring is at an integer resonance, or its "
     "kicks are too large"
 )
 
 
 def products(matrices: Array) -> Array:
-    """From the start to behind each of the matrices [step, n, n], [step + 1, n, n]."""
+    """Cumulative products of the matrices [step, n, n], from the start, [step + 1, n, n]."""
     steps, n = matrices.shape[:2]
     total = np.empty((steps + 1, n, n))
     kernels.products(np.ascontiguousarray(matrices), total)
@@ -39,23 +39,24 @@ def products(matrices: Array) -> Array:
 
 
 def merged(matrices: Array, ends: NDArray[np.intp]) -> Array:
-    """Products of runs of the matrices [step, n, n] in beam order, each up to and with one of the
-    rising `ends`, [end, n, n]."""
+    """Products of runs of the matrices [step, n, n] in beam order, each up to and including one of
+    the rising `ends`, [end, n, n]."""
     whole = np.empty((len(ends), *matrices.shape[1:]))
     kernels.merge(np.ascontiguousarray(matrices), ends, whole)
     return whole
 
 
 def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:
-    """What makes good a miss of the turn, [n, row]: (1 - turn)^-1 in the coordinates that are free.
+    """Correction of the start for a mismatch of a turn, (1 - turn)^-1 in the free coordinates,
+    [n, row].
 
     Args:
         turn: one-turn matrix, [n, n].
-        free: coordinates of the start that are free.
+        free: free coordinates of the start.
         rows: coordinates that should repeat, as many.
 
     Raises:
-        UnstableRingError: it has no inverse.
+        UnstableRingError: the matrix is singular.
     """
     solve = np.zeros((len(turn), len(rows)))
     try:
@@ -68,7 +69,7 @@ def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Arra
 def first_pass(
     weights: tuple[Array, Array, Array], maps: RingMaps, start: Array
 ) -> tuple[Array, Array]:
-    """States [block, layer + 1, n, lane] and readings [block, monitor, 2, lane] of one pass.
+    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane] of a pass.
 
     Raises:
         BeamLostError: names the layer where a trajectory was lost.
@@ -87,13 +88,13 @@ def first_pass(
 
 
 class LayerChain:
-    """What every chain of layers has: names, launches, tracking, the map of a turn.
+    """Common part of chains of layers: names, launches, tracking, the one-turn map.
 
-    A chain says how its layers send states (`_forward`, `_track`, `tangents`).
+    A chain defines how its layers act on states (`_forward`, `_track`, `tangents`).
 
     Attributes:
-        maps: what it was made from; names and places of layers and monitors.
-        ring: the ring of these maps, where it is known.
+        maps: names and positions of layers and monitors.
+        ring: the ring of these maps, if known.
     """
 
     maps: RingMaps
@@ -108,8 +109,8 @@ class LayerChain:
         raise NotImplementedError
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
-        from the start to there, d state / d launch, [layer + 2, n, n]."""
+        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state /
+        d launch there, [layer + 2, n, n]."""
         raise NotImplementedError
 
     @property
@@ -149,7 +150,7 @@ class LayerChain:
         return sweeps.unpack(states, len(start))
 
     def track(self, launch: ArrayLike, turns: int, *, keep_lost: bool = False) -> Array:
-        """States at the start of the ring after 0, 1, ..., turns turns.
+        """Return states at the start of the ring after 0, 1, ..., turns turns.
 
         Args:
             launch: states at the start, [batch, n].
@@ -164,7 +165,7 @@ class LayerChain:
             ValueError: a launch of another shape, or no turn.
         """
         if turns < 1:
-            raise ValueError(f"{turns} turns cannot be tracked; one at least can")
+            raise ValueError(f"{turns} turns cannot be tracked; give at least one")
         states = self._turns(self._start(launch), turns)
         if keep_lost:
             lost = ~np.all(np.abs(states) < APERTURE, axis=2)
@@ -204,8 +205,8 @@ class LayerChain:
     def one_turn_map(self, x: ArrayLike | None = None) -> tuple[Array, Array]:
         """Image and Jacobian of one turn at the state x [n] (else the origin): [n], [n, n].
 
-        The product of the layers' own Jacobians along the trajectory: exact for the chain, where
-        a composed second-order map of the turn would not be.
+        The product of the layers' Jacobians along the trajectory is exact for the chain, unlike a
+        composed second-order map.
         """
         x = np.zeros(self.dimension) if x is None else np.asarray(x, dtype=float)
         path, total = self.tangents(x)
@@ -219,16 +220,16 @@ class LayerChain:
         turn: ArrayLike = 0.0,
         tolerance: float = 1e-14,
     ) -> tuple[Array, Array]:
-        """The orbit that repeats after a turn, by Newton's method: `tangents` about it.
+        """Find the closed orbit by Newton's method, and return `tangents` at it.
 
         Args:
-            start: first guess, [n]; what is not free stays as it is here.
-            free: coordinates of the start that are free; as many, from the first on, repeat.
-            turn: what a turn should change these by, [free].
+            start: first guess, [n]; fixed coordinates keep its value.
+            free: free coordinates of the start; as many, from the first on, repeat.
+            turn: prescribed change of these in a turn, [free].
             tolerance: m and rad, or 1e-12 of the largest free coordinate.
 
         Raises:
-            UnstableRingError: there is none within reach.
+            UnstableRingError: no closed orbit is found.
         """
         x = np.zeros(self.dimension) if start is None else np.array(start, dtype=float)
         free = np.asarray(free, dtype=np.intp)
@@ -246,7 +247,7 @@ class LayerChain:
 
 
 class Chain(LayerChain):
-    """Second-order layers, one per magnet, read by the ring's monitors.
+    """Second-order layers, one per magnet, with the read-outs of the ring's monitors.
 
     Layer k sends the state x at the exit of magnet k - 1 to W0[k] + W1[k] x + W2[k] x^[2] at the
     exit of magnet k. States are OCELOT's (x, px, y, py), or (x, px, y, py, tau, p), in m and units
@@ -262,7 +263,7 @@ class Chain(LayerChain):
     @classmethod
     @by_name
     def from_ring(cls, ring: Ring, dimension: int = 4) -> Self:
-        """The chain of a ring's design, from OCELOT's maps.
+        """Return the chain of a ring's design, from OCELOT's maps.
 
         Args:
             ring: see `load_ring`.
@@ -273,11 +274,11 @@ class Chain(LayerChain):
         return made
 
     def weights(self) -> tuple[Array, Array, Array]:
-        """W0 [layer, n], W1 [layer, n, n], W2 [layer, n, n (n + 1) / 2]: do not change them."""
+        """W0 [layer, n], W1 [layer, n, n], W2 [layer, n, n (n + 1) / 2]; read-only."""
         return self.maps.W0, self.maps.W1, self.maps.W2
 
     def readings(self, launch: ArrayLike) -> Array:
-        """(x, y) of every monitor on one pass, [batch, monitor, 2], m.
+        """Return (x, y) at every monitor on one pass, [batch, monitor, 2], m.
 
         Raises:
             BeamLostError: names the layer where a trajectory was lost.
@@ -288,7 +289,7 @@ class Chain(LayerChain):
         return sweeps.unpack(readings, len(start))
 
     def turn(self) -> Layers:
-        """One whole turn: the layers as they are now, then the way to the ring's end; a copy."""
+        """A copy of the layers of one turn, with the drift to the ring's end."""
         return Layers.of(self.maps, self.weights())
 
     def layer_map(self, layer: int) -> TaylorMap:
@@ -304,15 +305,15 @@ class Chain(LayerChain):
         sweeps.run(sweeps.track, len(history), size, *turn.W, turn.curved, history)
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
-        from the start to there, d state / d launch, [layer + 2, n, n]."""
+        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state /
+        d launch there, [layer + 2, n, n]."""
         return self.trajectory(x)
 
     def trajectory(
         self, x: ArrayLike, turns: int = 1, cavities: Cavities = NO_RF
     ) -> tuple[Array, Array]:
-        """The same over many turns, with the RF: [step + 1, n] and [step + 1, n, n], a turn of
-        layer + 1 steps.
+        """Return the same over many turns, with the RF: [step + 1, n] and [step + 1, n, n], a turn
+        of layer + 1 steps.
 
         Args:
             x: launch, [n].
@@ -329,8 +330,8 @@ class Chain(LayerChain):
 
 
 def tangents(network: LayerChain, x: Array) -> tuple[Array, Array, Array]:
-    """States [layer + 1, n] at the launch x [n] and all exits, Jacobians M [layer + 1, n, n] of
-    them by the launch, and the inverses of these."""
+    """States [layer + 1, n] for the launch x [n], at all exits, their Jacobians M [layer + 1, n, n]
+    by the launch, and the inverses of these."""
     path, total = network.tangents(x)
     M = total[:-1]
     return path[:-1], M, np.asarray(np.linalg.inv(M), dtype=float)

@@ -45,7 +45,7 @@ class Columns:
         layer: of each, [column].
         slope: d v / d x of the kick v at the layer's exit, 1/rad, [column, n, n].
         start: the closed orbit at the start of the ring for one radian, [column, n].
-        pulled: the kick at the layer's exit as a change of the launch, [column, n].
+        launch_kick: the kick at the layer's exit as a change of the launch, [column, n].
     """
 
     names: tuple[str, ...]
@@ -54,22 +54,22 @@ class Columns:
     layer: Indices
     slope: Array
     start: Array
-    pulled: Array
+    launch_kick: Array
 
 
 class ResponseModel:
     """A ring's closed orbit at fixed RF frequency and its derivatives, from the layers' maps.
 
-    Cavities are drifts: a stored beam on the closed orbit meets the RF at the phase that gives
-    back what it lost, and a static orbit needs no more than that.
+    Cavities are drifts: on the closed orbit the beam meets the RF at the phase that replaces its
+    loss, and a static orbit needs nothing else.
 
     Args:
         ring: with its errors and settings.
-        dimension: 6; or 4 for a beam whose energy stays, whatever the correctors do.
+        dimension: 6; or 4 for a beam of constant energy.
         frequency: relative change of the RF frequency from the one at which the design orbit is
             closed; six coordinates.
-        astray: kicks that the design orbit follows and other energies do not, behind each magnet in
-            x and y, see `beam.kicks`, rad, [magnet, 2]; six coordinates. None: there are none.
+        orbit_kicks: kicks along the design orbit that act on other energies, behind each magnet in
+            x and y, see `beam.kicks`, rad, [magnet, 2]; six coordinates. None: no kicks.
 
     Attributes:
         ring, layers, maps, frequency, astray: what it was made from.
@@ -93,13 +93,15 @@ class ResponseModel:
         ring: Ring,
         dimension: int = 6,
         frequency: float = 0.0,
-        astray: Array | None = None,
+        orbit_kicks: Array | None = None,
     ) -> None:
-        if astray is not None and (dimension != 6 or astray.shape != (len(ring.magnets), 2)):
-            raise ValueError("kicks astray are [magnet, 2], and of six coordinates")
+        if orbit_kicks is not None and (
+            dimension != 6 or orbit_kicks.shape != (len(ring.magnets), 2)
+        ):
+            raise ValueError("kicks of the orbit are [magnet, 2], and need six coordinates")
         self.ring = ring
         self.layers = LayerMaps(ring, dimension)
-        self.astray = astray
+        self.orbit_kicks = orbit_kicks
         magnets = np.arange(len(ring.magnets))
         self.maps = self._dispersed(ring_maps(ring, dimension, self.layers), magnets)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
@@ -107,7 +109,7 @@ class ResponseModel:
         self._close(frequency)
 
     def at_frequency(self, frequency: float) -> "ResponseModel":
-        """The same ring, its maps not made again, at another RF frequency (relative change).
+        """Return the same ring, with its maps, at another RF frequency (relative change).
 
         Raises:
             UnstableRingError: no closed orbit.
@@ -118,8 +120,8 @@ class ResponseModel:
         return other
 
     def at_energy(self, deviation: float) -> "ResponseModel":
-        """The same ring at the RF frequency that changes the closed orbit's energy by so much from
-        here, relative, to first order.
+        """Return the same ring at the RF frequency that changes the closed orbit's energy by a
+        relative deviation, to first order.
 
         Raises:
             UnstableRingError: no closed orbit.
@@ -127,8 +129,8 @@ class ResponseModel:
         return self.at_frequency(self.frequency + deviation / self.rf_start[5])
 
     def changed_to(self, ring: Ring) -> "ResponseModel":
-        """Of a ring that differs in some elements, not in their places: only their layers are made
-        anew.
+        """Return the model of a ring with other elements in the same places: only their layers are
+        computed anew.
 
         Raises:
             UnstableRingError: no closed orbit.
@@ -136,7 +138,7 @@ class ResponseModel:
         other = copy(self)
         other.ring = ring
         other.layers, touched = self.layers.changed_to(ring)
-        if touched:  # else what kicks do is another, and the orbit is the same
+        if touched:  # else the kicks differ, and the orbit is the same
             other._forget()
             other.maps = other._dispersed(changed_maps(self.maps, other.layers, touched), touched)
             other._chain = Chain(other.maps)
@@ -144,28 +146,28 @@ class ResponseModel:
         return other
 
     def _dispersed(self, maps: RingMaps, layers: Sequence[int] | Indices) -> RingMaps:
-        """With what `astray` says behind some layers."""
-        if self.astray is None:
+        """Return the maps with the orbit kicks behind some layers."""
+        if self.orbit_kicks is None:
             return maps
-        own = np.array([k for k in layers if k < len(self.astray)], dtype=np.int64)
+        own = np.array([k for k in layers if k < len(self.orbit_kicks)], dtype=np.int64)
         arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2")}
         for weights in arrays.values():
-            weights[own] = self._with_astray(own, weights[own])
+            weights[own] = self._with_orbit_kicks(own, weights[own])
         return replace(maps, **arrays)
 
-    def _with_astray(self, layers: Indices, weights: Array) -> Array:
-        """Weights of some layers, and behind each px -= kick p, and tau -= kick x, or the map
-        were not symplectic, [layer, n, ...]."""
-        if self.astray is None:
+    def _with_orbit_kicks(self, layers: Indices, weights: Array) -> Array:
+        """Weights of some layers, and behind each px -= kick p and tau -= kick x, which makes the
+        map symplectic, [layer, n, ...]."""
+        if self.orbit_kicks is None:
             return weights
         behind = np.tile(np.eye(self.dimension), (len(layers), 1, 1))
         for plane in (0, 1):
-            kick = self.astray[layers, plane]
+            kick = self.orbit_kicks[layers, plane]
             behind[:, 2 * plane + 1, 5] = behind[:, 4, 2 * plane] = -kick
         return np.asarray(np.einsum("kij,kj...->ki...", behind, weights))
 
     def _forget(self) -> None:
-        """What is cached is of this orbit."""
+        """Drop what was cached for the previous orbit."""
         for name in ("closing", "inverse", "rf_start"):
             self.__dict__.pop(name, None)
 
@@ -190,20 +192,20 @@ class ResponseModel:
 
     @cached_property
     def inverse(self) -> Array:
-        """Of the tangents: matrices from there to the start, [layer + 2, n, n]."""
+        """Matrices from the places of the tangents to the start, [layer + 2, n, n]."""
         try:
             return np.asarray(np.linalg.inv(self.tangents))
-        except np.linalg.LinAlgError:  # the matrices have grown beyond all bounds
+        except np.linalg.LinAlgError:  # the matrices have overflown
             raise UnstableRingError(NO_ORBIT) from None
 
     @property
     def dimension(self) -> int:
-        """4 or 6."""
+        """Number of coordinates, 4 or 6."""
         return self.layers.dimension
 
     @property
     def monitors(self) -> tuple[str, ...]:
-        """In the order of the readings."""
+        """Monitors in the order of the readings."""
         return self.maps.monitors
 
     @property
@@ -213,7 +215,7 @@ class ResponseModel:
 
     @cached_property
     def correctors(self) -> tuple[str, ...]:
-        """All of the ring, in beam order."""
+        """All correctors of the ring, in beam order."""
         return tuple(e.name for e in self.ring.elements if e.kind in CORRECTORS)
 
     @cached_property
@@ -230,11 +232,11 @@ class ResponseModel:
         return -self._solve[:, 4] * self.slip
 
     def columns(self, correctors: Sequence[str] | None = None) -> Columns:
-        """Correctors as sources; None: all of the ring.
+        """Return correctors as sources; None: all of the ring.
 
         Raises:
             UnknownNameError: no such element.
-            MeasurementError: one that is no corrector.
+            MeasurementError: an element that is not a corrector.
         """
         ring = self.ring
         names = self.correctors if correctors is None else correctors
@@ -244,20 +246,20 @@ class ResponseModel:
             element = ring.elements[i]
             if element.kind not in CORRECTORS:
                 raise MeasurementError(
-                    f"'{element.name}' is a {element.kind}, no corrector; name a corrector"
+                    f"'{element.name}' is a {element.kind}, not a corrector; name a corrector"
                 )
             planes.append(CORRECTORS[element.kind])
         layer = self.layers.layer_of[place] if len(place) else np.empty(0, dtype=np.int64)
         kick, slope = self._kicks(place, layer)
-        pulled = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
+        launch_kick = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
         return Columns(
             names=tuple(ring.elements[i].name for i in place),
             planes=tuple(planes),
             place=place,
             layer=layer,
             slope=slope,
-            start=pulled @ self.closing.T,
-            pulled=pulled,
+            start=launch_kick @ self.closing.T,
+            launch_kick=launch_kick,
         )
 
     def response(self, correctors: Sequence[str] | None = None) -> Array:
@@ -268,11 +270,11 @@ class ResponseModel:
 
         Raises:
             UnknownNameError: no such element.
-            MeasurementError: one that is no corrector.
+            MeasurementError: an element that is not a corrector.
         """
         columns = self.columns(correctors)
         before = np.einsum("mai,ci->cma", self.reading_slopes, columns.start)
-        after = np.einsum("mai,ci->cma", self.reading_slopes, columns.pulled)
+        after = np.einsum("mai,ci->cma", self.reading_slopes, columns.launch_kick)
         return np.asarray(before + self.downstream(columns)[:, :, None] * after)
 
     def downstream(self, columns: Columns) -> NDArray[np.bool_]:
@@ -285,12 +287,12 @@ class ResponseModel:
         Second order in every layer, as the maps are; `response` is its derivative.
 
         Args:
-            correctors: one for each orbit; a name may stand many times.
+            correctors: one for each orbit, also repeatedly.
             kicks: added to the corrector's own, rad, [orbit].
 
         Raises:
             UnknownNameError: no such element.
-            UnstableRingError: no closed orbit within reach.
+            UnstableRingError: no closed orbit is found.
         """
         n, ring = self.dimension, self.ring
         turn = self._chain.turn()
@@ -305,7 +307,7 @@ class ResponseModel:
             changed = element.changed(angle=element.angle + float(kick))
             replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
         V0, V1, V2 = (
-            self._with_astray(layer, np.stack(own)) for own in zip(*replaced, strict=True)
+            self._with_orbit_kicks(layer, np.stack(own)) for own in zip(*replaced, strict=True)
         )
         good = np.zeros(len(paths), dtype=bool)
         share(
@@ -317,7 +319,7 @@ class ResponseModel:
         return self._read(paths[:, self.maps.at])
 
     def _read(self, here: Array) -> Array:
-        """Readings [..., monitor, 2] of the states at the exits that the monitors hang on."""
+        """Readings [..., monitor, 2] of the states at the monitors' exits."""
         maps = self.maps
         bent = np.einsum("maij,...mj->...mai", second_derivatives(maps.R2), here)
         return np.asarray(maps.R0 + np.einsum("...mai,...mi->...ma", maps.R1 + bent / 2, here))
@@ -331,14 +333,14 @@ class ResponseModel:
         to half a step above, not linearised, m, [monitor, 2].
 
         Raises:
-            UnstableRingError: no closed orbit within reach.
+            UnstableRingError: no closed orbit is found.
         """
         up, down = (self.at_frequency(self.frequency + side * step / 2) for side in (1, -1))
         return up.readings - down.readings
 
     def _kicks(self, place: Indices, layer: Indices) -> tuple[Array, Array]:
-        """Correctors' kicks at their layers' exits, [column, n], and how they depend on the state
-        at the entrances, [column, n, n]; the maps are the same on every orbit."""
+        """Correctors' kicks at their layers' exits, [column, n], and their slopes by the state at
+        the entrances, [column, n, n]; the maps are the same on every orbit."""
         memory, key = self.layers.memory, ("kicks", place.tobytes())
         if key not in memory:
             slopes = [self._map_slope(self.ring.elements[i]) for i in place]
@@ -351,7 +353,7 @@ class ResponseModel:
         return W0 + np.einsum("cai,ci->ca", W1 + bent / 2, x), W1 + bent
 
     def _map_slope(self, corrector: Element) -> Quadratic:
-        """d map / d kick; equal correctors share it."""
+        """d map / d kick; shared by equal correctors."""
         layers = self.layers
         key = ("kick", layers.physics(corrector))
         if key not in layers.memory:

@@ -1,4 +1,4 @@
-"""What a moved closed orbit makes of the matrices behind it."""
+"""Feed-down: changes of the matrices by a displaced closed orbit."""
 
 from typing import Any
 
@@ -14,16 +14,16 @@ Array = NDArray[np.float64]
 def feed_down(
     model: ResponseModel, back: NDArray[np.floating[Any]], into: NDArray[np.floating[Any]]
 ) -> Array:
-    """Sources C^-1 T''(., C da) C that a change da of the closed orbit's launch makes before each
-    exit, summed, [layer + 2, n, n, n], da the last axis.
+    """Sources C^-1 T''(., C da) C for a change da of the closed orbit's launch, summed before each
+    exit, [layer + 2, n, n, n], da the last axis.
 
     Args:
         model: closed orbit, maps and matrices.
         back, into: matrices from the layers' exits to the start and from there into the layers, of
-            whatever moves about the closed orbit, [layer + 2, n, n].
+            the motion around the closed orbit, [layer + 2, n, n].
     """
     maps, n = model.maps, model.dimension
-    W2 = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])  # the closing way too
+    W2 = np.concatenate([maps.W2, maps.closing.coefficients[2][None]])  # with the closing drift
     j = np.flatnonzero(W2.any(axis=(1, 2)))
     summed = np.zeros((len(W2) + 1, n, n, n))
     summed[j + 1] = np.einsum(

@@ -25,18 +25,18 @@ _ROUNDING = 1e-16
 
 @jit
 def _scratch(size):  # type: ignore[no-untyped-def]
-    """Room for a layer: the state x, its image y, the middle m, the step d [n, lane each], and the
+    """Buffer of a layer: the state x, its image y, the middle m, the step d [n, lane each], and the
     largest change of the middle [lane].
 
-    One flat array, whose parts the compiler knows to be apart: with five arrays it tests before
-    every short loop whether they overlap, which costs as much as the loop.
+    It is one flat array, so that the compiler knows its parts as disjoint: with five arrays it
+    tests for overlaps before every short loop, which costs as much as the loop.
     """
     return np.zeros((4 * len(size[0]) + 1) * len(size[1]))
 
 
 @jit
 def _part(size, work, which):  # type: ignore[no-untyped-def]
-    """x, y, m or d (0 to 3) of the room as [n, lane], a view."""
+    """x, y, m or d (0 to 3) of the buffer as [n, lane], a view."""
     n, lanes = len(size[0]), len(size[1])
     return work[which * n * lanes : (which + 1) * n * lanes].reshape((n, lanes))
 
@@ -80,8 +80,8 @@ def _middle(size, work):  # type: ignore[no-untyped-def]
 
 @jit
 def _largest(size, work):  # type: ignore[no-untyped-def]
-    """Over the lanes, a power of two of them; NaN is passed over. Halves are compared with halves:
-    the vector unit does it, as it does not a plain maximum."""
+    """Maximum over the lanes, a power of two; NaN is ignored. Comparing halves is vectorised; not
+    a plain maximum."""
     first, half = 4 * len(size[0]) * len(size[1]), len(size[1]) // 2
     while half > 0:
         for v in range(half):
@@ -93,7 +93,7 @@ def _largest(size, work):  # type: ignore[no-untyped-def]
 
 @jit
 def _layer(size, k, W0, W1, c, A, Q, moves, flat, work):  # type: ignore[no-untyped-def]
-    """x of the room becomes its image by layer k; m is left as the middle."""
+    """Replace x of the buffer by its image through layer k; m is the middle."""
     n, lanes = len(size[0]), len(size[1])
     y, m, d, change = n * lanes, 2 * n * lanes, 3 * n * lanes, 4 * n * lanes
     for a in range(n):
@@ -119,7 +119,7 @@ def _layer(size, k, W0, W1, c, A, Q, moves, flat, work):  # type: ignore[no-unty
             else:
                 _polynomial(size, k, c, A, Q, moves, _part(size, work, 2), _part(size, work, 3))
             left = _middle(size, work)
-            # What is still wrong is this change times the factor by which changes shrink.
+            # remaining error: this change times the convergence factor
             if not 4.0 * left * left > _ROUNDING * scale * before:
                 break
             before = left
@@ -184,7 +184,7 @@ def reverse(  # type: ignore[no-untyped-def]
     n, lane] = d loss / d field at the layer's middle (entry k + 1 is of layer k).
 
     With F the field's slope at the middle, mu = adjoint + F^T mu / 2 is solved as the step was,
-    and what goes back through the matrix is 2 mu - adjoint.
+    and 2 mu - adjoint is carried back through the matrix.
     """
     n, lanes = len(size[0]), len(size[1])
     slope = np.empty((n, lanes))

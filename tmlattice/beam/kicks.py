@@ -1,9 +1,8 @@
-"""What the closed orbit's own kicks do: the orbit that they make, and the dispersion.
+"""Orbit and dispersion of the closed orbit's own kicks.
 
-Whatever kicks a stored beam (errors of bends, displaced quadrupoles, correctors that put its orbit
-straight) kicks it less where its energy is higher, by the share of the energy. The orbit hardly
-tells these kicks, for they were made to cancel in it; the dispersion does, and no gradient makes
-what they add to it.
+The kicks of a stored beam (errors of bends, displaced quadrupoles, correctors that compensate them)
+are weaker at higher energy, by the relative energy. They hardly show in the orbit, in which they
+were made to cancel. They show in the dispersion, where no gradient makes the same contribution.
 """
 
 from collections.abc import Sequence
@@ -18,40 +17,40 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 KICKING = ({"bend", "quadrupole", "hcorrector"}, {"bend", "quadrupole", "vcorrector"})
-"""Magnets that a closed orbit has its kicks of, in x and in y."""
+"""Kinds of magnets that kick a closed orbit, in x and in y."""
 
 
 def kicking(ring: Ring, plane: int) -> Indices:
-    """The magnets that kick in a plane, as their places among the ring's magnets."""
+    """Indices of the magnets that kick in a plane."""
     return np.array([i for i, e in enumerate(ring.magnets) if e.kind in KICKING[plane]], dtype=int)
 
 
 def orbits_of_kicks(
     model: ResponseModel, sources: Sequence[int] | Indices, exits: Indices, rows: Array, plane: int
 ) -> Array:
-    """Closed orbit by a kick of 1 rad behind each of some magnets, m, [place, source].
+    """Closed orbit for a kick of 1 rad behind each of some magnets, m, [place, source].
 
     Args:
         model: of the ring.
         sources: magnets.
-        exits: of how many magnets each place is behind, [place].
+        exits: number of magnets before each place, [place].
         rows: d orbit / d state there, [place, n].
         plane: of the kicks.
     """
     behind = np.asarray(sources) + 1
     kick = np.zeros((len(behind), model.dimension))
     kick[:, 2 * plane + 1] = 1.0
-    pulled = np.einsum("kij,kj->ki", model.inverse[behind], kick)
-    start = pulled @ model.closing.T
-    return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ pulled.T))
+    launch_kick = np.einsum("kij,kj->ki", model.inverse[behind], kick)
+    start = launch_kick @ model.closing.T
+    return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ launch_kick.T))
 
 
 def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
-    """What a step of the RF adds to the orbit at the monitors by a kick of 1 rad behind each magnet
-    that kicks in a plane, m, [monitor, source].
+    """Change of an RF step's orbit by a kick of 1 rad behind each magnet that kicks in a plane, m,
+    [monitor, source].
 
-    A particle of more energy is kicked less; and as it passes beside the axis its way is longer
-    there by as much, so that another energy belongs to the step.
+    A particle of higher energy is kicked less. Away from the axis its path is longer by the same
+    share, which changes the energy of the step.
 
     Args:
         model: of the ring, six coordinates.
@@ -67,12 +66,12 @@ def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
 
 
 def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, plane: int) -> Array:
-    """What a kick of 1 rad behind each magnet that kicks in a plane adds to the dispersion behind
-    some layers, m per relative energy, [layer, source].
+    """Change of the dispersion behind some layers by a kick of 1 rad behind each magnet that kicks
+    in a plane, m per relative energy, [layer, source].
 
     Args:
         model: of the ring, six coordinates.
-        layers: behind which.
+        layers: indices.
         plane: 0 or 1.
     """
     behind = np.asarray(layers) + 1
@@ -89,8 +88,8 @@ def _energies(model: ResponseModel, plane: int) -> Array:
 
 
 def energy_of_way(model: ResponseModel) -> float:
-    """Relative energy that a fixed frequency asks for, of a way that is longer by a metre, 1/m: a
-    kick of 1 rad lengthens it by the dispersion where it stands."""
+    """Relative energy at a fixed frequency for a path that is longer by a metre, 1/m; a kick of
+    1 rad lengthens it by the dispersion at its position."""
     return float(-model.rf_start[5] / model.slip)
 
 
@@ -101,19 +100,18 @@ def by_energy(
     at_monitors: Array,
     at_correctors: Array,
 ) -> Array:
-    """What a dispersion that the model does not have adds to correctors' orbits at a fixed
-    frequency, m/rad, [corrector, monitor, 2].
+    """Change of correctors' orbits at a fixed frequency by a dispersion beyond the model's, m/rad,
+    [corrector, monitor, 2].
 
-    A corrector's orbit is longer by its kick times the dispersion where it stands, and the energy
-    follows: the kicks that a particle of another energy misses lengthen its way, for their map is
-    symplectic. So the dispersion at correctors counts as much as that at monitors.
+    A corrector's orbit is longer by its kick times the dispersion at its position, and the energy
+    follows. As the map is symplectic, the dispersion at correctors counts as much as that at
+    monitors.
 
     Args:
         model: of the ring, six coordinates.
         names: of the correctors.
-        at: the monitors' places among the ring's, [monitor].
-        at_monitors: the RF's orbit over the energy that its step makes in the model, m, [monitor,
-            2].
+        at: indices of the monitors among the ring's, [monitor].
+        at_monitors: the RF's orbit over the energy of its step in the model, m, [monitor, 2].
         at_correctors: in the plane of each, m per relative energy, [corrector].
     """
     own = model.rf_response()[at] / model.rf_start[5]

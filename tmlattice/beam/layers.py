@@ -1,4 +1,4 @@
-"""The layers of one turn as stacked weights: one record for whoever needs them."""
+"""The layers of one turn as stacked weights."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ LayerParts = tuple[Weights, list[Weights]]
 
 @dataclass(frozen=True)
 class Layers:
-    """A turn: every layer, then the way from the last magnet to the ring's end.
+    """A turn: every layer, then the drift from the last magnet to the ring's end.
 
     Step k sends the state x at exit k to W0[k] + W1[k] x + W2[k] x^[2] at exit k + 1, the products
     in the reduced Kronecker order x1^2, x1 x2, ..., xn^2. A monitor reads R0 + R1 x + R2 x^[2].
@@ -26,7 +26,7 @@ class Layers:
     Attributes:
         W: W0 [step, n], W1 [step, n, n], W2 [step, n, n (n + 1) / 2].
         R: R0 [monitor, 2], R1 [monitor, 2, n], R2 [monitor, 2, n (n + 1) / 2].
-        at: the exit that each monitor hangs on, rising, [monitor].
+        at: the exit of each monitor's state, rising, [monitor].
         start: the monitors at exit k are start[k] to start[k + 1] - 1.
     """
 
@@ -37,7 +37,7 @@ class Layers:
 
     @classmethod
     def of(cls, maps: RingMaps, weights: Weights | None = None) -> "Layers":
-        """Arrays of their own, that may be written to; other weights of the layers on request."""
+        """Return writable copies of the arrays; optionally with other weights of the layers."""
         weights = (maps.W0, maps.W1, maps.W2) if weights is None else weights
         closing = maps.closing.coefficients
         W0, W1, W2 = (np.concatenate([w, c[None]]) for w, c in zip(weights, closing, strict=True))
@@ -46,16 +46,16 @@ class Layers:
 
     @property
     def steps(self) -> int:
-        """Of a turn: the layers and the closing way."""
+        """Steps of a turn: the layers and the closing drift."""
         return len(self.W[0])
 
     @property
     def curved(self) -> NDArray[np.bool_]:
-        """Which steps have a second order, [step]."""
+        """Whether each step has a second order, [step]."""
         return curved(self.W[2])
 
     def put(self, parts: Mapping[int, LayerParts]) -> dict[int, LayerParts]:
-        """Write layers, in place; returns what was there."""
+        """Write layers in place; return the previous ones."""
         steps = np.fromiter(parts, dtype=np.intp)
         reads = [(int(self.start[k]), len(found)) for k, (_, found) in parts.items()]
         rows = np.array([row for s, m in reads for row in range(s, s + m)], dtype=np.intp)
@@ -76,7 +76,7 @@ class Layers:
 
     @contextmanager
     def with_parts(self, parts: Mapping[int, LayerParts]) -> Iterator[None]:
-        """These layers meanwhile."""
+        """Replace these layers within a context."""
         before = self.put(parts)
         try:
             yield

@@ -1,4 +1,4 @@
-"""The model's side of a diagnosis: a ring as its shots saw it, and every hypothesis about it."""
+"""The model of a diagnosis: a ring with its shots, and every hypothesis."""
 
 from collections.abc import Sequence
 
@@ -16,16 +16,15 @@ Array = NDArray[np.float64]
 
 
 class Model(TrackedShots):
-    """A ring as the shots of a measurement saw it, and every hypothesis about it.
+    """A ring as in the shots of a measurement, and every hypothesis.
 
     Args, attributes, errors: those of `TrackedShots`.
     """
 
     def hypotheses(self, effects: Sequence[str] | None = None) -> list[Hypothesis]:
-        """Every effect at every place that it can sit on, in the catalogue's order.
+        """Return every effect at every place, in the catalogue's order.
 
-        Effects that are there or not (swapped, dead) are included; the energy's only in six
-        coordinates.
+        Discrete effects (swapped, dead) are included; the energy's only in six coordinates.
         """
         chosen = names() if effects is None else list(effects)
         found: list[Hypothesis] = []
@@ -37,23 +36,23 @@ class Model(TrackedShots):
     def signatures(self, paths: Paths, hypotheses: Sequence[Hypothesis], launches: Array) -> Array:
         """d readings / d amount ** power of every hypothesis, [hypothesis, shot, reading, 2].
 
-        For what is discrete: the change when it is there.
+        For a discrete effect: its change of the readings.
 
         Args:
-            paths: of the model as it stands.
+            paths: of the model.
             hypotheses: see `hypotheses`.
             launches: those of the paths.
         """
         return signatures.signatures(self, paths, hypotheses, launches)
 
     def reading_signatures(self, paths: Paths, effect: str) -> Array:
-        """The same for one effect on readings at every monitor at once, [shot, reading, 2]."""
+        """The same for one effect on readings at every monitor, [shot, reading, 2]."""
         own = find(effect)
         assert isinstance(own, ReadingEffect)
         return signatures.of_readings(self, paths, own)
 
     def kick_signatures(self, paths: Paths, layers: NDArray[np.int64]) -> Array:
-        """d readings / d (px, py) kick in the middle of layers' magnets.
+        """d readings / d kick (px, py) in the middle of layers' magnets.
 
         Returns:
             [layer, 2, shot, reading, 2], m / rad.
@@ -63,7 +62,7 @@ class Model(TrackedShots):
     def free_kicks(
         self, paths: Paths, layers: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], Array]:
-        """A kick (px, py) in the middle of layers' magnets on one turn, as a change of the launch.
+        """Kicks (px, py) in the middle of layers' magnets on one turn, as changes of the launch.
 
         Returns:
             The first reading behind each, [layer], and [layer, 2, shot, n].
@@ -75,10 +74,10 @@ class Model(TrackedShots):
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
         """Hypotheses that are one kick on one turn, as changes of the launch.
 
-        Such a signature is the launch's own, cut off before a reading: `scan` needs no more.
+        Such a signature equals the launch's from a reading on: all that `scan` needs.
 
         Returns:
-            Which of the hypotheses these are, [kick]; the first reading behind each; and the
-            change of the launch, [shot, kick, n].
+            Indices of these hypotheses, [kick]; the first reading behind each; and the change of
+            the launch, [shot, kick, n].
         """
         return signatures.single_kicks(self, paths, hypotheses)

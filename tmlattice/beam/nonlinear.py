@@ -1,9 +1,9 @@
-"""Turns at a finite amplitude: fields of sextupoles and octupoles as kicks, the rest as mapped.
+"""Turns at a finite amplitude: sextupole and octupole fields as kicks, the rest as maps.
 
-A second-order map of a long sextupole lacks what the field does to its own kick, and is symplectic
-to second order only; of an octupole it has nothing. Over many turns both change the tunes as much
-as all sextupoles together do. Here the field of such a magnet is a kick at both ends and one in the
-middle, symplectic and of fourth order in the magnet's length L. In a field
+A second-order map of a long sextupole lacks the effect of the field on its own kick, and is
+symplectic to second order only; of an octupole it has nothing. Over many turns both change the
+tunes as much as all sextupoles together do. Here the field of such a magnet is a kick at both ends
+and one in the middle, symplectic and of fourth order in the magnet's length L. In a field
 B_y + i B_x = k_n z^n / n!, z = x + i y, with f = k_n L z^n / n!, the kicks are 1/6, 2/3 and 1/6 of
 px - i py = -f, and in the middle px + i py = L / 36 f conj(f') is added.
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 THIN = 1e-3
-"""m; the second-order map of a shorter magnet has all that its sextupole field does."""
+"""m; for shorter sextupoles the second-order map is complete."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class NonlinearTurn:
         fields: integrated k2 / 2 (1/m2) and k3 / 6 (1/m3) behind each step, times
             exp(-i (order + 1) tilt), [step, 2].
         second: factor of f conj(f') of these fields, m, [step].
-        exits: the step in front of which each exit of the layers stands, [layer + 2].
+        exits: the step before which each exit of the layers is, [layer + 2].
     """
 
     W: tuple[Array, Array, Array]
@@ -53,7 +53,7 @@ class NonlinearTurn:
 
 
 def nonlinear_turn(layers: LayerMaps) -> NonlinearTurn:
-    """The steps of a ring.
+    """Return the steps of a ring.
 
     Args:
         layers: of the ring, six coordinates.
@@ -101,7 +101,7 @@ def _fields(element: Element) -> tuple[complex, complex]:
 def track(
     states: Array, turns: int, way: NonlinearTurn, maps: RingMaps, cavities: Cavities
 ) -> Array:
-    """(x, y) at every monitor on every turn, [shot, turn, monitor, 2], m; NaN once lost.
+    """Track to (x, y) at every monitor on every turn, [shot, turn, monitor, 2], m; NaN if lost.
 
     Args:
         states: at the start of the ring, [shot, n].

@@ -1,4 +1,4 @@
-"""Where the beam is at the monitors, turn after turn, and where it was lost."""
+"""Beam positions at the monitors, turn by turn, and where the beam is lost."""
 
 from dataclasses import dataclass
 
@@ -13,12 +13,12 @@ from tmlattice.beam.sweeps import curved
 Array = NDArray[np.float64]
 
 APERTURE = 0.05
-"""m; a beam that is further from the axis at a magnet's exit is lost."""
+"""m; distance from the axis at a magnet's exit beyond which a beam is lost."""
 
 
 @dataclass(frozen=True)
 class Lost:
-    """Where a beam was lost.
+    """Place of a beam loss.
 
     Attributes:
         shot, turn: from 0.
@@ -34,11 +34,11 @@ class Lost:
 
 
 def lost(states: Array, names: tuple[str, ...], aperture: float = APERTURE) -> tuple[Lost, ...]:
-    """The shots whose beam leaves the aperture, and where.
+    """Return the shots whose beam leaves the aperture, and where.
 
     Args:
-        states: at the start and at every exit, turn after turn, [shot, step + 1, n].
-        names: of the layers; a turn has one step more, the way to its end.
+        states: at the start and at every exit, turn by turn, [shot, step + 1, n].
+        names: of the layers; a turn has one step more, the drift to its end.
         aperture: m.
     """
     outside = ~np.all(np.abs(states[:, :, 0:3:2]) < aperture, axis=2)  # true for NaN
@@ -56,7 +56,7 @@ def positions(
     cavities: Cavities = NO_RF,
     aperture: float = APERTURE,
 ) -> Array:
-    """(x, y) at every monitor on every turn, [shot, turn, monitor, 2], m; NaN once lost.
+    """Return (x, y) at every monitor on every turn, [shot, turn, monitor, 2], m; NaN if lost.
 
     Args:
         launches: [shot, n].

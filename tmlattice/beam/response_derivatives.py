@@ -1,16 +1,16 @@
-"""How errors change the orbit response: each effect of the ring in closed form, in factors.
+"""Derivatives of the orbit response by each effect of the ring, in closed form, as factors.
 
 To second order a corrector's kick and an error meet in four places. With the orbit's changes dc of
 a column (a corrector, or the RF) and da of the error, a new kick arises at the exit of
 
 - the error's layer: D'(x) dc, the slope of the error's direction D at the closed orbit x;
-- every layer that bends the map, where the error moves the closed orbit: T''(dc, da), feed-down;
-- the corrector's layer: v'(x) da, and what the error makes of the kick in the same element;
+- every curved layer, where the error moves the closed orbit: T''(dc, da), feed-down;
+- the corrector's layer: v'(x) da, and the error's change of the kick in the same element;
 
-and the read-outs gain the like. Every source is linear in dc = C u, u the column's change of the
-launch: dz before the corrector and dz + w behind it. So with P_j the sum of C^-1 (...) C over the
-layers before j, an error's change of the whole response is a few numbers for each monitor (what it
-reads of a launch is another) and for each column (its launch is another): see `Factors`.
+and the read-outs have corresponding terms. Every source is linear in dc = C u, u the column's
+change of the launch: dz before the corrector and dz + w behind it. So with P_j the sum of
+C^-1 (...) C over the layers before j, an error's change of the whole response is a few numbers for
+each monitor (its reading of a launch changes) and for each column (its launch changes): `Factors`.
 """
 
 from collections.abc import Hashable, Iterator, Sequence
@@ -33,7 +33,7 @@ Indices = NDArray[np.int64]
 Hypothesis = tuple[str, str | None]
 
 STILL = 1e-12
-"""m and rad per unit: an error whose own kick is smaller leaves the closed orbit where it is."""
+"""m and rad per unit: smaller kicks of an error are taken as no change of the closed orbit."""
 
 
 def derivatives(
@@ -41,10 +41,10 @@ def derivatives(
     hypotheses: Sequence[Hypothesis],
     correctors: Sequence[str] | None = None,
 ) -> Iterator[Array]:
-    """d (orbit response) / d amount of effects, one after another.
+    """Yield d (orbit response) / d amount of effects.
 
     Args:
-        model: the ring about which the response is linear; its monitors read without errors.
+        model: the ring of the linearisation; its monitors read without errors.
         hypotheses: (effect, place) of the catalogue, of effects on the ring.
         correctors: names; None: all of the ring, in beam order.
 
@@ -64,13 +64,13 @@ def derivatives(
 class Factors:
     """d (orbit response) / d amount of one error.
 
-    With the slopes' `start`, `pulled` and `readings` (u, p and G) a monitor before a column's
+    With the slopes' `start`, `launch_kick` and `readings` (u, p and G) a monitor before a column's
     corrector changes by seen u + G before, one behind it by seen (u + p) + G (before + behind).
 
     Attributes:
-        seen: change of what each monitor reads of the launch, [monitor, 2, n].
-        before, behind: change of each column's launch, and of what its kick adds to that, per unit
-            of the column's kick, [column, n].
+        seen: change of each monitor's reading of the launch, [monitor, 2, n].
+        before, behind: change of each column's launch, and of its kick as a launch, per unit of the
+            column's kick, [column, n].
     """
 
     seen: Array
@@ -79,16 +79,16 @@ class Factors:
 
 
 class ResponseSlopes:
-    """The derivatives of one response.
+    """Derivatives of one response.
 
     Args:
         model, correctors: see `derivatives`.
 
     Attributes:
-        start, pulled: each column's change of the launch per unit, and what its kick adds to that
-            behind it; the RF's last, [column, n].
-        readings: what the monitors read of the launch, [monitor, 2, n].
-        first: the first monitor behind each column's kick; there is none behind the RF's, [column].
+        start, launch_kick: each column's change of the launch per unit, and its kick as a further
+            change behind it; the RF's last, [column, n].
+        readings: the monitors' readings of the launch, [monitor, 2, n].
+        first: the first monitor behind each column's kick; none behind the RF's, [column].
 
     Raises:
         UnknownNameError, MeasurementError: see `ResponseModel.columns`.
@@ -100,30 +100,30 @@ class ResponseSlopes:
         n, at = model.dimension, model.maps.at
         rf = model.rf_start if n == 6 else np.zeros(n)
         self.start = np.vstack([columns.start, rf])
-        self.pulled = np.vstack([columns.pulled, np.zeros(n)])
+        self.launch_kick = np.vstack([columns.launch_kick, np.zeros(n)])
         self.readings = model.reading_slopes
         self.first = np.append(np.searchsorted(at, columns.layer, side="right"), len(at))
         self._exits = np.append(columns.layer + 1, 0)
         self._mixes: dict[Hashable, Quadratic] = {}
 
     def whole(self, change: Factors) -> Array:
-        """The derivative itself, [column, monitor, 2]: see `derivatives`."""
+        """Derivative of the whole response, [column, monitor, 2]: see `derivatives`."""
         n, shape = self.model.dimension, (len(self.start), *self.readings.shape[:2])
         seen = np.concatenate([change.seen, self.readings], axis=2).reshape(-1, 2 * n).T
         out = np.hstack([self.start, change.before]) @ seen
-        behind = np.hstack([self.pulled, change.behind]) @ seen
+        behind = np.hstack([self.launch_kick, change.behind]) @ seen
         there = np.arange(shape[1]) >= self.first[:, None]
         return np.asarray(out.reshape(shape) + there[:, :, None] * behind.reshape(shape))
 
     def picked(
         self, hypotheses: Sequence[Hypothesis], at: Indices, plane: Indices
     ) -> Iterator[Array]:
-        """The derivative by each hypothesis, as `whole`, of some readings alone, [column, monitor].
+        """Yield the derivative by each hypothesis, as `whole`, of some readings, [column, monitor].
 
         Args:
             hypotheses: see `factors`.
-            at: which monitors.
-            plane: that each column is read in, the RF's last, [column].
+            at: indices of the monitors.
+            plane: of each column's readings, the RF's last, [column].
         """
         parts = []
         for p in (0, 1):
@@ -134,20 +134,20 @@ class ResponseSlopes:
         for change in self.factors(hypotheses):
             for p, rows, there, readings in parts:
                 seen = np.hstack([change.seen[at, p], readings]).T
-                behind = np.hstack([self.pulled[rows], change.behind[rows]]) @ seen
+                behind = np.hstack([self.launch_kick[rows], change.behind[rows]]) @ seen
                 out[rows] = np.hstack([self.start[rows], change.before[rows]]) @ seen
                 out[rows] += there * behind
             yield out
 
     def factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
-        """The derivative by each hypothesis.
+        """Yield the derivative by each hypothesis, in factors.
 
         Raises:
             EffectError: an effect that does not act on the ring.
         """
         for name, _ in hypotheses:
             if not isinstance(find(name), RingEffect):
-                raise EffectError(f"'{name}' does not act on the ring; its derivative is not here")
+                raise EffectError(f"'{name}' does not act on the ring; it has no such derivative")
         return self._factors(hypotheses)
 
     def _factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
@@ -165,12 +165,12 @@ class ResponseSlopes:
             if np.abs(kicks[own]).max(initial=0.0) > STILL:
                 moved = self._moved(d.layer[own], kicks[own])
                 seen, behind, end = seen + moved[0], behind + moved[1], end + moved[2]
-            before = (self.start + self.pulled) @ end.T + behind
+            before = (self.start + self.launch_kick) @ end.T + behind
             yield Factors(seen, before @ model.closing.T, behind)
 
     def _own(self, d: Directions) -> tuple[Array, Array]:
-        """What each row of directions kicks the closed orbit by, [row, n], and by what more it
-        kicks a launch, [row, n, n]; both as changes of the launch."""
+        """Kick of each row of directions on the closed orbit, [row, n], and its slope by the
+        launch, [row, n, n]; both as changes of the launch."""
         model = self.model
         x, back = model.path[d.layer], model.inverse[d.layer + 1]
         bent = (second_derivatives(d.D2) @ x[:, None, :, None])[..., 0]
@@ -179,27 +179,27 @@ class ResponseSlopes:
         return kicks, back @ (d.D1 + bent) @ model.tangents[d.layer]
 
     def _stepped(self, layers: NDArray[np.int64], sources: Array) -> tuple[Array, Array, Array]:
-        """Of new kicks S u [row, n, n] in layers: what the monitors see of the launch; what of the
-        columns' own kicks comes too late for them, [column, n]; and their sum, [n, n]."""
-        seen, missed = np.zeros_like(self.readings), np.zeros_like(self.pulled)
+        """Terms of new kicks S u [row, n, n] in layers: in the monitors' readings of the launch; in
+        the columns' kicks behind the layers, [column, n]; and their sum, [n, n]."""
+        seen, missed = np.zeros_like(self.readings), np.zeros_like(self.launch_kick)
         for k, source in zip(layers, sources, strict=True):
             behind = np.searchsorted(self.model.maps.at, k, side="right")
             seen[behind:] += self.readings[behind:] @ source
-            missed += (self._exits > k)[:, None] * (self.pulled @ source.T)
+            missed += (self._exits > k)[:, None] * (self.launch_kick @ source.T)
         return seen, missed, sources.sum(axis=0)
 
     def _moved(self, layers: NDArray[np.int64], kicks: Array) -> tuple[Array, Array, Array]:
-        """Of an orbit that kicks [row, n] in layers move: what the monitors see of the launch, what
-        that adds to the columns' kicks, [column, n], and the sum of the layers' sources, [n, n]."""
+        """Terms of orbit kicks [row, n] in layers: in the monitors' readings of the launch, in the
+        columns' kicks, [column, n], and the sum of the layers' sources, [n, n]."""
         fed, seen_by, missed_by, own_by = self._fed
         everywhere = self.model.closing @ kicks.sum(axis=0)
         seen, added = seen_by @ everywhere, (own_by - missed_by) @ everywhere
         end = fed[-1] @ (everywhere + kicks.sum(axis=0))
         for k, kick in zip(layers, kicks, strict=True):
-            earlier = fed[k + 1] @ kick  # the kick is not there yet
+            earlier = fed[k + 1] @ kick  # before the kick
             behind = np.searchsorted(self.model.maps.at, k, side="right")
             seen[behind:] += seen_by[behind:] @ kick - self.readings[behind:] @ earlier
-            missed = missed_by @ kick - self.pulled @ earlier.T
+            missed = missed_by @ kick - self.launch_kick @ earlier.T
             added -= (self._exits > k)[:, None] * missed
             added += (self._exits > k + 1)[:, None] * (own_by @ kick)
             end -= earlier
@@ -207,12 +207,12 @@ class ResponseSlopes:
 
     @cached_property
     def _fed(self) -> tuple[Array, Array, Array, Array]:
-        """What a change of the orbit, as one of the launch (the last axis), makes by feed-down.
+        """Feed-down of a change of the orbit, as one of the launch (the last axis).
 
         Returns:
-            The sum of C^-1 T''(., C da) C over the layers before each, [layer + 2, n, n, n]; what a
-            monitor sees of a column's launch by it, [monitor, 2, n, n]; what of a column's own kick
-            comes too late for the sum; and what becomes of that kick itself, [column, n, n].
+            The sum of C^-1 T''(., C da) C over the layers before each, [layer + 2, n, n, n]; the
+            change of a monitor's reading of a column's launch, [monitor, 2, n, n]; the part of the
+            sum before a column's kick; and the change of that kick itself, [column, n, n].
         """
         model, maps, n = self.model, self.model.maps, self.model.dimension
         C, back, columns = model.tangents, model.inverse, self.columns
@@ -222,15 +222,15 @@ class ResponseSlopes:
         if maps.R2.any():
             bends = second_derivatives(maps.R2)
             seen += np.einsum("mpxy,mxb,myi->mpbi", bends, C[at], C[at], optimize=True)
-        missed = np.einsum("cabi,cb->cai", fed[self._exits], self.pulled)
-        own = np.zeros((len(self.pulled), n, n))
+        missed = np.einsum("cabi,cb->cai", fed[self._exits], self.launch_kick)
+        own = np.zeros((len(self.launch_kick), n, n))
         own[:-1] = back[columns.layer + 1] @ columns.slope @ C[columns.layer]
         return fed, seen, missed, own
 
     def _mixed(self, hypothesis: Hypothesis) -> Array:
-        """What an error in a corrector makes of its own kick, as a change of the launch."""
+        """Change of a corrector's kick by an error in it, as a change of the launch."""
         model, columns = self.model, self.columns
-        mixed = np.zeros_like(self.pulled)
+        mixed = np.zeros_like(self.launch_kick)
         effect, place = ring_effect(hypothesis[0]), hypothesis[1]
         members = effect.members(model.ring, place)
         for c in np.flatnonzero(np.isin(columns.place, members)):
@@ -242,7 +242,7 @@ class ResponseSlopes:
         return mixed
 
     def _mix(self, effect: RingEffect, place: int) -> Quadratic:
-        """d2 (map of a corrector) / d kick d amount; equal correctors share it."""
+        """d2 (map of a corrector) / d kick d amount; shared by equal correctors."""
         layers = self.model.layers
         element, h = layers.ring.elements[place], STEP * effect.largest
         key = (effect.name, layers.physics(element))

@@ -1,21 +1,21 @@
-"""Compiled: squares of changes of an orbit response that are given in factors."""
+"""Compiled: squares of changes of an orbit response in factors."""
 
 import numpy as np
 
 from tmlattice.compiled import jit_sums
 
 
-# The sum over readings (`reassoc`) may follow the vector unit's order.
+# `reassoc`: the sum may follow the vector unit's order.
 @jit_sums
 def squares(seen, readings, start, change, first, weight):  # type: ignore[no-untyped-def]
     """Weighted sum over all readings of (seen . start + readings . change)^2, [error].
 
     Args:
-        seen: what an error changes of what is read of a launch, [error, n, reading]; n is even.
-        readings: what is read of it, [n, reading].
+        seen: change of the readings of a launch by an error, [error, n, reading]; n is even.
+        readings: readings of a launch, [n, reading].
         start: launches of the columns, for the readings before and behind each column's kick,
             [2, column, n].
-        change: what an error changes of these, [2, error, column, n].
+        change: of these by an error, [2, error, column, n].
         first: the first reading behind each column's kick, [column].
         weight: of each reading, [column, reading].
     """

@@ -1,15 +1,15 @@
-"""The RF of a ring: where its cavities are, their voltage and frequency, and what they give.
+"""The RF of a ring: places, voltage, phase and frequency of its cavities.
 
-A cavity gives a particle p += V / (p0 c) sin(phase - 2 pi f tau / c): above transition, where a
-late particle (tau > 0) has too much energy, it must be given less; below, where it has too little,
-pi - phase gives it more. The phase makes good what the design orbit loses. A frequency other than
-the ring's own slips against the turns by L df / (f + df) each: on the first one it meets the beam
-at the design's phase.
+A cavity gives a particle p += V / (p0 c) sin(phase - 2 pi f tau / c). Above transition a late
+particle (tau > 0) has too much energy and must gain less; below, it must gain more, at the phase
+pi - phase. The gain at the phase equals the loss of the design orbit. A frequency other than the
+ring's own slips against the turns by L df / (f + df) each; on the first turn it meets the beam at
+the design's phase.
 
-What a lattice does not say comes from a rule. The harmonic number is the one nearest to 499.65 MHz,
-the frequency of most light sources (a circumference that fits 500 MHz fits it too, unless it is
-long); the voltage is four times what the ring loses when its bends and wigglers radiate, an
-over-voltage with which storage rings run.
+Defaults replace what a lattice does not state. The harmonic number is the one nearest to
+499.65 MHz, the frequency of most light sources (a circumference that fits 500 MHz fits it too,
+unless it is long). The voltage is four times the radiation loss of bends and wigglers, a usual
+over-voltage of storage rings.
 
 Source: M. Sands, SLAC-121 (1970), 3.
 """
@@ -27,11 +27,11 @@ from tmlattice.maps import ring_maps
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 FREQUENCY = 499.65e6
-"""Hz; where neither a cavity nor the caller says otherwise."""
+"""Hz; default without a cavity or an argument."""
 RELATIVISTIC = 1e3
-"""Above this gamma particles of other energies are as fast, to a millionth."""
+"""gamma above which the velocity is independent of the energy, to a millionth."""
 OVERVOLTAGE = 4.0
-"""Voltage of the RF over the loss of a turn, where no cavity says otherwise."""
+"""Default voltage of the RF over the loss of a turn."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class Rf:
     """The cavities of a ring.
 
     Attributes:
-        places: of the cavities, in `ring.elements`; their number stands for the ring's end.
+        places: indices of the cavities in `ring.elements`; their number means the ring's end.
         harmonic: RF periods in a turn.
         voltage: of all cavities together, V.
-        own: the ring has cavities: they are on although nothing is lost.
+        own: the ring has cavities, which are on without a loss too.
     """
 
     places: tuple[int, ...]
@@ -51,16 +51,16 @@ class Rf:
     own: bool
 
     def on(self, loss: float, frequency: float) -> bool:
-        """Whether a few turns feel it: the beam loses energy, or the operator set its frequency."""
+        """Whether it acts within a few turns: the beam loses energy, or the frequency was set."""
         return self.own or loss > 0 or frequency != 0
 
     def frequency(self, ring: Ring) -> float:
-        """Hz, of a beam on the design orbit; that of light for electrons, at their energies."""
+        """Frequency for the design orbit, Hz; electrons move at the speed of light."""
         return float(self.harmonic * speed_of(ring) / ring.length)
 
 
 def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None) -> Rf:
-    """The RF of a ring: its own cavities, else the marker or drift named `rf`, else its end.
+    """Return the RF of a ring: its cavities, else its marker or drift named `rf`, else its end.
 
     Args:
         ring: the design.
@@ -85,9 +85,9 @@ def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None)
 
 
 def stable_phase(ring: Ring, phase: float) -> float:
-    """The phase, or below transition the other one of the same gain.
+    """Return the phase, or below transition the other one of the same gain.
 
-    A turn's time grows with the energy by R_tau,p and by what the dispersion does, to first order.
+    The time of a turn grows with the energy by R_tau,p and the dispersion, to first order.
     Electrons are above transition in every ring.
     """
     if ring.gamma > RELATIVISTIC:
@@ -102,12 +102,12 @@ def stable_phase(ring: Ring, phase: float) -> float:
 
 
 def speed_of(ring: Ring) -> float:
-    """m/s; that of light where particles are as fast to 1e-6, as the lattices of electrons say."""
+    """Speed of the beam, m/s; that of light within 1e-6 of it, as in electron lattices."""
     return SPEED_OF_LIGHT * (ring.beta if ring.beta < 1 - 1e-6 else 1.0)
 
 
 def frequency_of(settings: Settings) -> float:
-    """The relative change of the RF frequency that a shot sets."""
+    """Relative change of the RF frequency in a shot's settings."""
     for name, setting in settings.items():
         if name.casefold() == "rf":
             return float(setting.get("frequency_relative", 0.0))
@@ -116,13 +116,13 @@ def frequency_of(settings: Settings) -> float:
 
 @dataclass(frozen=True)
 class Cavities:
-    """What the compiled loops need of the RF.
+    """Parameters of the RF for the compiled loops.
 
     Attributes:
-        exits: that the cavities stand behind: k is the exit of layer k - 1, and the number of
-            layers + 1 the ring's end; none: the RF is off, [cavity].
+        exits: positions of the cavities: k is the exit of layer k - 1, and the number of layers + 1
+            the ring's end; none: the RF is off, [cavity].
         values: gain of one cavity at its crest (relative), phase (rad), wave number (rad/m), and
-            what a turn is longer than the RF's (m), [4].
+            excess of a turn over the RF's (m), [4].
     """
 
     exits: NDArray[np.int64]
@@ -135,25 +135,25 @@ NO_RF = Cavities(np.empty(0, dtype=np.int64), np.zeros(4))
 def cavities(
     ring: Ring, rf: Rf, layer_of: Sequence[int] | NDArray[np.intp], loss: float, frequency: float
 ) -> Cavities:
-    """Thin cavities behind the magnets before them; what lies between is a drift, and commutes
-    with a gain of energy to its own second order.
+    """Return thin cavities behind the magnets before them; the drift between commutes with a gain
+    of energy to second order.
 
     Args:
-        ring: it stands in.
+        ring: with its elements.
         rf: of the ring.
         layer_of: the layer of each element.
         loss: relative energy loss of a turn on the design orbit.
         frequency: relative change of the frequency.
 
     Raises:
-        LatticeError: a voltage that cannot make good the loss.
+        LatticeError: a voltage below the loss.
     """
     if not rf.on(loss, frequency) or rf.voltage == 0:
         return NO_RF
     crest = rf.voltage / (ring.energy * 1e9 * ring.beta)
     if loss >= crest:
         raise LatticeError(
-            f"an RF of {rf.voltage / 1e6:.3g} MV cannot make good a loss of "
+            f"an RF of {rf.voltage / 1e6:.3g} MV cannot replace a loss of "
             f"{loss * ring.energy * 1e3:.3g} MeV a turn; give the ring's cavities their voltage"
         )
     wave = 2 * np.pi * rf.harmonic / ring.length * ring.beta * (1 + frequency)

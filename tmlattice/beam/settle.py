@@ -1,4 +1,4 @@
-"""Compiled: closed orbits of many settings of one corrector each, without linearisation."""
+"""Compiled: closed orbits for many settings of one corrector each, not linearised."""
 
 import numpy as np
 
@@ -9,18 +9,18 @@ from tmlattice.compiled import jit
 def settle(  # type: ignore[no-untyped-def]
     first, last, W0, W1, W2, curved, layer, V0, V1, V2, solve, turn, tolerance, paths, good
 ):
-    """Broyden's method from a given Jacobian.
+    """Find closed orbits by Broyden's method from a given Jacobian.
 
     Args:
         first, last: orbits of this call.
-        W0, W1, W2, curved: the ring's maps, its closing way the last, [map, ...].
+        W0, W1, W2, curved: the ring's maps, the closing drift last, [map, ...].
         layer: the map that is replaced, [orbit].
-        V0, V1, V2: what stands there instead, [orbit, ...].
-        solve: the start's change for a miss of the turn in the first coordinates, [n, free].
-        turn: what the turn should change them by, [free].
+        V0, V1, V2: its replacement, [orbit, ...].
+        solve: the start's change for a mismatch of the turn in the first coordinates, [n, free].
+        turn: prescribed change of these in a turn, [free].
         tolerance: largest change of the start, m and rad.
         paths: starts with the guess, [orbit, 0]; filled, [orbit, map + 1, n].
-        good: filled: whether it settled, [orbit].
+        good: filled: whether it converged, [orbit].
     """
     n, free = paths.shape[2], len(turn)
     miss, before, weight = np.zeros(free), np.zeros(free), np.zeros(free)
@@ -45,7 +45,7 @@ def settle(  # type: ignore[no-untyped-def]
                     y[a] = total
             for i in range(free):
                 miss[i] = paths[orbit, -1, i] - paths[orbit, 0, i] - turn[i]
-            if step > 0:  # Broyden: the Jacobian's inverse learns from what the last change did
+            if step > 0:  # Broyden's update of the inverse Jacobian
                 below = 0.0
                 for a in range(n):
                     error[a] = change[a]
@@ -66,7 +66,7 @@ def settle(  # type: ignore[no-untyped-def]
                 for i in range(free):
                     change[a] += inverse[a, i] * miss[i]
                 paths[orbit, 0, a] += change[a]
-                if not abs(change[a]) <= largest:  # what is no number is larger than all
+                if not abs(change[a]) <= largest:  # true for NaN
                     largest = abs(change[a]) if abs(change[a]) < 1.0 else np.inf
             before[:] = miss
             if not largest < 1.0:

@@ -1,8 +1,8 @@
-"""What small changes in layers do to first-turn readings, as shifts of the launch.
+"""Effect of small changes in layers on first-turn readings, as shifts of the launch.
 
-A change in a layer does on the trajectory what some shift of the launch does, from that layer on.
-So a reading sees it as the reading's row times the shift, and products with all changes at once are
-running sums: d readings / d changes is never built.
+A change in a layer acts on the trajectory behind it like a shift of the launch. A reading changes
+by its row times the shift, and products with all changes are running sums: d readings / d changes
+is never formed.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Shifts:
-    """Readings as linear functions of changes, about some trajectories.
+    """Readings as linear functions of changes, at some trajectories.
 
     Attributes:
         rows: d reading / d launch, [shot, monitor, 2, n].
         shift: of the launch for a unit of each change, in beam order, [shot, change, n].
         upto: changes before each monitor, [monitor].
-        present: which readings there are, [shot, monitor, 2]; the rows of all products.
+        present: valid readings, [shot, monitor, 2]; the rows of all products.
     """
 
     rows: Array
@@ -32,7 +32,7 @@ class Shifts:
     present: NDArray[np.bool_]
 
     def _running(self, terms: Array) -> Array:
-        """Sums over the changes that each monitor sees of terms [change, ...]: [monitor, ...]."""
+        """Sums of terms [change, ...] over the changes before each monitor, [monitor, ...]."""
         total = np.concatenate([np.zeros((1, *terms.shape[1:])), np.cumsum(terms, axis=0)])
         return np.asarray(total[self.upto])
 
@@ -48,14 +48,14 @@ class Shifts:
         at_start = np.einsum("smpa,smp->msa", self.rows, weights)
         later = np.zeros((len(self.upto) + 1, *at_start.shape[1:]))
         later[:-1] = np.cumsum(at_start[::-1], axis=0)[::-1]
-        # the first monitor that sees change j is the first with upto > j
+        # the first monitor behind change j is the first with upto > j
         first = np.searchsorted(self.upto, np.arange(self.shift.shape[1]), side="right")
         return np.asarray(np.einsum("sja,jsa->j", self.shift, later[first]))
 
     def kernel(self, variance: Array) -> Array:
         """J P J^T for variances P [change], [row, row]."""
         shots, monitors = self.rows.shape[:2]
-        if self.shift.shape[1] <= 2 * shots * monitors:  # J itself is quicker
+        if self.shift.shape[1] <= 2 * shots * monitors:  # J itself is faster
             A = self.matrix * np.sqrt(variance)
             return np.asarray(A @ A.T)
         low = np.minimum.outer(np.arange(monitors), np.arange(monitors))
@@ -74,7 +74,7 @@ class Shifts:
 
     @cached_property
     def matrix(self) -> Array:
-        """J itself, [row, change]: for few changes."""
+        """J itself, [row, change]; for few changes."""
         seen = np.arange(self.shift.shape[1]) < self.upto[:, None]
         J = np.einsum("smpa,sja->smpj", self.rows, self.shift) * seen[:, None, :]
         return np.asarray(J[self.present])

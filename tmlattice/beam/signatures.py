@@ -1,6 +1,6 @@
-"""What each hypothesis, and each free kick, would change in the readings: d readings / d amount.
+"""Signatures of hypotheses and free kicks: d readings / d amount.
 
-A cause changes the state at the exit of its layer; C^-1 of the trajectory's tangent C makes that a
+A cause changes the state at the exit of its layer. C^-1 of the trajectory's tangent C makes that a
 change of the launch, and d reading / d launch carries it to all readings downstream.
 """
 
@@ -18,7 +18,8 @@ from tmlattice.effects import Cause, LaunchEffect, Monitors, ReadingEffect, Ring
 Array = NDArray[np.float64]
 
 SMALL = 1e-4
-"""Of the largest fault: central differences of readings, which are quadratic in none by more."""
+"""Step of central differences of readings over the largest fault; no effect is of higher than
+second order there."""
 
 
 def signatures(
@@ -91,11 +92,11 @@ def _of_ring(
         states = np.ascontiguousarray(paths.states[shots])
         kernels.kicks(d.layer, d.D0, d.D1, d.D2, states, steps, kicks)
         exits = d.layer[:, None] + 1 + turns[None]  # [row, turn]
-        pulled = np.einsum("strij,strj->stri", inverse[shots][:, exits.T], kicks)
+        launch_kick = np.einsum("strij,strj->stri", inverse[shots][:, exits.T], kicks)
         start = np.searchsorted(where, exits)
         part = np.zeros((len(hypotheses), len(shots), *out.shape[2:]))
         slopes = np.ascontiguousarray(paths.beam_launch[shots])
-        share(kernels.carry, len(shots), d.owner, start, pulled, slopes, part)
+        share(kernels.carry, len(shots), d.owner, start, launch_kick, slopes, part)
         _given_back(model, group, hypotheses, inverse, states, slopes, part)
         for row, (owner, monitor) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
             for turn in range(model.turns):
@@ -115,7 +116,7 @@ def _given_back(
     slopes: Array,
     part: Array,
 ) -> None:
-    """More radiation moves the cavities' phase: they make good what the design orbit loses."""
+    """Signature by the cavities' phase, which follows the radiation loss."""
     if model.turns == 1:
         return
     there = model.assembly
@@ -131,11 +132,11 @@ def _given_back(
         slipped = np.repeat(np.where(rf.exits == model.steps, slip, 0.0), model.turns)
         late = states[:, behind, 4] - slipped  # at the ring's end the RF slips behind the cavity
         gain = lost / len(rf.exits) * np.cos(phase - wave * late) / np.cos(phase)
-        pulled = inverse[group.shots[:, None], behind][..., 5] * gain[..., None]
-        pulled = np.ascontiguousarray(pulled[:, None])  # [shot, 1, cavity and turn, n]
+        launch_kick = inverse[group.shots[:, None], behind][..., 5] * gain[..., None]
+        launch_kick = np.ascontiguousarray(launch_kick[:, None])  # [shot, 1, cavity and turn, n]
         start = np.searchsorted(model.where, behind)[:, None]
         owner = np.full(len(behind), h)
-        share(kernels.carry, len(part[h]), owner, start, pulled, slopes, part)
+        share(kernels.carry, len(part[h]), owner, start, launch_kick, slopes, part)
 
 
 def kick_signatures(model: TrackedShots, paths: Paths, layers: NDArray[np.int64]) -> Array:
@@ -144,12 +145,14 @@ def kick_signatures(model: TrackedShots, paths: Paths, layers: NDArray[np.int64]
     exits = np.asarray(layers)[:, None] + 1 + turns[None]  # [layer, turn]
     kick = np.stack([model.kick(k) for k in layers])
     inverse = np.linalg.inv(paths.tangents[:, exits])  # [shot, layer, turn, n, n]
-    pulled = np.einsum("slTij,lpj->sTlpi", inverse, kick, optimize=True)
-    pulled = np.ascontiguousarray(pulled.reshape(model.shots, model.turns, -1, model.dimension))
+    launch_kick = np.einsum("slTij,lpj->sTlpi", inverse, kick, optimize=True)
+    launch_kick = np.ascontiguousarray(
+        launch_kick.reshape(model.shots, model.turns, -1, model.dimension)
+    )
     start = np.repeat(np.searchsorted(model.where, exits), 2, axis=0)
     out = np.zeros((2 * len(kick), *paths.readings.shape))
     owner = np.arange(2 * len(kick))
-    share(kernels.carry, model.shots, owner, start, pulled, paths.beam_launch, out)
+    share(kernels.carry, model.shots, owner, start, launch_kick, paths.beam_launch, out)
     return seen(model, paths, out).reshape(len(kick), 2, *paths.readings.shape)
 
 
@@ -159,8 +162,8 @@ def free_kicks(
     """See `Model.free_kicks`."""
     kick = np.stack([model.kick(k) for k in layers])
     inverse = np.linalg.inv(paths.tangents[:, layers + 1])  # [shot, layer, n, n]
-    pulled = np.einsum("slij,lpj->lpsi", inverse, kick, optimize=True)
-    return np.searchsorted(model.where, layers + 1), pulled
+    launch_kick = np.einsum("slij,lpj->lpsi", inverse, kick, optimize=True)
+    return np.searchsorted(model.where, layers + 1), launch_kick
 
 
 def single_kicks(
@@ -178,24 +181,24 @@ def single_kicks(
     one = np.isin(base.owner, np.flatnonzero(rows == 1))
     order = np.argsort(base.owner[one])
     owner, exits = base.owner[one][order], base.layer[one][order] + 1
-    pulled = np.zeros((model.shots, len(owner), model.dimension))
+    launch_kick = np.zeros((model.shots, len(owner), model.dimension))
     inverse = np.linalg.inv(paths.tangents)
     for group in model.groups:
         if not group.active:
             continue
         d = group.directions(some)
-        own = np.isin(d.owner, owner)  # fewer where a setting takes its effect away
+        own = np.isin(d.owner, owner)  # without those that a setting removes
         kicks = np.empty((len(group.shots), 1, len(d.owner), model.dimension))
         states = np.ascontiguousarray(paths.states[group.shots])
         kernels.kicks(d.layer, d.D0, d.D1, d.D2, states, 0, kicks)
         back = inverse[group.shots][:, d.layer[own] + 1]
         change = np.einsum("skij,skj->ski", back, kicks[:, 0][:, own], optimize=True)
-        pulled[np.ix_(group.shots, np.searchsorted(owner, d.owner[own]))] = change
-    return np.array(ring)[owner], np.searchsorted(model.where, exits), pulled
+        launch_kick[np.ix_(group.shots, np.searchsorted(owner, d.owner[own]))] = change
+    return np.array(ring)[owner], np.searchsorted(model.where, exits), launch_kick
 
 
 def seen(model: TrackedShots, paths: Paths, beam: Array) -> Array:
-    """What the monitors make of changes of the beam, [hypothesis, shot, reading, 2]."""
+    """Readings of changes of the beam, [hypothesis, shot, reading, 2]."""
     return _through(paths.monitors, beam)
 
 

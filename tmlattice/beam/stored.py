@@ -1,20 +1,21 @@
-"""The stored beam about its closed orbit, and how every effect moves it: orbit, tunes, modes.
+"""A stored beam at its closed orbit, and the effects of errors on orbit, tunes and modes.
 
-Small oscillations about the closed orbit are two modes. With the one-turn matrix M, M U = U Lambda
-for the modes' vectors U and Lambda = exp(2 pi i Q); where the ring reads with the slope G of its
-launch, a mode is seen as E = G U. All matrices are carried back to the start of the ring: a change
-D of the layer k's matrix is the source S = C^-1 D C there (C from the start to the layer), and with
-the sum T of the sources before a place
+Small oscillations around the closed orbit are two modes. With the one-turn matrix M, M U = U Lambda
+for the modes' vectors U and Lambda = exp(2 pi i Q). Monitors with the slope G of the launch read a
+mode as E = G U. All matrices are carried back to the start of the ring: a change D of the layer k's
+matrix is the source S = C^-1 D C there (C from the start to the layer), and with the sum T of the
+sources before a place
 
     d (matrix to there) = C T,    d M = M T_end,    d E = G T U + G dU,
 
 dU and d Q by perturbation of the eigenvalues. An effect that kicks moves the closed orbit, which
-bends every map behind: with P_j the sum over the curved layers of C^-1 B (C e) C per unit e of the
-launch, its sources are contractions of P. So every effect costs some products of small matrices.
+changes every curved map behind: with P_j the sum over the curved layers of C^-1 B (C e) C per unit
+e of the launch, its sources are contractions of P. Every effect costs some products of small
+matrices.
 
-Where the RF is on, a cavity gives an oscillating particle energy by its time of flight: behind it
-all matrices have that in them, and the modes are those of all six coordinates. The closed orbit
-meets the RF's phase and has no part in it.
+With the RF on, a cavity changes the energy of an oscillating particle by its time of flight. All
+matrices behind it include that, and the modes are those of six coordinates. The closed orbit meets
+the RF's phase and is not affected.
 """
 
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ ComplexArray = NDArray[np.complex128]
 Hypothesis = tuple[str, str | None]
 
 TRANSVERSE = 4
-"""Coordinates of the betatron motion: energy and path length stay what the closed orbit has."""
+"""Coordinates of the betatron motion; energy and path length are those of the closed orbit."""
 
 NEAR = 1e-9
 """Distance of two eigenvalues below which modes mix freely and have no derivative."""
@@ -47,19 +48,18 @@ axis second-order maps are symplectic to their own order only (1e-5 for an orbit
 
 
 STILL = 1e-12
-"""m and rad per unit: effects that kick less leave the closed orbit where it is."""
+"""m and rad per unit: smaller kicks are taken as no change of the closed orbit."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What a stored beam shows at the monitors; or what effects change of that, per unit of their
-    amounts, in the order of the hypotheses.
+    """Orbit, tunes and modes of a stored beam, or their derivatives by hypotheses.
 
     Attributes:
         orbit: closed orbit at the monitors, m, [hypothesis, monitor, 2].
         tunes: Q of both modes, [hypothesis, 2].
-        modes: their vectors as the beam shows them at the monitors, [hypothesis, monitor, 2, mode];
-            up to one complex factor a mode, which the launch has free.
+        modes: their vectors at the monitors, [hypothesis, monitor, 2, mode], up to one complex
+            factor per mode, that of the launch.
     """
 
     orbit: Array
@@ -72,7 +72,7 @@ class StoredBeam:
 
     Args:
         model: closed orbit and matrices; monitors without errors.
-        rf: cavities that the oscillation feels, of a model of six coordinates.
+        rf: cavities that act on the oscillation; six coordinates.
 
     Attributes:
         rf: as given.
@@ -87,7 +87,7 @@ class StoredBeam:
     def __init__(self, model: ResponseModel, rf: Cavities = NO_RF) -> None:
         self.model = model
         self.rf = rf
-        # as the oscillation has them: to the exits, into the layers, back from the exits, readings
+        # matrices of the oscillation: to the exits, into the layers, back from the exits, readings
         self._C, self._into = model.tangents, model.tangents
         self._back, self._G = model.inverse, model.reading_slopes
         self._turn = model.tangents[-1]
@@ -105,7 +105,7 @@ class StoredBeam:
         self.modes: ComplexArray = self._G @ self._U
 
     def launched(self, amplitude: ComplexArray) -> Array:
-        """Where a kick leaves the beam at the start of the ring, [..., n].
+        """State at the start of the ring after a kick, [..., n].
 
         Args:
             amplitude: of the modes at turn 0, [..., mode].
@@ -116,11 +116,11 @@ class StoredBeam:
 
     @property
     def shown(self) -> Moved:
-        """Closed orbit, tunes and modes themselves, without the axis of hypotheses."""
+        """Closed orbit, tunes and modes, without the axis of hypotheses."""
         return Moved(self.model.readings, self.tunes, self.modes)
 
     def moved(self, hypotheses: Sequence[Hypothesis]) -> Moved:
-        """How effects on the ring change all of this.
+        """Return the derivatives by effects on the ring.
 
         Args:
             hypotheses: (effect, place), of effects on the ring.
@@ -141,7 +141,7 @@ class StoredBeam:
             for out, rows in ((moved.orbit, orbit), (moved.tunes, tunes), (moved.modes, seen)):
                 if len(np.unique(d.owner)) == len(rows):
                     out[d.owner] = rows
-                else:  # families have a row a member
+                else:  # families have one row per member
                     np.add.at(out, d.owner, rows)
         for row, (owner, m) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
             at = model.maps.at[m]
@@ -152,7 +152,7 @@ class StoredBeam:
         return moved
 
     def _sources(self, d: Directions) -> tuple[Array, Array, ComplexArray]:
-        """Of each row of the directions: the closed orbit's change at the monitors, the sources of
+        """For each row of the directions: the closed orbit's change at the monitors, the sources of
         the whole turn, [row, n, n], and G T U at the monitors, [row, monitor, 2, mode]."""
         model, at, U, n = self.model, self.model.maps.at, self._U, self.model.dimension
         k, rows = d.layer, len(d.layer)
@@ -180,8 +180,8 @@ class StoredBeam:
 
     @cached_property
     def _seen_bends(self) -> Array:
-        """What a launch of the closed orbit adds to the modes at the monitors: through the maps
-        before, and where read-outs bend, [n, monitor * 2 * mode * (re, im)]."""
+        """Change of the modes at the monitors by the closed orbit's launch, through curved maps and
+        read-outs, [n, monitor * 2 * mode * (re, im)]."""
         model, maps = self.model, self.model.maps
         through = np.einsum(
             "mja,mabc,bp->cmjp", self._G, self._bends[maps.at], self._U, optimize=True
@@ -215,8 +215,8 @@ class StoredBeam:
 
 
 def _with_rf(model: ResponseModel, rf: Cavities) -> tuple[Array, Array]:
-    """What cavities give an oscillating particle, pulled back to the start: the product of those
-    before each exit and the end, [layer + 2, n, n]; and the turn with all of them, [n, n]."""
+    """Cavities in the matrices, carried back to the start: the product of those before each exit
+    and the end, [layer + 2, n, n]; and the turn with all of them, [n, n]."""
     crest, phase, wave, _ = rf.values
     given = np.tile(np.eye(model.dimension), (len(model.tangents), 1, 1))
     slope = np.zeros((model.dimension,) * 2)
@@ -233,8 +233,8 @@ def _with_rf(model: ResponseModel, rf: Cavities) -> tuple[Array, Array]:
 def _nearest(
     turn: Array, tunes: ComplexArray, modes: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Eigenvalues and vectors of a turn with RF: the two that are those of the transverse motion
-    alone, as large and in phase, then the others.
+    """Eigenvalues and vectors of a turn with RF: first the two nearest to those of the transverse
+    motion alone, then the others.
 
     Raises:
         UnstableRingError: the RF makes one of them grow.
@@ -257,7 +257,7 @@ def _modes(turn: Array) -> tuple[ComplexArray, ComplexArray]:
     """Eigenvalues and vectors of a transverse one-turn matrix: of the mode nearer to x, of the one
     nearer to y, and their conjugates.
 
-    A mode turns as its action has it: Im(conj(x) px + conj(y) py) is positive, which gives Q and
+    The rotation is that of the action: Im(conj(x) px + conj(y) py) is positive, which gives Q and
     not 1 - Q.
 
     Raises:
@@ -269,11 +269,11 @@ def _modes(turn: Array) -> tuple[ComplexArray, ComplexArray]:
     action = (vectors[0::2].conj() * vectors[1::2]).imag.sum(axis=0)
     forward = np.flatnonzero(action > 0)
     if len(forward) != 2:
-        raise UnstableRingError("the beam is not stable: its modes are no oscillations")
+        raise UnstableRingError("the beam is not stable: its modes do not oscillate")
     in_x = (vectors[0].conj() * vectors[1]).imag / action
     order = forward[np.argsort(-in_x[forward])]
     chosen = vectors[:, order] / np.sqrt(2 * action[order])
-    # a phase that does not jump with the ring's errors: its own coordinate is real at the start
+    # continuous phase: the mode's own coordinate is real at the start
     largest = np.array([chosen[0, 0], chosen[2, 1]])
     chosen = chosen * (np.abs(largest) / largest)
     return (

@@ -1,8 +1,8 @@
-"""The strengths that can be wrong: of every powered quadrupole and sextupole, as relative changes.
+"""Strengths that may be wrong: of every powered quadrupole and sextupole, as relative changes.
 
-OCELOT is asked for the map of a magnet at nine strengths; between them its coefficients are
-polynomials of the change, to rounding, so that a fit moves four hundred strengths at once and has
-their exact derivatives in a millisecond.
+OCELOT computes the map of a magnet at nine strengths. In between its coefficients are polynomials
+of the change, to rounding, so that a fit moves four hundred strengths at once and has their exact
+derivatives in a millisecond.
 """
 
 from collections.abc import Sequence
@@ -23,11 +23,11 @@ Weights = tuple[Array, Array, Array]
 ATTRIBUTES = {"quadrupole": "k1", "sextupole": "k2"}
 
 LARGEST = 1.5
-"""A strength may change by this much, either way; beyond, it is another magnet."""
+"""Largest relative change of a strength."""
 
 DEGREE = 8
-"""Of the polynomials over +-LARGEST. cos(L sqrt(k)) is a series in k L^2, 0.8 at most here, whose
-ninth term is below 1e-16."""
+"""Degree of the polynomials over +-LARGEST. cos(L sqrt(k)) is a series in k L^2, 0.8 at most here,
+whose ninth term is below 1e-16."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Strength:
         layer: of the magnet.
         name: of the magnet.
         attribute: k1 or k2.
-        elements: what the layer is made of; the magnet is the last.
+        elements: of the layer; the magnet is the last.
         energy: `Ring.map_energy`, GeV.
     """
 
@@ -50,23 +50,22 @@ class Strength:
 
     @property
     def value(self) -> float:
-        """The design's, 1/m2 or 1/m3."""
+        """Design strength, 1/m2 or 1/m3."""
         return float(getattr(self.elements[-1], self.attribute))
 
     def magnet(self, change: float) -> Element:
-        """The magnet with its strength changed by a relative amount."""
+        """Return the magnet with a relative change of its strength."""
         return self.elements[-1].changed(**{self.attribute: self.value * (1 + change)})
 
     def weights(self, change: float, dimension: int = 4) -> Weights:
-        """OCELOT's W0, W1, W2 of the layer with its magnet's strength changed by a relative
-        amount."""
+        """OCELOT's W0, W1, W2 of the layer with a relative change of its magnet's strength."""
         way = (*self.elements[:-1], self.magnet(change))
         W0, W1, W2 = way_map(way, self.energy, dimension).coefficients
         return W0, W1, W2
 
 
 def strengths_of(ring: Ring, kinds: Sequence[str] = ("quadrupole", "sextupole")) -> list[Strength]:
-    """The powered magnets of some kinds, in beam order.
+    """Return the powered magnets of some kinds, in beam order.
 
     Raises:
         TmlatticeError: the ring has none.
@@ -83,7 +82,7 @@ def strengths_of(ring: Ring, kinds: Sequence[str] = ("quadrupole", "sextupole"))
 
 @dataclass(frozen=True)
 class RingStrengths:
-    """The strengths of a ring, and the layers as functions of them.
+    """Strengths of a ring, and the layers as functions of them.
 
     Attributes:
         strengths: in beam order.
@@ -96,11 +95,11 @@ class RingStrengths:
     curves: Weights
 
     def weights(self, changes: ArrayLike) -> Weights:
-        """W0, W1, W2 of the layers at relative changes [strength] within +-LARGEST."""
+        """W0, W1, W2 of the layers for relative changes [strength] within +-LARGEST."""
         return _sums(_series(changes), self.curves)
 
     def slopes(self, changes: ArrayLike) -> Weights:
-        """Their derivatives by the changes."""
+        """Derivatives of the weights by the changes."""
         basis = _series(changes)[:-1]
         d0, d1, d2 = (np.asarray(chebyshev.chebder(c), np.float64) / LARGEST for c in self.curves)
         return _sums(basis, (d0, d1, d2))
@@ -117,7 +116,7 @@ def _sums(basis: Array, curves: Weights) -> Weights:
 
 def _curves(ring: Ring, strengths: Sequence[Strength], dimension: int) -> Weights:
     nodes = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
-    layers = LayerMaps(ring, dimension)  # asks OCELOT once for magnets that are alike
+    layers = LayerMaps(ring, dimension)  # one map for equal magnets
     at_nodes = [
         [layers.map(s.magnet(LARGEST * x)).after(layers.way(s.layer)).reduced() for s in strengths]
         for x in nodes
@@ -132,7 +131,7 @@ _kept: list[tuple[Ring, tuple[Any, ...], RingStrengths]] = []
 
 
 def ring_strengths(ring: Ring, kinds: Sequence[str], dimension: int = 4) -> RingStrengths:
-    """`strengths_of` a ring with their layers; kept for the last rings asked for, as a study fits
+    """Return `strengths_of` a ring with their layers; cached for the last rings, as a study fits
     hundreds of measurements of one design."""
     key = (tuple(kinds), dimension)
     for known, known_key, found in _kept:

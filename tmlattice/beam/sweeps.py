@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 Size = tuple[tuple[None, ...], tuple[None, ...]]
 
 LANES = (1, 16, 64)
-"""Trajectories that a block may hold: one, a few, many. One needs the shortest chain of
-operations; many need long rows for the vector unit."""
+"""Trajectories of a block: one, some, many. One needs the shortest chain of operations; many need
+long rows for the vector unit."""
 
 
 def run(kernel: Callable[..., None], count: int, size: Size, *arguments: object) -> None:
@@ -44,8 +44,8 @@ def run(kernel: Callable[..., None], count: int, size: Size, *arguments: object)
 
 _PLANES = (None, None)
 
-# Products are fused into sums (`contract`): exact to rounding, and repeatable. Nothing else of fast
-# mathematics touches a state. Sums over lanes (`reassoc`) may follow the vector unit's order.
+# `contract`: products are fused into sums, exact to rounding and repeatable; no other fast
+# mathematics for states. `reassoc`: sums over lanes may follow the vector unit's order.
 
 
 @jit
@@ -152,10 +152,10 @@ def reverse(  # type: ignore[no-untyped-def]
     first, last, size, W1, W2, curved, R1, R2, bent, start, states, pulls, adjoint
 ):
     """Fill adjoint [block, layer + 1, n, lane] = d loss / d states from
-    pulls [block, monitor, 2, lane] = d loss / d readings; adjoint[:, -1] holds what does not come
+    pulls [block, monitor, 2, lane] = d loss / d readings; adjoint[:, -1] holds the part that is not
     from the readings.
 
-    The monitors at exit k are start[k] to start[k + 1] - 1: they stand in beam order.
+    The monitors at exit k are start[k] to start[k + 1] - 1, in beam order.
     """
     n, lanes = len(size[0]), len(size[1])
     for block in range(first, last):
@@ -200,22 +200,22 @@ def weights(first, last, size, states, adjoint, G0, G1, G2):  # type: ignore[no-
 
 
 def curved(W2: Array) -> NDArray[np.bool_]:
-    """Which layers have a second-order part at all: the sweeps skip it where it is zero."""
+    """Whether each layer has a second-order part: the sweeps skip zero ones."""
     return np.asarray(W2.any(axis=(1, 2)))
 
 
 def size_of(n: int, batch: int) -> Size:
-    """The compile-time constants of the kernels: their lengths are the dimension and the lanes."""
+    """Compile-time constants of the kernels, as lengths: the dimension and the lanes."""
     return (None,) * n, (None,) * lanes_for(batch)
 
 
 def lanes_for(batch: int) -> int:
-    """How many trajectories a block holds for a batch of this size."""
+    """Number of trajectories in a block for a batch of this size."""
     return next((lanes for lanes in LANES if batch <= lanes), LANES[-1])
 
 
 def pack(rows: Array, lanes: int) -> Array:
-    """Trajectories [batch, ...] as blocks [block, ..., lane], the last one filled up with zeros."""
+    """Trajectories [batch, ...] as blocks [block, ..., lane], the last one padded with zeros."""
     blocks = -(-len(rows) // lanes)
     padded = np.zeros((blocks * lanes, *rows.shape[1:]))
     padded[: len(rows)] = rows

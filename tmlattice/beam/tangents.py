@@ -1,6 +1,6 @@
 """Compiled loops of the diagnosis: tangent maps along trajectories, signatures of all hypotheses.
 
-A turn has `step` maps: its layers, closed by the way to the ring's end.
+A turn has `step` maps: its layers and the closing drift.
 Axes: states [shot, step + 1, n], tangents C [shot, step + 1, n, n] = d state / d launch.
 """
 
@@ -58,7 +58,7 @@ def trajectories(first, last, W0, W1, W2, curved, exits, rf, states, tangents): 
 
 @jit
 def _cavities(exit_, exits, rf, x, tangent):  # type: ignore[no-untyped-def]
-    """What the cavities at one exit give to a state, and to its tangent."""
+    """Apply the cavities at one exit to a state and its tangent."""
     for c in range(len(exits)):
         if exits[c] == exit_:
             angle = rf[1] - rf[2] * x[4]
@@ -70,7 +70,7 @@ def _cavities(exit_, exits, rf, x, tangent):  # type: ignore[no-untyped-def]
 
 @jit
 def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
-    """whole [end, n, n]: the product of the steps behind the last end, up to and with this one."""
+    """whole [end, n, n]: the product of the steps behind the last end, up to and including this."""
     n, k = steps.shape[1], 0
     row = np.empty(n)
     for e in range(len(ends)):
@@ -88,7 +88,7 @@ def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
 
 @jit
 def products(steps, total):  # type: ignore[no-untyped-def]
-    """total [step + 1, n, n] of matrices [step, n, n]: from the start to behind each."""
+    """total [step + 1, n, n] of matrices [step, n, n]: cumulative products from the start."""
     n = steps.shape[1]
     for a in range(n):
         for j in range(n):
@@ -128,14 +128,14 @@ def kicks(layer, D0, D1, D2, states, steps, out):  # type: ignore[no-untyped-def
 
 
 @jit
-def carry(first, last, owner, start, pulled, G, out):  # type: ignore[no-untyped-def]
+def carry(first, last, owner, start, launch_kick, G, out):  # type: ignore[no-untyped-def]
     """out [hypothesis, shot, reading, 2] += G v: kicks carried to all readings downstream.
 
     Args:
         first, last: shots.
         owner: hypothesis of each row, [row].
         start: the first reading downstream of the row, [row, turn].
-        pulled: the kick as a change of the launch, C^-1 kick, [shot, turn, row, n].
+        launch_kick: the kick as a change of the launch, C^-1 kick, [shot, turn, row, n].
         G: d reading / d launch, [shot, reading, 2, n].
     """
     n = G.shape[3]
@@ -143,7 +143,7 @@ def carry(first, last, owner, start, pulled, G, out):  # type: ignore[no-untyped
         for row in range(len(owner)):
             h = owner[row]
             for turn in range(start.shape[1]):
-                v = pulled[shot, turn, row]
+                v = launch_kick[shot, turn, row]
                 for m in range(start[row, turn], G.shape[1]):
                     for plane in range(2):
                         total = 0.0

@@ -1,9 +1,9 @@
 """Compiled kernels shared among threads.
 
 A kernel takes a range (first, last, ...) of independent blocks, releases the interpreter lock, and
-writes to places that belong to its blocks. So the result does not depend on how the range is cut,
-and no compiler's own thread pool is needed: forked and spawned workers, and several callers at
-once, are all safe. `NUMBA_NUM_THREADS` sets the number of threads.
+writes to the memory of its blocks alone. The result does not depend on the ranges, and no thread
+pool of the compiler is needed: forked and spawned workers, and several callers at once, are safe.
+`NUMBA_NUM_THREADS` sets the number of threads.
 """
 
 import os
@@ -21,7 +21,7 @@ def _forget_pool() -> None:
     _pool = None
 
 
-if hasattr(os, "register_at_fork"):  # a forked child has no threads: it makes its own pool
+if hasattr(os, "register_at_fork"):  # a forked child has no threads: it makes a new pool
     os.register_at_fork(after_in_child=_forget_pool)
 
 
@@ -30,7 +30,7 @@ def _threads() -> int:
 
 
 def share(kernel: Callable[..., None], count: int, *arguments: object) -> None:
-    """Call `kernel(first, last, *arguments)` so that the ranges cover 0 to count."""
+    """Call `kernel(first, last, *arguments)` for ranges that cover 0 to count."""
     global _pool
     threads = min(_threads(), count)
     if threads < 2:

@@ -1,4 +1,4 @@
-"""The shots of a measurement, tracked: what a ring with causes makes the monitors read.
+"""Tracked shots of a measurement: readings of a ring with causes.
 
 Launches are (x, px, y, py, delta), one for each shot; readings are [shot, reading, 2] with the
 turns of a shot one after another, `reading = turn * monitors + monitor`.
@@ -34,7 +34,7 @@ from tmlattice.lattice import Ring
 Array = NDArray[np.float64]
 
 Kicks = Mapping[int, Array]
-"""By layer: (px, py) of every shot in the middle of its magnet, rad, [shot, 2]."""
+"""Free kicks by layer: (px, py) of every shot in the middle of its magnet, rad, [shot, 2]."""
 
 NO_KICKS: Kicks = {}
 LAUNCH = ("x", "px", "y", "py", "delta")
@@ -43,16 +43,16 @@ _COLUMNS = [0, 1, 2, 3, 5]  # of OCELOT's six coordinates
 
 @dataclass(frozen=True)
 class Paths:
-    """The model's trajectories, and how they depend on their launches.
+    """Trajectories of the model, and their derivatives by the launches.
 
     Attributes:
         readings: [shot, reading, 2], m.
         launch: d readings / d (x, px, y, py, delta), [shot, reading, 2, 5].
-        beam: where the beam is, [shot, reading, 2], m: readings before the monitors' errors.
+        beam: position of the beam, [shot, reading, 2], m: readings before the monitors' errors.
         states, tangents: at every exit, [shot, step + 1, n], [shot, step + 1, n, n].
         beam_launch: d beam / d launch, all coordinates, [shot, reading, 2, n].
         monitors: d reading / d beam, [shot, monitor, 2, 2].
-        monitors_of: the monitors of the shots in which causes are.
+        monitors_of: the monitors of the shots in which causes act.
     """
 
     readings: Array
@@ -66,27 +66,27 @@ class Paths:
 
 
 class TrackedShots:
-    """A ring as the shots of a measurement saw it: see `Model`, which knows hypotheses too.
+    """A ring with the shots of a measurement; see `Model` for hypotheses.
 
-    Over more than one turn the RF is on where the beam loses energy, where the ring has cavities,
-    and where a shot sets its frequency: see `rf`. On one turn cavities are drifts.
+    Over more than one turn the RF is on if the beam loses energy, the ring has cavities, or a shot
+    sets the frequency: see `rf`. On one turn cavities are drifts.
 
     Args:
         ring: the design.
         settings: of each shot.
         turns: of each shot.
-        known: causes that are no hypothesis (radiation where it is asked for).
-        dimension: 6; 4 where no cause touches the energy.
-        active: shots in which causes are there; the others are of the ring without, [shot].
+        known: causes that are no hypotheses (radiation, if asked for).
+        dimension: 6; 4 if no cause changes the energy.
+        active: shots in which causes act; the others are of the ring without, [shot].
 
     Attributes:
-        ring, layers, maps: with what is known.
+        ring, layers, maps: with the known causes.
         groups: shots with equal settings.
         steps: of a turn.
-        where: the state that each reading is made from, [reading].
+        where: index of the state of each reading, [reading].
 
     Raises:
-        LatticeError: an RF that cannot make good what is lost.
+        LatticeError: an RF that cannot replace the loss.
     """
 
     def __init__(
@@ -129,14 +129,14 @@ class TrackedShots:
                     yield own, setting, active
 
     def knowing(self, causes: Sequence[Cause]) -> Self:
-        """The same with further causes known, in all shots."""
+        """Return the shots with further known causes, in all of them."""
         return type(self)(
             self.design, self._settings, self.turns, (*self.assembly.known, *causes),
             self.dimension, self.active,
         )  # fmt: skip
 
     def monitor(self, name: str) -> int:
-        """Its place among the monitors."""
+        """Index of a monitor."""
         return self._monitor[name]
 
     def kick(self, layer: int) -> Array:
@@ -163,7 +163,7 @@ class TrackedShots:
     def _runs(
         self, causes: Sequence[Cause], kicks: Kicks
     ) -> Iterator[tuple[Group, NDArray[np.intp], Cavities]]:
-        """Shots with equal weights, the weights with causes and kicks in them meanwhile."""
+        """Yield shots with equal weights, while their layers contain the causes and kicks."""
         causes = on_ring(causes)
         for group in self.groups:
             rf = self._cavities(group, causes)
@@ -190,7 +190,7 @@ class TrackedShots:
 
     # --- readings -------------------------------------------------------------------------------
     def beam(self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS) -> Array:
-        """Where the beam is, [shot, reading, 2], m; NaN where it is lost."""
+        """Return the beam's position, [shot, reading, 2], m; NaN where it is lost."""
         states = self._states(launches)
         weights, nodes = (np.ones(1), states[None])
         if self.dimension == 6:
@@ -206,7 +206,7 @@ class TrackedShots:
     def readings(
         self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS
     ) -> Array:
-        """What the monitors read, [shot, reading, 2], m.
+        """Return the readings, [shot, reading, 2], m.
 
         Args:
             launches: (x, px, y, py, delta), [shot, 5].
@@ -223,7 +223,7 @@ class TrackedShots:
         return readings.reshape(beam.shape)
 
     def _monitors(self, causes: Sequence[Cause]) -> Monitors:
-        """The monitors with what is known of them and with causes."""
+        """Return the monitors with known errors and causes."""
         monitors = self._known_monitors.copy()
         for cause in causes:
             effect = find(cause.effect)
@@ -231,11 +231,11 @@ class TrackedShots:
                 effect.set(monitors, self._monitor[cause.element or ""], cause.amount)
         return monitors
 
-    @np.errstate(over="ignore", invalid="ignore")  # of a beam that is lost
+    @np.errstate(over="ignore", invalid="ignore")  # of a lost beam
     def paths(
         self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS
     ) -> Paths:
-        """Trajectories, readings and their derivatives by the launches."""
+        """Return trajectories, readings and their derivatives by the launches."""
         n = self.dimension
         states = np.empty((self.shots, self.turns * self.steps + 1, n))
         tangents = np.empty((self.shots, self.turns * self.steps + 1, n, n))
@@ -274,7 +274,7 @@ class TrackedShots:
         return Paths(readings, launch, beam, states, tangents, slopes, monitors, monitors_of)
 
     def lost(self, paths: Paths) -> tuple[Lost, ...]:
-        """The shots whose beam is lost: on which turn, in which magnet."""
+        """Return the shots whose beam is lost, with turn and magnet."""
         return lost(paths.states, self.maps.layers)
 
     def slopes(self, paths: Paths) -> Array:

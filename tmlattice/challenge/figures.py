@@ -58,7 +58,7 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     if tier == "C":
         out["exact"] = _exact(rows)
         out["exact_above_10"] = _exact([row for row in rows if row["weakest"] >= 10])
-        out["clean_gap_closed"] = _closed(rows)
+        out["clean_gap_closed"] = _explained(rows)
         return out
     if tier == "D":
         return out | _unknowns(rows)
@@ -79,12 +79,12 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["calibration"] = calibration(rows)
     out["coverage"] = coverage(clear)
     out["pulls"] = pulls([row["answers"]["tool"]["pull"] for row in rows])
-    out["clean_gap_closed"] = _closed(clear)
+    out["clean_gap_closed"] = _explained(clear)
     strong = [row for row in rows if (row["signal_to_noise"] or 0) >= 20]
-    out["clean_gap_closed_above_20"] = _closed(strong)
+    out["clean_gap_closed_above_20"] = _explained(strong)
     for name in ("one_action", "oracle_one_action"):
-        out[name] = _told(clear, name)
-        out[f"{name}_above_20"] = _told(strong, name)
+        out[name] = _known_share(clear, name)
+        out[f"{name}_above_20"] = _known_share(strong, name)
     out["false_refusals"] = rate([row["refused"] for row in clear])
     out["more_than_one_finding"] = rate([row["findings"] > 1 for row in clear])
     out["relative_to_oracle"] = _relative(clear)
@@ -105,7 +105,7 @@ def together(rows: Sequence[Row]) -> dict[str, Any]:
     return {"of_found_alone": rate(split[True]), "of_none_alone": rate(split[False])}
 
 
-def _told(rows: Sequence[Row], name: str) -> dict[str, Any]:
+def _known_share(rows: Sequence[Row], name: str) -> dict[str, Any]:
     """Share of the cases of which this flag is known."""
     told = [row.get(name) for row in rows]
     return rate([flag for flag in told if flag is not None])
@@ -224,7 +224,7 @@ def pulls(values: Sequence[float | None]) -> dict[str, Any]:
     }
 
 
-def _closed(rows: Sequence[Row]) -> dict[str, Any]:
+def _explained(rows: Sequence[Row]) -> dict[str, Any]:
     """Where something is to be seen: error on clean held-out readings at most 5 % of before.
 
     An amount known to 1 / (signal to noise) leaves that share of the gap: nobody reaches 5 % at a

@@ -17,15 +17,15 @@ from tmlattice.challenge.case import Case, Truth, ring_of
 from tmlattice.challenge.kinds import CHANGES, problem_of
 from tmlattice.challenge.oracle import REFINED, answer
 from tmlattice.effects import Cause, find, modelled
+from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis, Problem
-from tmlattice.inference.rivals import best_start
 from tmlattice.inference.scan import Scan, scan
 
 Array = NDArray[np.float64]
 
-FAR = 60.0
+MAX_BEHIND = 60.0
 """Chi-square behind the best of the scan from which on a hypothesis is not refitted."""
 
 MOST_NUMBERS = 2**27
@@ -33,7 +33,7 @@ MOST_NUMBERS = 2**27
 
 
 @dataclass(frozen=True)
-class Weighed:
+class Refitted:
     """Every hypothesis about one case.
 
     Attributes:
@@ -51,14 +51,14 @@ class Weighed:
     amount: Array
 
 
-def judge_kinds(argument: tuple[Case, Truth]) -> dict[str, Any]:
+def evaluate_kinds(argument: tuple[Case, Truth]) -> dict[str, Any]:
     """What the oracle says of a case of kinds, as `oracle.judge` says it."""
     case, truth = argument
-    said = _said(weighed(case, truth))
+    said = _as_answer(refitted(case, truth))
     return {"oracles": [said], "residual": None}
 
 
-def weighed(case: Case, truth: Truth) -> Weighed:
+def refitted(case: Case, truth: Truth) -> Refitted:
     """The hypotheses about a case, the leading ones refitted."""
     ring = ring_of(case.lattice)
     problem = problem_of(ring, case.measured, case.before, truth.background)
@@ -75,7 +75,7 @@ def weighed(case: Case, truth: Truth) -> Weighed:
     power = np.array([find(n).power for n, _ in hypotheses])
     amount = np.sign(amount) * np.abs(amount) ** (1 / power)
     order = np.argsort(-statistic)[:REFINED]
-    order = order[statistic[order] > statistic.max() - FAR]
+    order = order[statistic[order] > statistic.max() - MAX_BEHIND]
     everywhere = [h for h, (n, place) in enumerate(hypotheses) if place is None and find(n).curved]
     for h in dict.fromkeys((*order.tolist(), *everywhere)):
         name, place = hypotheses[h]
@@ -90,7 +90,7 @@ def weighed(case: Case, truth: Truth) -> Weighed:
         if again.good and least <= again.causes[0].amount <= find(name).largest:
             statistic[h] = start.chi2 - again.chi2
             amount[h] = again.causes[0].amount
-    return Weighed(problem, start, seen, statistic, amount)
+    return Refitted(problem, start, seen, statistic, amount)
 
 
 def _hypotheses(case: Case, problem: Problem) -> list[Hypothesis]:
@@ -104,7 +104,7 @@ def _hypotheses(case: Case, problem: Problem) -> list[Hypothesis]:
     ]  # fmt: skip
 
 
-def _said(found: Weighed) -> dict[str, Any]:
+def _as_answer(found: Refitted) -> dict[str, Any]:
     hypotheses = found.seen.hypotheses
     prior = np.array([found.problem.prior(h) for h in hypotheses])
     threshold = found.seen.threshold(DEFAULT.false_alarm)

@@ -12,7 +12,7 @@ from tmlattice.challenge.draw import Draw
 from tmlattice.diagnosis.kinds import How, Measured, part_of, stacked
 from tmlattice.effects import Cause, Effect, LaunchEffect, find, modelled
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.among import Known, small_errors_of
+from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import Problem
@@ -51,7 +51,7 @@ CHANGES = (
 
 
 @dataclass(frozen=True)
-class Asked:
+class CaseSettings:
     """What is made of every case.
 
     Attributes:
@@ -141,8 +141,8 @@ def problem_of(
         (name, place) for name in background for place in find(name).places(ring)
         if problem.sees((name, place))
     ]  # fmt: skip
-    known = Known.usual(everywhere, background)
-    return small_errors_of(problem, known, problem.first, learn=False).problem
+    known = DistributedErrors.usual(everywhere, background)
+    return fit_distributed_errors(problem, known, problem.first, learn=False).problem
 
 
 class Ruler:
@@ -167,7 +167,7 @@ class Ruler:
 
 
 # --- a case ---------------------------------------------------------------------------------------
-def kinds_case(asked: Asked, number: int, name: str) -> tuple[Case, Truth, Draw]:
+def kinds_case(asked: CaseSettings, number: int, name: str) -> tuple[Case, Truth, Draw]:
     """The public and the secret part of a case, and what was drawn in vain."""
     random = stream(asked.seed, "challenge", asked.tier, number)
     seed = int(random.integers(2**31))
@@ -211,7 +211,7 @@ def kinds_case(asked: Asked, number: int, name: str) -> tuple[Case, Truth, Draw]
 
 
 def _drawn(
-    asked: Asked,
+    asked: CaseSettings,
     draw: Draw,
     ruler: Ruler,
     machine: Callable[[Sequence[Cause]], dict[str, Measured]],
@@ -228,7 +228,7 @@ def _drawn(
     raise TmlatticeError("no fault leaves a beam that can be measured; take a smaller signal")
 
 
-def _single(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...]:
+def _single(asked: CaseSettings, draw: Draw, ruler: Ruler) -> tuple[Cause, ...]:
     def places(effect: Effect) -> Sequence[str | None]:
         return [p for p in effect.places(asked.ring) if ruler.problem.sees((effect.name, p))]
 
@@ -237,7 +237,7 @@ def _single(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...]:
     return (draw.one(ruler, usual, places),)
 
 
-def _pair(asked: Asked, draw: Draw, ruler: Ruler) -> tuple[Cause, ...] | None:
+def _pair(asked: CaseSettings, draw: Draw, ruler: Ruler) -> tuple[Cause, ...] | None:
     random, ring = draw.random, asked.ring
     names = CHANGES[int(random.integers(len(CHANGES)))]
     effect = find(names[int(random.integers(len(names)))])

@@ -25,7 +25,7 @@ from tmlattice.challenge.case import (
     write_case,
 )
 from tmlattice.challenge.draw import Draw
-from tmlattice.challenge.kinds import TIER_KINDS, Asked, kinds_case, measure
+from tmlattice.challenge.kinds import TIER_KINDS, CaseSettings, kinds_case, measure
 from tmlattice.challenge.ruler import Ruler
 from tmlattice.challenge.unknown import DISCRETE, LARGEST, Unknown, clean_readings
 from tmlattice.effects import (
@@ -152,7 +152,7 @@ def make(
         if name in there:
             continue
         if kinds:
-            asked = Asked(
+            asked = CaseSettings(
                 tier, lattice, ring, seed, kinds, tuple(chosen) if effects else None, shots, signal,
                 amount, rms, told,
             )  # fmt: skip

@@ -44,7 +44,9 @@ class Oracle:
         seed: of the simulated null.
     """
 
-    def __init__(self, case: Case, truth: Truth, told: Sequence[Cause] = (), seed: int = 0) -> None:
+    def __init__(
+        self, case: Case, truth: Truth, given: Sequence[Cause] = (), seed: int = 0
+    ) -> None:
         ring = ring_of(case.lattice)
         data = of_measurement(ring, case.fit)
         launches = truth.launches["fit"]
@@ -59,7 +61,7 @@ class Oracle:
         small = draw_background(ring, truth.background, truth.seed)
         set_there = {name for setting in data.settings for name in setting}
         known, self.small = [], []  # in the ring for good, and with every reading
-        for cause in (*small, *told):
+        for cause in (*small, *given):
             if find(cause.effect).acts_on_settings:
                 self.small += [cause] * (cause.element in set_there)
             elif isinstance(find(cause.effect), RingEffect):
@@ -158,7 +160,7 @@ def _without_dead(data: Data, truth: Truth, monitors: Sequence[str]) -> Data:
     return data.without(dropped)
 
 
-def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
+def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
     """What the oracle says of a case, as JSON: {"oracles": one for each cause, "residual"}.
 
     A case of an unknown, or of none, has one oracle and, of an unknown, the residual after the best
@@ -169,9 +171,9 @@ def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
     if len(causes) > 1:
         # a monitor without a signal is known to everybody
         asked = [cause for cause in causes if find(cause.effect).modelled]
-        told = [tuple(c for c in causes if c is not cause) for cause in asked]
+        given = [tuple(c for c in causes if c is not cause) for cause in asked]
         return {
-            "oracles": [_said(Oracle(case, truth, others), case) for others in told],
+            "oracles": [_as_answer(Oracle(case, truth, others), case) for others in given],
             "residual": None,
         }
     oracle = Oracle(case, truth)
@@ -182,10 +184,10 @@ def judge(argument: tuple[Case, Truth]) -> dict[str, Any]:
             quiet = quiet - oracle.residual(truth.clean["before"])
         best = oracle.refined(quiet)[0].max()
         left = float(np.sqrt(max(float(quiet @ quiet) - best, 0.0)))
-    return {"oracles": [_said(oracle, case)], "residual": left}
+    return {"oracles": [_as_answer(oracle, case)], "residual": left}
 
 
-def _said(oracle: Oracle, case: Case) -> dict[str, Any]:
+def _as_answer(oracle: Oracle, case: Case) -> dict[str, Any]:
     clean = oracle.residual(case.fit.in_order_of(oracle.model.maps.monitors).readings[:, 0])
     statistic, amount = oracle.refined(clean)
     root = np.array([1 / find(name).power for name, _ in oracle.hypotheses])

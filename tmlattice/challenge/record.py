@@ -109,7 +109,7 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
 
 def one_action(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | None:
     """Whether the answer is one finding, named, with the action that takes the true cause away;
-    None of a result from before there were recommended actions."""
+    None of a result from before there were remedies."""
     if any("recommended_action" not in finding for finding in result["findings"]):
         return None
     if result["verdict"] != "identified" or len(result["findings"]) != 1:
@@ -119,9 +119,9 @@ def one_action(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | No
     return told["effect"] == true.effect and next(places) == next(places)
 
 
-def oracle_one_action(judged: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
+def oracle_one_action(evaluated: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
     """The same of the exact posterior: whether one action, the true one, holds the mass."""
-    (oracle,) = judged["oracles"]
+    (oracle,) = evaluated["oracles"]
     members = [m for m in oracle["posterior"] if m["probability"]]
     causes = [Cause(m["effect"], m["element"], m["amount"]) for m in members]
     told = recommended_actions(ring, causes, [m["probability"] for m in members])
@@ -170,14 +170,14 @@ def exact(result: Mapping[str, Any], causes: Sequence[Cause]) -> bool:
     return bool(fits[rows, columns].all())
 
 
-def oracle_answer(judged: Mapping[str, Any], ranking: str) -> dict[str, Any]:
+def oracle_answer(evaluated: Mapping[str, Any], ranking: str) -> dict[str, Any]:
     """The oracle in the words of a diagnosis.
 
     Args:
         judged: see `judge`.
         ranking: "class", all within a chi-square of 9, or "posterior", a 95 % credible set.
     """
-    findings = [_oracle_finding(o, ranking) for o in judged["oracles"] if o["detected"]]
+    findings = [_oracle_finding(o, ranking) for o in evaluated["oracles"] if o["detected"]]
     if not findings:
         return {"verdict": "none", "findings": []}
     several = any(len(finding["credible_set"]) > 1 for finding in findings)
@@ -200,7 +200,7 @@ def _oracle_finding(oracle: Mapping[str, Any], ranking: str) -> dict[str, Any]:
 
 
 def baseline_answer(
-    guesses: Sequence[Mapping[str, Any]], apart: int | None = None
+    guesses: Sequence[Mapping[str, Any]], separate: int | None = None
 ) -> dict[str, Any]:
     """A baseline in the words of a diagnosis; it always finds something.
 
@@ -208,7 +208,7 @@ def baseline_answer(
         guesses: see `baselines`.
         apart: so many guesses are findings of their own; None: all are of one finding.
     """
-    parts = [list(guesses)] if apart is None else [[guess] for guess in guesses[:apart]]
+    parts = [list(guesses)] if separate is None else [[guess] for guess in guesses[:separate]]
     findings = []
     for part in parts:
         members = [{**g, "probability": 1 / len(part)} for g in part]

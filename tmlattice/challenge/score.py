@@ -26,8 +26,8 @@ from tmlattice.challenge.case import (
     trusted_case,
 )
 from tmlattice.challenge.figures import ALONE, Row, summary
-from tmlattice.challenge.ideal import judge_kinds, plain_kinds
-from tmlattice.challenge.oracle import judge
+from tmlattice.challenge.ideal import evaluate_kinds, plain_kinds
+from tmlattice.challenge.oracle import evaluate
 from tmlattice.challenge.record import (
     ALIASED,
     REFUSED,
@@ -43,10 +43,10 @@ from tmlattice.challenge.record import (
 )
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError, plain
-from tmlattice.inference.judge import held_out_gap
+from tmlattice.inference.validation import held_out_gap
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import of_measurement
-from tmlattice.observe.first_turns import FirstTurns, judged
+from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ def score(
     results = finished(folder / "results")
     names = [name for name in case_names(folder) if name in results]
     if not names:
-        raise TmlatticeError(f"'{folder}' has no results; `tmlattice challenge run` makes them")
+        raise TmlatticeError(f"'{folder}' has no results; `tmlattice dev challenge run` makes them")
     failed, truths = dict[str, str](), dict[str, Truth]()
     for name in names:
         try:
@@ -95,7 +95,7 @@ def score(
     others = sorted(set(case_names(folder)) - set(names))
     names = list(truths)
     where: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": progress}
-    judged, guessed = _others(folder, described, truths, lattice, where) if oracle else ({}, {})
+    evaluated, guessed = _others(folder, described, truths, lattice, where) if oracle else ({}, {})
     ring = ring_of(described["lattice"])
     places = Places(ring)
     rows = []
@@ -103,7 +103,9 @@ def score(
         if "error" in results[name]:
             continue
         try:
-            row = row_of(results[name], truths[name], judged.get(name), guessed.get(name), places)
+            row = row_of(
+                results[name], truths[name], evaluated.get(name), guessed.get(name), places
+            )
             row |= clean_gap(ring, partial(read_case, folder, name), truths[name], results[name])
             summary([row], described["tier"])  # values that nobody can count spoil no other case
         except (
@@ -114,7 +116,7 @@ def score(
             continue
         rows.append(row)
     failed |= {n: str(results[n]["error"]) for n in names if "error" in results[n]}
-    failed |= {f"oracle {n}": r["error"] for n, r in judged.items() if "error" in r}
+    failed |= {f"oracle {n}": r["error"] for n, r in evaluated.items() if "error" in r}
     failed |= {f"baselines {n}": r["error"] for n, r in guessed.items() if "error" in r}
     return {
         "format": FORMAT,
@@ -146,19 +148,19 @@ def _others(
     def load_case(name: str) -> Callable[[], Case]:
         return lambda: trusted_case(folder, name, lattice)
 
-    ideal, plain_ones = (judge_kinds, plain_kinds) if of_kinds else (judge, baselines)
-    judged = run_batch(ideal, {n: load(n) for n in truths}, folder / "oracle", **where)
+    ideal, plain_ones = (evaluate_kinds, plain_kinds) if of_kinds else (evaluate, baselines)
+    evaluated = run_batch(ideal, {n: load(n) for n in truths}, folder / "oracle", **where)
     if described["tier"] == "E":  # they always find something
-        return judged, {}
+        return evaluated, {}
     cases = {n: load_case(n) for n in truths}
-    return judged, run_batch(plain_ones, cases, folder / "baselines", **where)
+    return evaluated, run_batch(plain_ones, cases, folder / "baselines", **where)
 
 
 # --- a case ---------------------------------------------------------------------------------------
 def row_of(
     result: Mapping[str, Any],
     truth: Truth,
-    judged: Mapping[str, Any] | None,
+    evaluated: Mapping[str, Any] | None,
     guessed: Mapping[str, Any] | None,
     places: Places,
 ) -> Row:
@@ -185,24 +187,24 @@ def row_of(
     answers |= {f"{ALONE}{kind}": one for kind, one in result.get("alone", {}).items()}
     if truth.alone:
         row["alone"] = dict(truth.alone)
-    if judged is not None and "error" not in judged:
+    if evaluated is not None and "error" not in evaluated:
         for ranking, name in (("class", "oracle"), ("posterior", "bayes_oracle")):
-            answers[name] = oracle_answer(judged, ranking)
-        row["residual"] = judged["residual"]
-        if unknown is not None and judged["residual"] is not None:
-            row["aliased"] = bool(judged["residual"] < ALIASED)
+            answers[name] = oracle_answer(evaluated, ranking)
+        row["residual"] = evaluated["residual"]
+        if unknown is not None and evaluated["residual"] is not None:
+            row["aliased"] = bool(evaluated["residual"] < ALIASED)
     if guessed is not None and "error" not in guessed:
         for name, guesses in guessed.items():
             if name != "seconds":
                 # of several causes they are told how many there are
-                apart = len(causes) if len(causes) > 1 else None
-                answers[name] = baseline_answer(guesses, apart)
+                separate = len(causes) if len(causes) > 1 else None
+                answers[name] = baseline_answer(guesses, separate)
     row["answers"] = {name: _answer(answer, truth, places) for name, answer in answers.items()}
     if len(causes) == 1:
         row["column"] = column(result, causes[0])
         row["one_action"] = one_action(result, causes[0], places.ring)
-        if judged is not None and "error" not in judged:
-            row["oracle_one_action"] = oracle_one_action(judged, causes[0], places.ring)
+        if evaluated is not None and "error" not in evaluated:
+            row["oracle_one_action"] = oracle_one_action(evaluated, causes[0], places.ring)
     if len(causes) > 1 and truth.tier == "C":
         visible = [cause for cause in causes if find(cause.effect).modelled]
         row["exact"] = {
@@ -292,5 +294,5 @@ def clean_gap(
     data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
     design = FirstTurns(model=Model(ring, data.settings), data=data, places={})
     found = replace(design, fixed=tuple(causes))
-    gap = held_out_gap([judged(problem) for problem in (design, found)])
+    gap = held_out_gap([held_out_residuals(problem) for problem in (design, found)])
     return {"clean_before": gap.misfits[0].rms, "clean_after": gap.misfits[-1].rms}

@@ -1,4 +1,4 @@
-"""`tmlattice challenge`: the diagnosis checked on data whose cause is withheld."""
+"""`tmlattice dev challenge`: the diagnosis checked on data whose cause is withheld."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -11,6 +11,7 @@ from tmlattice.cli.options import (
     Careful,
     background_option,
     console,
+    jobs_option,
     json_option,
     quiet_option,
     table,
@@ -39,8 +40,7 @@ def challenge() -> None:
 
 def _cluster_options(function: Any) -> Any:
     for decorate in (
-        click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler instead."),
-        click.option("--jobs", type=click.IntRange(1), help="Local processes; else one a core."),
+        jobs_option,
         click.option(
             "--lattice",
             metavar="FILE.py",
@@ -70,11 +70,6 @@ def _cluster_options(function: Any) -> Any:
     help="Tier B: the diagnosis starts from an orbit response of the machine before the fault.",
 )
 @click.option(
-    "--correctors",
-    type=click.IntRange(5),
-    help="With --learnt: the response steps so many, evenly along the ring; else all.",
-)
-@click.option(
     "--kind",
     "kinds",
     multiple=True,
@@ -91,17 +86,8 @@ def _cluster_options(function: Any) -> Any:
     help="Of the fit; two more are held out.",
 )
 @click.option("--effect", "effects", multiple=True, help="Draw from these alone (repeat).")
-@click.option(
-    "--signal",
-    type=float,
-    nargs=2,
-    default=(5.0, 100.0),
-    show_default=True,
-    help="Smallest and largest signal to noise, log-uniform.",
-)
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
 @background_option("Tiers B, E, R, T, P and M: small errors everywhere")
-@click.option("--told", is_flag=True, help="The diagnosis is told those sizes.")
 @quiet_option
 def make(
     tier: str,
@@ -139,8 +125,7 @@ def make(
 def run(
     context: click.Context,
     folder: Path,
-    jobs: int | None,
-    scheduler: str | None,
+    workers: dict[str, Any],
     lattice: str | None,
     quiet: bool,
 ) -> None:
@@ -150,7 +135,7 @@ def run(
     """
     from tmlattice.challenge import run as run_cases
 
-    results = run_cases(folder, jobs=jobs, scheduler=scheduler, progress=not quiet, lattice=lattice)
+    results = run_cases(folder, progress=not quiet, lattice=lattice, **workers)
     failed = {name: result["error"] for name, result in results.items() if "error" in result}
     if not quiet:
         screen = console()
@@ -177,8 +162,7 @@ def score(
     folder: Path,
     out: Path | None,
     oracle: bool,
-    jobs: int | None,
-    scheduler: str | None,
+    workers: dict[str, Any],
     lattice: str | None,
     json_file: Path | None,
     quiet: bool,
@@ -191,14 +175,7 @@ def score(
         output_file(json_file) if json_file else nullcontext() as path,
         output_folder(out) if out else nullcontext() as figures,
     ):
-        result = score_cases(
-            folder,
-            oracle=oracle,
-            jobs=jobs,
-            scheduler=scheduler,
-            progress=not quiet,
-            lattice=lattice,
-        )
+        result = score_cases(folder, oracle=oracle, progress=not quiet, lattice=lattice, **workers)
         if path:
             write_json(path, result)
         if figures:
@@ -229,7 +206,7 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
     if result["not_run"]:
         screen.print(
             f"{len(result['not_run'])} more cases have no result and count for nothing here; "
-            "`tmlattice challenge run` makes them"
+            "`tmlattice dev challenge run` makes them"
         )
     verdicts = ", ".join(f"{name} {count}" for name, count in result["verdicts"].items())
     screen.print(f"verdicts: {verdicts}")

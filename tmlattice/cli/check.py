@@ -7,16 +7,15 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
-    Careful,
+    OfMachine,
     assume_option,
     console,
     json_option,
-    lattice_options,
+    lattice_argument,
     no_numbers,
     open_ring,
     quiet_option,
     read_data,
-    table_options,
 )
 
 if TYPE_CHECKING:
@@ -25,13 +24,11 @@ if TYPE_CHECKING:
 WRONG = 1
 
 
-@click.command("check", cls=Careful)
-@click.argument("lattice")
-@click.argument("measurement", type=FILE)
-@lattice_options
+@click.command("check", cls=OfMachine)
+@lattice_argument
+@click.argument("measurement", type=FILE, required=False)
 @assume_option
 @click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
-@table_options
 @json_option
 @quiet_option
 @click.pass_context
@@ -39,12 +36,8 @@ def check(
     context: click.Context,
     lattice: str,
     measurement: Path,
-    sequence: str | None,
-    energy: float | None,
     assumed: tuple[str, ...],
     radiation: bool,
-    map_file: Path | None,
-    unit: str | None,
     json_file: Path | None,
     quiet: bool,
 ) -> None:
@@ -63,8 +56,8 @@ def check(
     with output_file(json_file) if json_file else nullcontext() as path:
         from tmlattice.diagnosis.data_checks import check_data
 
-        ring = open_ring(lattice, sequence, energy)
-        data, _ = read_data(measurement, ring, map_file, unit, quiet)
+        ring = open_ring(lattice)
+        data, _ = read_data(measurement, ring, quiet)
         try:
             found = check_data(ring, data, assumed=assumed, radiation=radiation)
         except (MeasurementError, UnknownNameError) as error:

@@ -8,23 +8,26 @@ import signal
 import sys
 import warnings
 from contextlib import suppress
-from typing import NoReturn, TextIO
+from pathlib import Path
+from typing import Any, NoReturn, TextIO
 
 import click
 
 from tmlattice import __version__
-from tmlattice.cli.challenge import challenge
 from tmlattice.cli.check import check
+from tmlattice.cli.compare import compare
 from tmlattice.cli.correct import correct
+from tmlattice.cli.dev import dev
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
 from tmlattice.cli.import_files import import_files
 from tmlattice.cli.info import info
+from tmlattice.cli.init import init
+from tmlattice.cli.options import FILE, lattice_options
 from tmlattice.cli.predict import predict
 from tmlattice.cli.progress import stopped_in
-from tmlattice.cli.reproduce import reproduce
+from tmlattice.cli.report import report
 from tmlattice.cli.simulate import simulate
-from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
 from tmlattice.errors import TmlatticeError, harmless
 
@@ -34,12 +37,39 @@ BAD_INPUT = 2
 class Sections(click.Group):
     """A group whose help lists its commands by what they are for."""
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """The options of all commands are taken wherever they stand."""
+        own = {
+            name: option
+            for option in self.params
+            if isinstance(option, click.Option) and option.name != "version"
+            for name in option.opts
+        }
+        first: list[str] = []
+        rest: list[str] = []
+        words = iter(args)
+        for word in words:
+            name, _, value = word.partition("=")
+            if word == "--":
+                rest += [word, *words]
+            elif name not in own:
+                rest.append(word)
+            elif value or own[name].is_flag:
+                first.append(word)
+            else:
+                given = next(words, None)
+                if given is None:
+                    raise click.UsageError(f"{name} needs a value, {own[name].metavar}", ctx)
+                first += [word, given]
+        return super().parse_args(ctx, first + rest)
+
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """The command, or a sentence with the nearest one."""
         if args and args[0] not in self.commands and not args[0].startswith("-"):
             near = difflib.get_close_matches(args[0], self.commands, 1)
+            near = [f"dev {args[0]}"] if args[0] in dev.commands else near
             mend = f"did you mean '{near[0]}'?" if near else "`tmlattice --help` lists them"
             raise click.UsageError(f"no command '{args[0]}'; {mend}", ctx)
         return super().resolve_command(ctx, args)
@@ -54,10 +84,11 @@ class Sections(click.Group):
 
 
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
-    "Measure": (info, simulate, import_files, check),
+    "Describe": (info, init),
+    "Measure": (simulate, import_files, check),
+    "Diagnose": (diagnose, report, compare, correct, effects),
     "Fit": (tune_fit, predict),
-    "Diagnose": (diagnose, correct, effects),
-    "Study": (study, challenge, reproduce),
+    "Develop": (dev,),
 }
 
 
@@ -66,14 +97,26 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="tmlattice")
-def tmlattice() -> None:
+@click.option("--machine", "machines", type=FILE, multiple=True, metavar="FILE",
+              help="Machine file: lattice, names, units, supplies; else tmlattice.toml of the "
+              "working directory, if there is one. For every command.")  # fmt: skip
+@click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors. For every command.")
+@lattice_options
+@click.pass_context
+def tmlattice(
+    context: click.Context, /, machines: tuple[Path, ...], quiet: bool, **lattice: Any
+) -> None:
     """The gap between the model of a storage ring and the ring itself.
 
     A LATTICE is a built-in name (petra3) or a path: OCELOT code (.py), AT (.mat, .json, .m,
     .repr), MAD-X (.seq, .madx, or a TWISS table: .tfs, .twiss, .dat), elegant (.lte), Xsuite
     (.json) or the package's own JSON. OCELOT's files are Python code and are run: load only files
-    that you trust. All others are data (SECURITY.md).
+    that you trust. All others are data (SECURITY.md). A machine file (`tmlattice init`) names the
+    LATTICE, so that it may be left out.
     """
+    given = ["machine"] * bool(machines) + [name for name, value in lattice.items() if value]
+    if given and context.invoked_subcommand in (dev.name, effects.name):
+        raise click.UsageError(f"--{given[0]} has no meaning for {context.invoked_subcommand}")
 
 
 for _commands in SECTIONS.values():

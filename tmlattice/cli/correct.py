@@ -5,7 +5,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, console, json_option, open_ring, quiet_option
+from tmlattice.cli.options import (
+    FILE,
+    HINT,
+    OfMachine,
+    console,
+    json_option,
+    machine_file,
+    open_ring,
+    quiet_option,
+)
 from tmlattice.cli.progress import tell
 
 if TYPE_CHECKING:
@@ -35,21 +44,22 @@ class TargetText(click.ParamType):  # type: ignore[type-arg]
         return name.strip(), tolerance
 
 
-@click.command("correct", cls=Careful)
+@click.command("correct", cls=OfMachine)
 @click.argument("estimated", metavar="ESTIMATED", type=FILE)
 @click.option(
     "--design",
     metavar="LATTICE",
     help="The lattice that the diagnosis started from: its strengths are the present settings, and "
-    "its optics the goal. Of a folder of `diagnose --out` it is known.",
+    "its optics the goal. Of a folder of `diagnose --out` it is known; else that of the machine "
+    "file.",
 )
 @click.option("--goal", metavar="LATTICE", help="The optics that are wanted, if not the design's.")
 @click.option(
     "--knobs",
     metavar="FILE|KINDS",
     help="A table of devices with units, settings, limits, steps and excitation curves (.csv, "
-    f".yaml; see --example); or kinds with commas: {KINDS}. Else supplies and skew quadrupoles, "
-    "and correctors where the closed orbit is a target.",
+    f".yaml; see --example); or kinds with commas: {KINDS}. Else [[supplies]] of the machine file; "
+    "else supplies and skew quadrupoles, and correctors where the closed orbit is a target.",
 )
 @click.option(
     "--target",
@@ -67,13 +77,6 @@ class TargetText(click.ParamType):  # type: ignore[type-arg]
     metavar="FILE",
     help="Write the table of the knobs, and end.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Of the draws from the posterior.",
-)
 @json_option
 @click.option(
     "--out",
@@ -89,7 +92,6 @@ def correct(
     knobs: str | None,
     targets: tuple[tuple[str, float | None], ...],
     example_file: Path | None,
-    seed: int,
     json_file: Path | None,
     out: Path | None,
     quiet: bool,
@@ -113,10 +115,11 @@ def correct(
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
         path, named = _sources(estimated)
-        start = design or named
+        machine = machine_file()
+        start = design or named or (machine.lattice_name() if machine else None)
         if not start:
-            raise click.UsageError("name the lattice that the diagnosis started from: --design")
-        settings = open_ring(start, None, None)
+            raise click.UsageError(f"name the lattice that was diagnosed with --design{HINT}")
+        settings = open_ring(start)
         devices = _devices(knobs, settings, dict(targets))
         if example_file:
             with output_file(example_file) as temporary:
@@ -124,10 +127,10 @@ def correct(
             console().print(f"written: {example_file}")
             return
         tell("estimated ring")
-        estimate, said = read_estimate(path, settings, open_ring(str(path), None, None))
-        wanted = open_ring(goal, None, None) if goal else None
+        estimate, said = read_estimate(path, settings, open_ring(str(path)))
+        wanted = open_ring(goal) if goal else None
         options: dict[str, Any] = {"targets": dict(targets)} if targets else {}
-        found = run(estimate, goal=wanted, knobs=devices, seed=seed, progress=tell, **options)
+        found = run(estimate, goal=wanted, knobs=devices, progress=tell, **options)
         if folder:
             write_correction(found, folder)
         if extra:
@@ -170,6 +173,9 @@ def _devices(knobs: str | None, settings: "Ring", targets: dict[str, float | Non
     from tmlattice.correction.knobs import default_knobs, kinds_for, read_knobs
     from tmlattice.correction.targets import OPTICS
 
+    machine = machine_file()
+    if knobs is None and machine is not None and (own := machine.knobs(settings)) is not None:
+        return own
     if knobs is None:
         return default_knobs(settings, kinds_for(targets or OPTICS))
     if Path(knobs).suffix:

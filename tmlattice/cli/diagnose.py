@@ -12,18 +12,17 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
-    Careful,
     NameList,
+    OfMachine,
     assume_option,
     background_option,
     console,
     json_option,
-    lattice_options,
+    lattice_argument,
     no_numbers,
     open_ring,
     quiet_option,
     read_data,
-    table_options,
 )
 from tmlattice.cli.progress import tell
 
@@ -32,24 +31,16 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
-    from tmlattice.inference.among import Known
+    from tmlattice.inference.distributed import DistributedErrors
     from tmlattice.lattice import Ring
     from tmlattice.measurement import Measurement
 
 log = logging.getLogger(__name__)
 
 
-@click.command("diagnose", cls=Careful)
-@click.argument("lattice")
-@click.argument("measurements", metavar="MEASUREMENT...", type=FILE, nargs=-1, required=True)
-@lattice_options
-@click.option(
-    "--holdout",
-    type=click.FloatRange(0, 1, max_open=True),
-    default=None,
-    help="Share of the shots, or of the correctors, that the fit does not see: the validation set. "
-    "0.33 of shots, 0.2 of correctors where nothing is said.",
-)
+@click.command("diagnose", cls=OfMachine)
+@lattice_argument
+@click.argument("measurements", metavar="MEASUREMENT...", type=FILE, nargs=-1)
 @click.option(
     "--reference",
     "references",
@@ -117,7 +108,6 @@ log = logging.getLogger(__name__)
     "the machine as found, make it the design again (a quadrupole that gives 20 % less is told "
     "25 % more). What no setting mends is printed.",
 )
-@table_options
 @json_option
 @click.option(
     "--out",
@@ -129,8 +119,6 @@ log = logging.getLogger(__name__)
 def diagnose(
     lattice: str,
     measurements: tuple[Path, ...],
-    sequence: str | None,
-    energy: float | None,
     references: tuple[Path, ...],
     settings_file: Path | None,
     background: tuple[tuple[str, float | None], ...],
@@ -143,9 +131,6 @@ def diagnose(
     json_file: Path | None,
     out: Path | None,
     quiet: bool,
-    holdout: float | None,
-    map_file: Path | None,
-    unit: str | None,
     **options: Any,
 ) -> None:
     """Say where the ring differs from LATTICE, by which effect, and how far the gap shrinks.
@@ -176,9 +161,8 @@ def diagnose(
         asked = read_settings(settings_file) if settings_file else {}
         from tmlattice.measurement import Measurement, OrbitResponse
 
-        ring = open_ring(lattice, sequence, energy)
-        told = (map_file, unit, quiet)
-        (data, said), (before, _) = (_read(p, ring, *told) for p in (measurements, references))
+        ring = open_ring(lattice)
+        (data, said), (before, _) = (_read(p, ring, quiet) for p in (measurements, references))
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more
         turns = isinstance(first, Measurement) and not more
@@ -204,7 +188,6 @@ def diagnose(
             options["reference"] = before
         if options["max_effects"] is None:
             del options["max_effects"]
-        options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
         if lattice_out and lattice_out == corrected_out:
             raise click.UsageError(f"--lattice-out and --corrected-out are both '{lattice_out}'")
         for option, path in (("lattice", lattice_out), ("corrected", corrected_out)):
@@ -247,7 +230,7 @@ def diagnose(
 
 
 def _read(
-    paths: tuple[Path, ...], ring: "Ring", map_file: Path | None, unit: str | None, quiet: bool
+    paths: tuple[Path, ...], ring: "Ring", quiet: bool
 ) -> "tuple[dict[str, Measured], list[str]]":
     """Measurements by the names of their folders, by the whole path where two have one name; and
     what was assumed of files that are none.
@@ -263,7 +246,7 @@ def _read(
     found: dict[str, Measured] = {}
     said: list[str] = []
     for name, path in zip(names, paths, strict=True):
-        found[str(path) if twice else name], own = read_data(path, ring, map_file, unit, quiet)
+        found[str(path) if twice else name], own = read_data(path, ring, quiet)
         said += own
     return found, said
 
@@ -281,7 +264,7 @@ def _not_used(lattice: str) -> list[str]:
     ]
 
 
-def _known(ring: "Ring", lattice: str) -> "Known | None":
+def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
     """What an earlier diagnosis left known beside the ring as it found it."""
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, read_known
 
@@ -316,7 +299,7 @@ def _write(
         write_json(extra, document)
 
 
-def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | None":
+def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Correction | None":
     """Settings of supplies that bring the estimated ring to the design, where the covariance of its
     errors is known and they have an expected gain."""
     from tmlattice.correction import correct
@@ -336,7 +319,7 @@ def _correction(result: "Diagnosis", known: "Known | None") -> "Correction | Non
 
 def _write_rings(
     result: "Diagnosis",
-    known: "Known | None",
+    known: "DistributedErrors | None",
     lattice_out: Path | None,
     corrected_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:

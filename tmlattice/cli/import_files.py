@@ -1,17 +1,18 @@
 """`tmlattice import`: measurements of other programs as a measurement folder."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, console, quiet_option
+from tmlattice.cli.options import FILE, OfMachine, console, machine_file, open_ring, quiet_option
 
 if TYPE_CHECKING:
     from tmlattice.importers import Imported
 
 
-@click.command("import", cls=Careful)
+@click.command("import", cls=OfMachine)
 @click.argument("files", nargs=-1, type=FILE)
 @click.option(
     "--out",
@@ -28,13 +29,8 @@ if TYPE_CHECKING:
     help="Of a LOCO fit: the model before the fit, with the parameters of the first iteration; or "
     "the fitted lattice, with those of the last.",
 )
-@click.option("--lattice", metavar="LATTICE", help="Of a table or of turns.")
-@click.option("--sequence", metavar="NAME", help="The lattice file's variable that holds the ring.")
 @click.option(
-    "--energy",
-    type=click.FloatRange(0, min_open=True),
-    metavar="GEV",
-    help="Beam energy of LATTICE; else what it states.",
+    "--lattice", metavar="LATTICE", help="Of a table or of turns; else the machine file's."
 )
 @click.option(
     "--turns",
@@ -45,27 +41,14 @@ if TYPE_CHECKING:
 @click.option(
     "--unit",
     type=click.Choice(["m", "mm", "um", "nm"]),
-    help="Of readings whose file states none (else taken from their size, with a word), or of a "
-    "turn-by-turn file [mm].",
-)
-@click.option(
-    "--noise",
-    type=click.FloatRange(0, min_open=True),
-    metavar="M",
-    help="Rms of a reading, or of an orbit change, m, where FILES give none.",
-)
-@click.option(
-    "--map",
-    "map_file",
-    type=FILE,
-    metavar="FILE",
-    help="YAML: names, unit, noise, bad monitors of a file of readings.",
+    help="Of readings whose file states none (else as the machine file states, or from their "
+    "size), or of a turn-by-turn file [mm].",
 )
 @click.option(
     "--example",
     is_flag=True,
-    help="Write a template of each kind of file into --out, for LATTICE (petra3 where none "
-    "is named), and import nothing.",
+    help="Write a template of each kind of file and a machine file into --out, for --lattice "
+    "(else the machine file's, or petra3), and import nothing.",
 )
 @click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
@@ -75,12 +58,8 @@ def import_files(
     out: Path,
     iteration: Literal["first", "last"],
     lattice: str | None,
-    sequence: str | None,
-    energy: float | None,
     turns: str | None,
     unit: Literal["m", "mm", "um", "nm"] | None,
-    noise: float | None,
-    map_file: Path | None,
     example: bool,
     keep_bad: bool,
     force: bool,
@@ -97,7 +76,9 @@ def import_files(
     if example:
         if files:
             raise click.UsageError("--example writes templates and reads no FILES")
-        _example(lattice or "petra3", sequence, energy, out, quiet)
+        machine = machine_file()
+        own = machine.lattice_name() if machine is not None and machine.lattice else "petra3"
+        _example(lattice or own, out, quiet)
         return
     if not files:
         raise click.UsageError("name the FILES to import, or --example for a template of each")
@@ -105,29 +86,37 @@ def import_files(
     from tmlattice.measurement.write import check_free
 
     check_free(out, force)
-    from tmlattice.importers.told import read_told
-
-    told = None if map_file is None else read_told(map_file)
-    options = Options(iteration, keep_bad, sequence, lattice, energy, turns, unit, noise, told)
+    machine = machine_file()
+    options = Options(iteration, keep_bad, turns=turns, unit=unit)
+    if lattice:
+        options = replace(options, ring=lambda: open_ring(lattice))
+    elif machine is not None and machine.lattice:
+        options = replace(options, ring=lambda: open_ring(machine.lattice_name()))
+    if machine is not None:
+        stated = machine.options_for(files[0])  # of a lattice that is among the files
+        options = replace(
+            options,
+            told=machine.told,
+            sequence=stated.get("sequence"),
+            energy=machine.options.get("energy"),
+        )
     brought = bring_in(files, options)
     write_imported(brought, out, force)
     if not quiet:
         _print(brought, out)
 
 
-def _example(
-    lattice: str, sequence: str | None, energy: float | None, out: Path, quiet: bool
-) -> None:
+def _example(lattice: str, out: Path, quiet: bool) -> None:
     from tmlattice.effects import Cause
     from tmlattice.importers.example import FILES, write_example
-    from tmlattice.lattice import load_ring, middle_of_first_arc
-    from tmlattice.lattice.checks import need_monitors
+    from tmlattice.lattice import middle_of_first_arc
     from tmlattice.machine.simulate import simulate
 
-    ring = load_ring(lattice, sequence, energy)
-    need_monitors(ring)
+    ring = open_ring(lattice)
     fault = Cause("quadrupole_gradient", middle_of_first_arc(ring).name, -0.05)
-    write_example(out, ring, simulate(ring, [fault], shots=6, engine="ocelot").measurement())
+    write_example(
+        out, lattice, ring, simulate(ring, [fault], shots=6, engine="ocelot").measurement()
+    )
     if quiet:
         return
     screen = console()
@@ -135,7 +124,7 @@ def _example(
         screen.print(f"{out / name}: {what}", soft_wrap=True)
     screen.print(f"the readings are of '{lattice}' with {fault.element} by {fault.amount:+.0%}")
     screen.print(
-        f"next: tmlattice diagnose {lattice} {out / 'readings_wide.csv'} --map {out / 'map.yaml'}",
+        f"next: tmlattice diagnose {out / 'readings_wide.csv'} --machine {out / 'tmlattice.toml'}",
         soft_wrap=True,
     )
 

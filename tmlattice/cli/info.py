@@ -1,12 +1,12 @@
 """`tmlattice info`: what a lattice holds and how it focuses."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from tmlattice.cli.options import (
-    Careful,
+    WithDefault,
     console,
     json_option,
     lattice_argument,
@@ -15,34 +15,34 @@ from tmlattice.cli.options import (
     table,
 )
 
+if TYPE_CHECKING:
+    from tmlattice.lattice import Ring
 
-@click.command("info", cls=Careful)
+
+@click.command("info", cls=WithDefault)
 @lattice_argument
 @json_option
 @quiet_option
-def info(
-    lattice: str, sequence: str | None, energy: float | None, json_file: Path | None, quiet: bool
-) -> None:
+def info(lattice: str, json_file: Path | None, quiet: bool) -> None:
     """Print counts, length, tunes, chromaticity and betas of LATTICE."""
     from contextlib import nullcontext
 
     from tmlattice.files import output_file, write_json
 
     with output_file(json_file) if json_file else nullcontext() as path:
-        facts = _facts(lattice, sequence, energy)
+        facts = _facts(open_ring(lattice, read=False))
         if path:
             write_json(path, facts)
     if not quiet:
         _print(facts)
 
 
-def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str, Any]:
+def _facts(ring: "Ring") -> dict[str, Any]:
     from tmlattice import __version__
     from tmlattice.beam.chain import Chain
     from tmlattice.errors import UnstableRingError
     from tmlattice.optics import off_momentum, twiss
 
-    ring = open_ring(lattice, sequence, energy, read=False)
     facts: dict[str, Any] = {
         "format": "tmlattice-info",
         "version": 1,
@@ -64,10 +64,10 @@ def _facts(lattice: str, sequence: str | None, energy: float | None) -> dict[str
         "problem": None,
     }
     try:
-        functions = twiss(Chain.from_ring(ring))
+        functions = twiss(ring)
         facts["tunes"] = functions.total_tunes.tolist()
         facts["beta_max"] = functions.beta.max(axis=0).tolist()
-        facts["closed_orbit_max"] = abs(functions.orbit).max(axis=0).tolist()
+        facts["closed_orbit_max"] = [float(abs(own).max()) for own in (functions.x, functions.y)]
         energy_effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
         # per momentum, not per energy dE / (p0 c) = beta delta; and of the path, not of its time
         beta, lag = (1.0, 0.0) if ring.gamma > 1e3 else (ring.beta, ring.gamma**-2)

@@ -1,8 +1,10 @@
 """Options that several commands share."""
 
+import functools
 import os
+import re
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,50 +17,31 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from tmlattice.lattice import Ring
+    from tmlattice.machine_file import MachineFile
     from tmlattice.measurement import AnyMeasurement, Measurement
 
 FILE = click.Path(path_type=Path)
 
-REGULARIZATIONS = ["symplectic", "none", "l1", "l2"]
 
+class Launch(click.ParamType):  # type: ignore[type-arg]
+    """A launch as one word."""
 
-class Numbers(click.ParamType):  # type: ignore[type-arg]
-    """Numbers separated by commas, as one word.
-
-    Args:
-        name: how they are shown: one name each.
-        least: the smallest that is allowed.
-        advice: what a wrong value is answered with.
-    """
-
-    def __init__(self, name: str, advice: str, least: float = float("-inf")) -> None:
-        self.name = name
-        self._advice = advice
-        self._least = least
+    name = "x,px,y,py"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """As many finite numbers as there are names."""
+        """Four finite numbers."""
         if isinstance(value, tuple):
             return value
         try:
             numbers = tuple(float(part) for part in str(value).split(","))
         except ValueError:
             numbers = ()
-        allowed = all(self._least <= n and abs(n) < float("inf") for n in numbers)
-        if len(numbers) != len(self.name.split(",")) or not allowed:
-            self.fail(f"'{value}'{self._advice}", param, ctx)
+        if len(numbers) != 4 or not all(abs(n) < float("inf") for n in numbers):
+            say = "is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0"
+            self.fail(f"'{value}' {say}", param, ctx)
         return numbers
-
-
-LAUNCH = Numbers(
-    "x,px,y,py", " is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0"
-)
-EMITTANCE = Numbers("X,Y", ": give two emittances in m rad, such as 1e-9,1e-11", least=0.0)
-LAUNCH_SIGMA = Numbers(
-    "X,PX,Y,PY,DELTA", ": give five rms values, such as 1e-4,2e-5,1e-4,2e-5,0", least=0.0
-)
 
 
 class BackgroundText(click.ParamType):  # type: ignore[type-arg]
@@ -111,7 +94,6 @@ INPUTS = (
     "lattice", "measurement", "measurements", "references", "calibration", "settings_file",
     "network", "files", "map_file", "estimated", "design", "goal", "knobs",
 )  # fmt: skip
-MARKS = ("monitors", "correctors", "particle")
 OUTPUTS = ("json_file", "truth", "out", "lattice_out", "corrected_out", "example_file")
 OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv", "tunes.csv")
 OF_FOLDERS = ("challenge.json", "options.json")
@@ -132,6 +114,10 @@ class Careful(click.Command):
         values = [ctx.params.get(name) for name in INPUTS]
         given = [v for value in values for v in (value if isinstance(value, tuple) else [value])]
         folder = ctx.params.get("folder")
+        machine = machine_file()
+        if machine is not None:
+            given += [machine.path, machine.lattice]
+            given += [machine.supplies] if isinstance(machine.supplies, Path) else []
         paths = [Path(str(value)) for value in given if value]
         read = {key for path in paths for key in _identities(path)}
         for path in paths:
@@ -155,8 +141,158 @@ class Careful(click.Command):
             if keys & written:
                 raise OutputError(f"'{out}' is written twice; name another file for one of them")
             written |= keys
-        with shown(f"tmlattice {ctx.info_name}", bool(ctx.params.get("quiet"))):
+        with shown(f"tmlattice {ctx.info_name}", is_quiet()):
             return super().invoke(ctx)
+
+
+class OfMachine(Careful):
+    """A command on a lattice, which a machine file may name.
+
+    Of its arguments LATTICE is the first one where it may be left out.
+    """
+
+    default = ""
+    """The lattice where neither the command line nor a machine file names one; none: an error."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the machine file, and fill in the LATTICE that was left out.
+
+        Raises:
+            MachineFileError: the machine file cannot be used.
+            click.UsageError: neither names a lattice.
+        """
+        try:
+            rest = super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if error.option_name not in STATED:
+                raise
+            raise click.UsageError(
+                f"no option {error.option_name}: {STATED[error.option_name]} of the machine file "
+                "states it (`tmlattice init` writes one)",
+                ctx,
+            ) from error
+        machine = _machine(ctx)
+        arguments = {p.name: p for p in self.params if isinstance(p, click.Argument)}
+        if "lattice" not in arguments:
+            return rest
+        given = ctx.params
+        data = next((name for name in ("measurements", "measurement") if name in arguments), None)
+        word = given["lattice"]
+        if data and word is not None and machine is not None and machine.lattice:
+            more = given[data]
+            if not more or (isinstance(more, tuple) and not _is_lattice(word)):
+                given[data] = (Path(word), *more) if arguments[data].nargs == -1 else Path(word)
+                given["lattice"] = None
+        if data and not given[data]:
+            raise click.UsageError(
+                "name a MEASUREMENT, and before it the LATTICE where no machine file does "
+                "(`tmlattice init LATTICE` writes one)",
+                ctx,
+            )
+        if given["lattice"] is None:
+            if machine is not None and machine.lattice:
+                given["lattice"] = machine.lattice_name()
+            elif self.default:
+                given["lattice"] = self.default
+            else:
+                raise click.UsageError(f"name the LATTICE{HINT}", ctx)
+        return rest
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Where the rest is stated."""
+        text = (
+            "Names, units and supplies: in the machine file (`tmlattice init`). --machine FILE, "
+            "--quiet, --sequence, --energy, --particle, --monitors and --correctors: see "
+            "`tmlattice --help`."
+        )
+        formatter.write_paragraph()
+        formatter.write_text(text)
+
+
+class WithDefault(OfMachine):
+    """A command that takes the built-in ring where no lattice is named."""
+
+    default = "petra3"
+
+
+STATED = {"--unit": "[data]", "--noise": "[data]", "--map": "[channels]"}
+"""Options that a machine file takes the place of, and where it states them."""
+HINT = ", or state it in a machine file (`tmlattice init LATTICE` writes one)"
+_MACHINE = "tmlattice.machine"
+
+
+LATTICE_OPTIONS = (
+    click.option("--sequence", metavar="NAME", help="The sequence, line or variable of the lattice "
+                 "file that is the ring."),
+    click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
+                 help="Beam energy, if the lattice states none."),
+    click.option("--particle", type=click.Choice(["electron", "proton"]), metavar="NAME",
+                 help="electron or proton, if the lattice states none."),
+    click.option("--monitors", multiple=True, metavar="PATTERN", help="Markers or drifts that are "
+                 "BPMs, such as 'BPM*'; several with commas."),
+    click.option("--correctors", multiple=True, metavar="PATTERN",
+                 help="Elements that are correctors too, such as 'COR*'."),
+)  # fmt: skip
+
+
+def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """How the LATTICE is read, for every command; a machine file states it once and for all."""
+    for option in reversed(LATTICE_OPTIONS):
+        function = option(function)
+    return function
+
+
+def stated_options() -> dict[str, Any]:
+    """The options of `load_ring` that the command line states."""
+    given = click.get_current_context().find_root().params
+    names = ("sequence", "energy", "particle", "monitors", "correctors")
+    chosen = {name: given.get(name) for name in names}
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in chosen.items() if v}
+
+
+def is_quiet() -> bool:
+    """Whether `--quiet` was given, anywhere on the command line."""
+    return bool(click.get_current_context().find_root().params.get("quiet"))
+
+
+def machine_file() -> "MachineFile | None":
+    """The machine file of the running command."""
+    context = click.get_current_context(silent=True)
+    return None if context is None else context.meta.get(_MACHINE)
+
+
+def _machine(ctx: click.Context) -> "MachineFile | None":
+    """The file of `--machine`, else the one in the working directory, with a word on which it is.
+
+    Raises:
+        MachineFileError: it cannot be used.
+        click.UsageError: two are named.
+    """
+    given: tuple[Path, ...] = ctx.find_root().params.get("machines") or ()
+    found = Path("tmlattice.toml")
+    if not given and not found.exists():
+        return None
+    from tmlattice.errors import harmless
+    from tmlattice.machine_file import load_machine_file
+
+    if len(given) > 1:
+        raise click.UsageError(f"--machine is given twice, '{given[0]}' and '{given[1]}'", ctx)
+    # one that was found may be anybody's: what it names is not run
+    made = load_machine_file(given[0] if given else found, trusted=bool(given))
+    ctx.meta[_MACHINE] = made
+    if not ctx.find_root().params.get("quiet"):
+        click.echo(harmless(f"tmlattice: machine file {made.path}"), err=True)
+    return made
+
+
+def _is_lattice(word: str) -> bool:
+    """Whether a word is a lattice, and not the first of several measurements."""
+    from tmlattice.lattice.load import SUFFIXES, builtin_lattices
+
+    path = Path(word)
+    if path.is_dir() or path.name == "measurement.json":
+        return False
+    return word.casefold() in builtin_lattices() or path.suffix.lower() in SUFFIXES
 
 
 def _identities(path: Path) -> set[Any]:
@@ -182,27 +318,34 @@ def no_numbers(error: Exception) -> str:
     )
 
 
-def _remember(context: click.Context, option: click.Parameter, value: Any) -> None:
-    context.meta[f"tmlattice.{option.name}"] = value
-
-
-def open_ring(
-    lattice: str, sequence: str | None, energy: float | None, read: bool = True
-) -> "Ring":
-    """The ring that a command's lattice options name; a part of a ring is told.
+def open_ring(lattice: str, read: bool = True) -> "Ring":
+    """The ring of a lattice, by what the machine file states of it; a part of a ring is told.
 
     Args:
-        lattice, sequence, energy: see `load_ring`.
+        lattice: a built-in name or a path.
         read: the command needs monitors.
 
     Raises:
         LatticeError: no such ring, or one without monitors.
     """
-    from tmlattice.errors import harmless
+    machine = machine_file()
+    options = {} if machine is None else dict(machine.options_for(lattice))
+    return checked_ring(lattice, options | stated_options(), read)
+
+
+def checked_ring(lattice: str, options: Mapping[str, Any], read: bool = True) -> "Ring":
+    """As `open_ring`, with options of `load_ring`."""
+    from tmlattice.errors import LatticeError, harmless
     from tmlattice.lattice import load_ring
     from tmlattice.lattice.checks import need_monitors, no_whole_turn
 
-    ring = load_ring(lattice, sequence, energy, **marks())
+    try:
+        ring = load_ring(lattice, **options)
+    except LatticeError as error:
+        if not re.search(r"\b(energy|sequence)=", str(error)):
+            raise
+        where = "on the command line: --energy GEV, --sequence NAME, or [lattice] of tmlattice.toml"
+        raise LatticeError(f"{error}; {where}") from error
     if read:
         need_monitors(ring)
     if told := no_whole_turn(ring):
@@ -210,68 +353,35 @@ def open_ring(
     return ring
 
 
-def marks() -> dict[str, Any]:
-    """What `--monitors`, `--correctors` and `--particle` of the running command say, if they do."""
-    meta = click.get_current_context().meta
-    said = {name: meta.get(f"tmlattice.mark_{name}") for name in MARKS}
-    return {name: value for name, value in said.items() if value}
+lattice_argument = click.argument("lattice", required=False)
 
 
-def lattice_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Which sequence of the lattice, at which energy, and what is a monitor or a corrector."""
-    for decorate in (
-        click.option("--correctors", "mark_correctors", multiple=True, metavar="PATTERN",
-                     expose_value=False, callback=_remember,
-                     help="Elements that are correctors too, such as 'COR*'; see --monitors."),
-        click.option("--monitors", "mark_monitors", multiple=True, metavar="PATTERN",
-                     expose_value=False, callback=_remember,
-                     help="Elements that are monitors although the file has them as markers or "
-                     "drifts, such as 'BPM*'; several with commas."),
-        click.option("--particle", "mark_particle", type=click.Choice(["electron", "proton"]),
-                     expose_value=False, callback=_remember,
-                     help="Else what the lattice states."),
-        click.option("--energy", type=click.FloatRange(0, min_open=True), metavar="GEV",
-                     help="Beam energy; else what the lattice states."),
-        click.option("--sequence", metavar="NAME",
-                     help="The lattice file's variable that holds the ring."),
-    ):  # fmt: skip
-        function = decorate(function)
-    return function
+class Workers(click.ParamType):  # type: ignore[type-arg]
+    """A number of local processes, or the address of a Dask scheduler."""
+
+    name = "N|ADDRESS"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> dict[str, Any]:
+        """The option `jobs` or `scheduler` of `run_batch`."""
+        if isinstance(value, dict):
+            return value
+        if ":" in str(value):
+            return {"scheduler": str(value)}
+        try:
+            number = int(value)
+        except ValueError:
+            number = 0
+        if number < 1:
+            self.fail(f"'{value}': give a number of processes, or tcp://HOST:PORT", param, ctx)
+        return {"jobs": number}
 
 
-def lattice_argument(function: Callable[..., Any]) -> Callable[..., Any]:
-    """LATTICE, petra3 where none is named, and its options."""
-    return click.argument("lattice", default="petra3")(lattice_options(function))
-
-
-def change_option(
-    default: float | None, text: str
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """--change, of the magnet that an experiment weakens."""
-    return click.option("--change", type=float, default=default, help=text,
-                        show_default=default is not None)  # fmt: skip
-
-
-def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """What `tune-fit` and its study share: the perturbation, the measurement, the fit."""
-    for decorate in reversed((
-        click.option("--launch", type=LAUNCH, default="1e-3,0,1e-3,0", show_default=True,
-                     help="State at the start of the ring, m and rad."),
-        click.option("--noise", type=click.FloatRange(0), default=2e-5, show_default=True,
-                     help="Rms of one reading, m."),
-        click.option("--epochs", type=click.IntRange(1), default=1000, show_default=True,
-                     help="Gradient steps at most."),
-        click.option("--turns", type=click.IntRange(16), default=500, show_default=True,
-                     help="Tracked for the tunes."),
-        click.option("--regularization-rate", type=click.FloatRange(0), default=1e-10,
-                     show_default=True, help="lambda: weight of the regularization."),
-        click.option("--learning-rate", type=click.FloatRange(0, min_open=True), default=1e-6,
-                     show_default=True, help="Adam's step."),
-        click.option("--seed", type=click.IntRange(0), default=0, show_default=True,
-                     help="Of the readings' noise."),
-    )):  # fmt: skip
-        function = decorate(function)
-    return function
+jobs_option = click.option(
+    "--jobs", "workers", type=Workers(), default={},
+    help="Local processes (else one a core), or the address of a Dask scheduler.",
+)  # fmt: skip
 
 
 def assume_option(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -290,28 +400,17 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def quiet_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """--quiet."""
-    return click.option("--quiet", "-q", is_flag=True, help="Print nothing but errors.")(function)
+    """`quiet`, which `--quiet` of the whole command line sets."""
+
+    @functools.wraps(function)
+    def run(*arguments: Any, **options: Any) -> Any:
+        return function(*arguments, quiet=is_quiet(), **options)
+
+    return run
 
 
-def table_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """--map and --unit, of a file whose columns are taken as they come."""
-    for decorate in (
-        click.option("--unit", type=click.Choice(["m", "mm", "um", "nm"]),
-                     help="Of readings whose file states none; else taken from their size, with a "
-                     "word."),
-        click.option("--map", "map_file", type=FILE, metavar="FILE",
-                     help="YAML: names, unit, noise, bad monitors of a file of readings "
-                     "(`tmlattice import --example` writes one)."),
-    ):  # fmt: skip
-        function = decorate(function)
-    return function
-
-
-def read_data(
-    path: Path, ring: "Ring", map_file: Path | None = None, unit: Any = None, quiet: bool = False
-) -> "tuple[AnyMeasurement, tuple[str, ...]]":
-    """A measurement folder, or a file of readings as they come, and what was assumed of it.
+def read_data(path: Path, ring: "Ring", quiet: bool) -> "tuple[AnyMeasurement, tuple[str, ...]]":
+    """A measurement folder, or a file of another program, and what was assumed of it.
 
     The assumptions are printed too: nothing is taken for granted silently.
     """
@@ -320,10 +419,9 @@ def read_data(
     if not path.is_file() or path.name == "measurement.json":
         return read_measurement(path), ()
     from tmlattice.importers import Options, bring_in, described
-    from tmlattice.importers.told import read_told
 
-    told = None if map_file is None else read_told(map_file)
-    brought = bring_in([path], Options(ring=ring, unit=unit, told=told))
+    machine = machine_file()
+    brought = bring_in([path], Options(ring=ring, told=None if machine is None else machine.told))
     said = (*brought.assumed, *brought.doubts)
     if not quiet:
         screen = console()
@@ -334,7 +432,7 @@ def read_data(
     return brought.measurement, said
 
 
-def trajectories(path: Path, refusal: str, ring: "Ring", **given: Any) -> "Measurement":
+def trajectories(path: Path, refusal: str, ring: "Ring", quiet: bool) -> "Measurement":
     """The first turns of a measurement folder, or of a file of readings; see `read_data`.
 
     Raises:
@@ -343,7 +441,7 @@ def trajectories(path: Path, refusal: str, ring: "Ring", **given: Any) -> "Measu
     from tmlattice.errors import MeasurementError
     from tmlattice.measurement import Measurement, in_words
 
-    data, _ = read_data(path, ring, **given)
+    data, _ = read_data(path, ring, quiet)
     if not isinstance(data, Measurement):
         raise MeasurementError(f"'{path}' is {in_words(data)}{refusal}")
     return data

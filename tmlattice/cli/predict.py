@@ -4,12 +4,18 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, console, lattice_options, open_ring, quiet_option
+from tmlattice.cli.options import (
+    FILE,
+    OfMachine,
+    console,
+    lattice_argument,
+    open_ring,
+    quiet_option,
+)
 
 
-@click.command("predict", cls=Careful)
-@click.argument("lattice")
-@lattice_options
+@click.command("predict", cls=OfMachine)
+@lattice_argument
 @click.option(
     "--calibration",
     type=FILE,
@@ -29,8 +35,6 @@ from tmlattice.cli.options import FILE, Careful, console, lattice_options, open_
 @quiet_option
 def predict(
     lattice: str,
-    sequence: str | None,
-    energy: float | None,
     calibration: Path | None,
     correctors: tuple[str, ...],
     kick: float,
@@ -55,7 +59,7 @@ def predict(
     if kick == 0 or not abs(kick) < float("inf"):
         raise click.BadParameter(f"a kick of {kick:g} rad; it is finite and not zero")
     with output_file(out) as file:
-        ring = open_ring(lattice, sequence, energy)
+        ring = open_ring(lattice)
         causes = read_calibration(calibration, ring) if calibration else []
         dispersion = read_dispersion(calibration, ring) if calibration else None
         rejected = read_rejected(calibration, ring) if calibration else []

@@ -1,4 +1,4 @@
-"""`tmlattice reproduce`: the paper's other systems, its figures beside ours."""
+"""`tmlattice dev reproduce`: the paper's other systems, its figures beside ours."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, console, json_option, quiet_option
+from tmlattice.cli.options import FILE, console, quiet_option
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     Reproduced = tuple[list[Comparison], Figure]
 
+SEED = 0
+"""Of noise and of first weights."""
 SYSTEMS = ["free-fall", "lotka-volterra", "pendulum", "magnets", "cavitation"]
 
 
@@ -23,15 +25,10 @@ SYSTEMS = ["free-fall", "lotka-volterra", "pendulum", "magnets", "cavitation"]
 @click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
 @click.option("--out", type=FILE, default="reproduce", show_default=True, metavar="DIR",
               help="Folder for the figures and reproduction.json.")  # fmt: skip
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True,
-              help="Of noise and of first weights.")  # fmt: skip
 @click.option("--small", is_flag=True,
               help="Fewer networks, a gentler collapse: seconds, not minutes.")  # fmt: skip
-@json_option
 @quiet_option
-def reproduce(
-    systems: tuple[str, ...], out: Path, seed: int, small: bool, json_file: Path | None, quiet: bool
-) -> None:
+def reproduce(systems: tuple[str, ...], out: Path, small: bool, quiet: bool) -> None:
     """Reproduce the paper's SYSTEMS (all, where none is named): table and figures.
 
     Every number under "here" is computed anew; those under "paper" are as printed there.
@@ -39,18 +36,17 @@ def reproduce(
     from time import perf_counter
 
     from tmlattice import __version__
-    from tmlattice.files import output_file, output_folder, write_json
+    from tmlattice.files import output_folder, write_json
 
     chosen = [name for name in SYSTEMS if name in systems] or SYSTEMS
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out))
-        extra = files.enter_context(output_file(json_file)) if json_file else None
         import matplotlib.pyplot as plt
 
         entries = []
         for name in chosen:
             begin = perf_counter()
-            rows, figure = _RUN[name](seed, small, not quiet)
+            rows, figure = _RUN[name](small, not quiet)
             figure.savefig(folder / f"{name}.png", dpi=150)
             plt.close(figure)
             entries.append({
@@ -65,45 +61,42 @@ def reproduce(
             "format": "tmlattice-reproduction",
             "version": 1,
             "package": __version__,
-            "options": {"seed": seed, "small": small},
+            "options": {"seed": SEED, "small": small},
             "systems": entries,
         }
-        for path in (folder / "reproduction.json", extra):
-            if path:
-                write_json(path, result)
+        write_json(folder / "reproduction.json", result)
     if not quiet:
         names = ", ".join(f"{name}.png" for name in chosen)
-        also = f"; {json_file}" if json_file else ""
-        console().print(f"written: {out}/: {names}, reproduction.json{also}")
+        console().print(f"written: {out}/: {names}, reproduction.json")
 
 
-def _free_fall(seed: int, small: bool, progress: bool) -> "Reproduced":
+def _free_fall(small: bool, progress: bool) -> "Reproduced":
     from tmlattice.plots.systems import plot_free_fall
     from tmlattice.systems.free_fall import comparisons, predicted_masses, step_errors
 
     errors = step_errors([1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01][: 4 if small else None])
-    masses = predicted_masses([60, 70, 90, 120, 150], seed=seed)
+    masses = predicted_masses([60, 70, 90, 120, 150], seed=SEED)
     return comparisons(errors, masses), plot_free_fall(errors, masses)
 
 
-def _lotka_volterra(seed: int, small: bool, progress: bool) -> "Reproduced":
+def _lotka_volterra(small: bool, progress: bool) -> "Reproduced":
     from tmlattice.plots.systems import plot_lotka_volterra
     from tmlattice.systems.lotka_volterra import comparisons, race
 
     smaller: dict[str, Any] = {"epochs": (100,), "cells": (5,), "regularizations": ("none",)}
-    done = race(seed=seed, progress=progress, **(smaller if small else {}))
+    done = race(seed=SEED, progress=progress, **(smaller if small else {}))
     return comparisons(done), plot_lotka_volterra(done)
 
 
-def _pendulum(seed: int, small: bool, progress: bool) -> "Reproduced":
+def _pendulum(small: bool, progress: bool) -> "Reproduced":
     from tmlattice.plots.systems import plot_pendulum
     from tmlattice.systems.pendulum import comparisons, study
 
-    done = study(seed)
+    done = study(SEED)
     return comparisons(done), plot_pendulum(done)
 
 
-def _magnets(seed: int, small: bool, progress: bool) -> "Reproduced":
+def _magnets(small: bool, progress: bool) -> "Reproduced":
     from tmlattice.lattice import load_ring
     from tmlattice.plots.systems import plot_magnets
     from tmlattice.systems.magnets import comparisons, study
@@ -113,16 +106,16 @@ def _magnets(seed: int, small: bool, progress: bool) -> "Reproduced":
     return comparisons(done), plot_magnets(done, ring)
 
 
-def _cavitation(seed: int, small: bool, progress: bool) -> "Reproduced":
+def _cavitation(small: bool, progress: bool) -> "Reproduced":
     from tmlattice.plots.systems import plot_cavitation
     from tmlattice.systems.cavitation import comparisons, study
 
     smaller: dict[str, Any] = {"drive": 0.5, "periods": 1, "order": 5}
-    done = study(seed=seed, **(smaller if small else {}))
+    done = study(seed=SEED, **(smaller if small else {}))
     return comparisons(done), plot_cavitation(done)
 
 
-_RUN: dict[str, Callable[[int, bool, bool], "Reproduced"]] = {
+_RUN: dict[str, Callable[[bool, bool], "Reproduced"]] = {
     "free-fall": _free_fall,
     "lotka-volterra": _lotka_volterra,
     "pendulum": _pendulum,

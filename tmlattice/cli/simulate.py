@@ -7,13 +7,12 @@ from typing import Any
 import click
 
 from tmlattice.cli.options import (
-    EMITTANCE,
     FILE,
-    LAUNCH_SIGMA,
-    Careful,
+    WithDefault,
     background_option,
     console,
     lattice_argument,
+    machine_file,
     open_ring,
     quiet_option,
     table,
@@ -47,7 +46,7 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
         return words[0], " ".join(words[1:-1]) or None, amount
 
 
-@click.command("simulate", cls=Careful)
+@click.command("simulate", cls=WithDefault)
 @lattice_argument
 @click.option(
     "--effect",
@@ -89,8 +88,8 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--noise",
     type=click.FloatRange(0),
-    help="Rms of one reading, m; else 2e-5, and of an orbit or its change 2e-6 in x and 1.2e-6 in "
-    "y. Tunes: of a tune, else 2e-5.",
+    help="Rms of one reading, m; else the machine file's (of turns), or 2e-5, and of an orbit or "
+    "its change 2e-6 in x and 1.2e-6 in y. Tunes: of a tune, else 2e-5.",
 )
 @click.option(
     "--engine",
@@ -100,20 +99,6 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     help="Thick symplectic tracking, or second-order maps.",
 )
 @click.option("--radiation", is_flag=True, help="Bends and wigglers radiate.")
-@click.option(
-    "--launch-sigma",
-    type=LAUNCH_SIGMA,
-    default="1e-4,2e-5,1e-4,2e-5,0",
-    show_default=True,
-    help="Rms of the launches about the nominal ones.",
-)
-@click.option(
-    "--kicks",
-    type=click.FloatRange(0),
-    default=0.0,
-    show_default=True,
-    help="Rms of random settings of all correctors, rad.",
-)
 @click.option(
     "--settings",
     "settings_file",
@@ -142,43 +127,11 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     help="Orbit response: step this one; repeat for more. Else all.",
 )
 @click.option(
-    "--kick",
-    type=click.FloatRange(0, min_open=True),
-    default=1e-4,
-    show_default=True,
-    help="Orbit response: the step of each corrector, rad.",
-)
-@click.option(
-    "--rf-step",
-    type=float,
-    default=None,
-    help="Orbit response, dispersion: the step of the RF, Hz; 0 for none; else 1.3 mm of orbit.",
-)
-@click.option(
-    "--one-sided",
-    is_flag=True,
-    help="Orbit response, dispersion: step from the setting, not from half below it to half above.",
-)
-@click.option(
     "--particles",
     type=click.IntRange(1),
     default=1,
     show_default=True,
     help="Turn by turn: 1 is the middle of the beam; some hundreds decohere.",
-)
-@click.option(
-    "--emittance",
-    type=EMITTANCE,
-    default="1e-9,1e-11",
-    show_default=True,
-    help="Turn by turn: of many particles, m rad.",
-)
-@click.option(
-    "--spread",
-    type=click.FloatRange(0),
-    default=1e-3,
-    show_default=True,
-    help="Turn by turn: rms relative energy of many particles.",
 )
 @click.option("--out", type=FILE, required=True, metavar="DIR", help="The measurement folder.")
 @click.option(
@@ -194,8 +147,6 @@ def simulate(
     context: click.Context,
     /,
     lattice: str,
-    sequence: str | None,
-    energy: float | None,
     effects: tuple[tuple[str, str | None, float], ...],
     background: tuple[tuple[str, float | None], ...],
     kind: str,
@@ -203,16 +154,11 @@ def simulate(
     jobs: int,
     noise: float | None,
     correctors: tuple[str, ...],
-    kick: float,
-    rf_step: float | None,
-    one_sided: bool,
     out: Path,
     truth: Path | None,
     force: bool,
     quiet: bool,
     particles: int,
-    emittance: tuple[float, ...],
-    spread: float,
     **options: Any,
 ) -> None:
     """Measure a machine whose errors are known.
@@ -234,15 +180,17 @@ def simulate(
     if truth is not None:
         _check_apart(truth, out)
     _check_options(context, kind)
-    ring = open_ring(lattice, sequence, energy)
+    ring = open_ring(lattice)
+    machine = machine_file()
+    if noise is None and machine is not None and kind in ("trajectory", "turn-by-turn"):
+        noise = machine.told.noise
     _warn_of_large(effects)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]
     if kind != "trajectory":
         chosen = {
             **options, "background": dict(background), "correctors": correctors or None,
-            "kick": kick, "rf_step": rf_step, "one_sided": one_sided, "noise": noise,
-            "particles": particles, "emittance": emittance, "spread": spread,
+            "noise": noise, "particles": particles,
             "settings": _settings(settings_file),
         }  # fmt: skip
         for name in ("shots", "turns"):  # first turns' own defaults

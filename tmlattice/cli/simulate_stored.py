@@ -7,12 +7,11 @@ from typing import Any
 
 SHOTS = frozenset({"shots", "settings_file"})
 KINDS: Mapping[str, frozenset[str]] = {
-    "trajectory": SHOTS
-    | {"turns", "amplitude", "radiation", "engine", "launch_sigma", "kicks", "jobs"},
-    "orbit-response": frozenset({"correctors", "kick", "rf_step", "one_sided", "engine"}),
-    "turn-by-turn": SHOTS | {"turns", "amplitude", "radiation", "particles", "emittance", "spread"},
+    "trajectory": SHOTS | {"turns", "amplitude", "radiation", "engine", "jobs"},
+    "orbit-response": frozenset({"correctors", "engine"}),
+    "turn-by-turn": SHOTS | {"turns", "amplitude", "radiation", "particles"},
     "closed-orbit": SHOTS | {"radiation"},
-    "dispersion": frozenset({"rf_step", "one_sided"}),
+    "dispersion": frozenset(),
     "tunes": SHOTS,
 }
 """The options that a kind has beside those of all."""
@@ -60,14 +59,13 @@ def _run(
     from tmlattice.machine.response import simulate_response
 
     monitors = f"{len(ring.monitors)} monitors"
-    sides = "one-sided" if options.get("one_sided") else "two-sided"
     made: Any
     if kind == "orbit-response":
         made = simulate_response(ring, causes, progress=not quiet, **options)
         rf = "" if made.measured.rf is None else f", RF step {made.measured.rf.step:g} Hz"
         return made, "response.csv", (
-            f"{len(made.measured.correctors)} correctors, {monitors}, {sides} steps of "
-            f"{1e6 * options['kick']:g} µrad{rf}, engine {options['engine']}"
+            f"{len(made.measured.correctors)} correctors, {monitors}, two-sided steps of "
+            f"{1e6 * abs(made.measured.kicks[0]):g} µrad{rf}, engine {options['engine']}"
         )  # fmt: skip
     if kind == "turn-by-turn":
         made = stored_beam.simulate_turns(ring, causes, **options)
@@ -81,11 +79,9 @@ def _run(
         shots = len(made.measured.shots)
         return made, "readings.csv", f"{shots} closed orbit(s), {monitors}, engine at"
     if kind == "dispersion":
-        step = options.pop("rf_step")
-        steps = None if step is None else [step]
-        made = stored_beam.simulate_dispersion(ring, causes, steps=steps, **options)
+        made = stored_beam.simulate_dispersion(ring, causes, **options)
         (step,) = (one.step for one in made.measured.steps)
-        return made, "readings.csv", f"{monitors}, a {sides} RF step of {step:g} Hz, engine at"
+        return made, "readings.csv", f"{monitors}, a two-sided RF step of {step:g} Hz, engine at"
     if "noise" in options:
         options["noise"] = options["noise"], stored_beam.TUNE_NOISE[1]
     made = stored_beam.simulate_tunes(ring, causes, **options)

@@ -1,6 +1,6 @@
-"""`tmlattice study`: an experiment over many magnets."""
+"""`tmlattice dev study`: an experiment over many magnets."""
 
-from contextlib import ExitStack, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +9,11 @@ import click
 from tmlattice.cli.options import (
     FILE,
     Careful,
-    change_option,
+    checked_ring,
     console,
+    jobs_option,
     json_option,
-    lattice_argument,
-    marks,
-    open_ring,
     quiet_option,
-    recipe_options,
     table,
 )
 
@@ -47,20 +44,13 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
 
 
 @study.command("tune-fit", cls=Careful)
-@lattice_argument
+@click.argument("lattice", default="petra3")
 @click.option(
     "--magnets",
     type=_Number(),
     default="40",
     show_default=True,
     help="Powered magnets, evenly spread over the ring.",
-)
-@click.option(
-    "--kind",
-    type=click.Choice(["quadrupole", "sextupole", "pair"]),
-    default="quadrupole",
-    show_default=True,
-    help="What is changed; a pair is two quadrupoles a third of the ring apart.",
 )
 @click.option(
     "--methods",
@@ -71,22 +61,6 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     "knows the magnet).",
 )
 @click.option(
-    "--shots",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Trajectories, their launches turned in phase.",
-)
-@click.option(
-    "--seeds",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Noises for each magnet and method.",
-)
-@click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster; else local processes.")
-@click.option("--workers", type=click.IntRange(1), help="Local processes; else one a core.")
-@click.option(
     "--out",
     type=FILE,
     default="study-tune-fit",
@@ -94,18 +68,28 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     metavar="DIR",
     help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",
 )
-@change_option(-0.2, "Relative change of the magnet's strength.")
-@recipe_options
-@json_option
+@click.option(
+    "--change",
+    type=float,
+    default=-0.2,
+    show_default=True,
+    help="Relative change of the magnet's strength.",
+)
+@click.option(
+    "--epochs",
+    type=click.IntRange(1),
+    default=1000,
+    show_default=True,
+    help="Gradient steps at most.",
+)
+@jobs_option
 @quiet_option
 def tune_fit(
     lattice: str,
     methods: str,
     out: Path,
-    json_file: Path | None,
     quiet: bool,
-    scheduler: str | None,
-    workers: int | None,
+    workers: dict[str, Any],
     **options: Any,
 ) -> None:
     """Tune errors of fine-tuning over many magnets, each changed in turn."""
@@ -114,48 +98,41 @@ def tune_fit(
     from tmlattice.fitting.study import study_tune_fit, summarise
 
     chosen = tuple(name.strip() for name in methods.split(","))
-    with ExitStack() as files:
-        path = files.enter_context(output_file(json_file)) if json_file else None
-        cases = study_tune_fit(
-            lattice, chosen, progress=not quiet, folder=out, scheduler=scheduler,
-            workers=workers, **marks(), **options,
-        )  # fmt: skip
-        cases.sort(key=lambda case: (case.s, case.magnet, case.method, case.seed))
-        summary = {
-            "format": "tmlattice-study-tune-fit",
-            "version": 3,
-            "package": __version__,
-            "lattice": lattice,
-            "options": {**options, "launch": list(options["launch"])},
-            **summarise(cases),
-            "results": [
-                {
-                    "magnet": case.magnet,
-                    "s": case.s,
-                    "method": case.method,
-                    "seed": case.seed,
-                    "abs_dq": case.absolute_error,
-                    "rel_dq": case.relative_error,
-                    "tune_sigma": case.tune_sigma,
-                    "orbit_rms": case.orbit_rms,
-                    "prediction_rms": case.prediction_rms,
-                    "found": case.found,
-                    "problem": case.problem,
-                }
-                for case in cases
-            ],
-        }
-        with output_file(out / "study.json") as own:
-            write_json(own, summary)
-        if path:
-            write_json(path, summary)
-        _draw(lattice, options, cases, out)
+    cases = study_tune_fit(lattice, chosen, progress=not quiet, folder=out, **workers, **options)
+    cases.sort(key=lambda case: (case.s, case.magnet, case.method, case.seed))
+    summary = {
+        "format": "tmlattice-study-tune-fit",
+        "version": 3,
+        "package": __version__,
+        "lattice": lattice,
+        "options": options,
+        **summarise(cases),
+        "results": [
+            {
+                "magnet": case.magnet,
+                "s": case.s,
+                "method": case.method,
+                "seed": case.seed,
+                "abs_dq": case.absolute_error,
+                "rel_dq": case.relative_error,
+                "tune_sigma": case.tune_sigma,
+                "orbit_rms": case.orbit_rms,
+                "prediction_rms": case.prediction_rms,
+                "found": case.found,
+                "problem": case.problem,
+            }
+            for case in cases
+        ],
+    }
+    with output_file(out / "study.json") as own:
+        write_json(own, summary)
+    _draw(lattice, cases, out)
     if not quiet:
         _print(summary)
 
 
 @study.command("localisation", cls=Careful)
-@lattice_argument
+@click.argument("lattice", default="petra3")
 @click.option(
     "--cases",
     type=click.IntRange(1),
@@ -180,32 +157,16 @@ def tune_fit(
     help="Of a measurement; repeat for several.",
 )
 @click.option(
-    "--noise",
-    type=click.FloatRange(0, min_open=True),
-    default=2e-5,
-    show_default=True,
-    help="Rms of one reading, m.",
-)
-@click.option(
     "--epochs",
     type=click.IntRange(1),
     default=1000,
     show_default=True,
     help="Gradient steps at most.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Of faults, launches and noise.",
-)
 @json_option
 @quiet_option
 def localisation(
     lattice: str,
-    sequence: str | None,
-    energy: float | None,
     json_file: Path | None,
     quiet: bool,
     **options: Any,
@@ -216,7 +177,7 @@ def localisation(
     from tmlattice.files import output_file, write_json
 
     with output_file(json_file) if json_file else nullcontext() as path:
-        ring = open_ring(lattice, sequence, energy)
+        ring = checked_ring(lattice, {})
         cases = list(study_localisation(ring, progress=not quiet, **options))
         rows = summarise(cases)
         if path:
@@ -263,13 +224,13 @@ def _print_localisation(rows: list[dict[str, Any]]) -> None:
         )
 
 
-def _draw(lattice: str, options: dict[str, Any], cases: list[Any], out: Path) -> None:
+def _draw(lattice: str, cases: list[Any], out: Path) -> None:
     import matplotlib.pyplot as plt
 
     from tmlattice.files import output_file
     from tmlattice.plots import plot_study
 
-    ring = open_ring(lattice, options["sequence"], options["energy"])
+    ring = checked_ring(lattice, {})
     figure = plot_study(ring, cases)
     with output_file(out / "study.png") as path:
         figure.savefig(path, dpi=150, format="png")

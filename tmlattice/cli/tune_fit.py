@@ -10,17 +10,14 @@ from click.core import ParameterSource
 
 from tmlattice.cli.options import (
     FILE,
-    REGULARIZATIONS,
-    Careful,
-    change_option,
+    Launch,
+    WithDefault,
     console,
     json_option,
     lattice_argument,
     open_ring,
     quiet_option,
-    recipe_options,
     table,
-    table_options,
     trajectories,
 )
 
@@ -34,7 +31,7 @@ if TYPE_CHECKING:
     from tmlattice.measurement import Measurement
 
 
-@click.command("tune-fit", cls=Careful)
+@click.command("tune-fit", cls=WithDefault)
 @lattice_argument
 @click.option(
     "--magnet",
@@ -48,13 +45,6 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="Fit these data, a measurement folder or a file of readings, and change no magnet; all "
     "shots together.",
-)
-@click.option(
-    "--regularization",
-    type=click.Choice(REGULARIZATIONS),
-    default="symplectic",
-    show_default=True,
-    help="Of the recipe (adam): what holds its free weights.",
 )
 @click.option(
     "--out",
@@ -71,26 +61,49 @@ if TYPE_CHECKING:
     multiple=True,
     help="Repeat for more; all three where none is named. Figures and JSON have the same ones.",
 )
-@change_option(
-    None,
-    "Relative change of the magnet's strength; else -0.2, or less where that makes "
+@click.option(
+    "--change",
+    type=float,
+    help="Relative change of the magnet's strength; else -0.2, or less where that makes "
     "the ring unstable.",
 )
-@recipe_options
-@table_options
+@click.option(
+    "--launch",
+    type=Launch(),
+    default="1e-3,0,1e-3,0",
+    show_default=True,
+    help="State at the start of the ring, m and rad.",
+)
+@click.option(
+    "--noise",
+    type=click.FloatRange(0),
+    default=2e-5,
+    show_default=True,
+    help="Rms of one reading, m.",
+)
+@click.option(
+    "--epochs",
+    type=click.IntRange(1),
+    default=1000,
+    show_default=True,
+    help="Gradient steps at most.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Of the readings' noise.",
+)
 @json_option
 @quiet_option
 def tune_fit(
     lattice: str,
-    sequence: str | None,
-    energy: float | None,
     measurement: Path | None,
     out: Path,
     json_file: Path | None,
     quiet: bool,
     methods: tuple[str, ...],
-    map_file: Path | None,
-    unit: str | None,
     **options: Any,
 ) -> None:
     """Predict the tunes of a perturbed ring from one first-turn orbit.
@@ -116,14 +129,12 @@ def tune_fit(
         from tmlattice.network import save_network
 
         if measurement is None:
-            ring = open_ring(lattice, sequence, energy)
+            ring = open_ring(lattice)
             outcome = run(ring, progress=not quiet, **options)
         else:
-            ring = open_ring(lattice, sequence, energy)
+            ring = open_ring(lattice)
             refusal = "; tune-fit takes a trajectory, the first turn of a beam"
-            data = trajectories(
-                measurement, refusal, ring, map_file=map_file, unit=unit, quiet=quiet
-            )
+            data = trajectories(measurement, refusal, ring, quiet)
             outcome = _fit(ring, data, measurement, quiet, options)
         written = _draw(outcome, folder)
         result = outcome.as_json()

@@ -16,19 +16,19 @@ from tmlattice.correction.first_turn import Threading
 from tmlattice.correction.knobs import Knob, default_knobs, kinds_for, read_knobs
 from tmlattice.correction.result import Correction, Setting, with_gains
 from tmlattice.correction.solve import (
-    ENOUGH,
+    MAX_EXCESS,
     Point,
     Problem,
     by_gain,
     drawn,
     fewest,
+    optimised,
     rounded,
-    settled,
 )
 from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import TmlatticeError, UnstableRingError
-from tmlattice.lattice import Ring
+from tmlattice.lattice import Ring, load_ring
 
 __all__ = ["Correction", "Knob", "Setting", "correct", "default_knobs", "read_knobs"]
 
@@ -45,9 +45,9 @@ SIGMAS = 3.0
 
 
 def correct(
-    diagnosis: Diagnosis | Estimate | Ring,
+    diagnosis: Diagnosis | Estimate | Ring | Any,
     *,
-    goal: Ring | None = None,
+    goal: Ring | Any | None = None,
     knobs: Sequence[Knob] | Iterable[str] | str | Path | None = None,
     targets: Iterable[str] | Mapping[str, float | None] | None = None,
     seed: int = 0,
@@ -56,7 +56,8 @@ def correct(
     """Settings of knobs that bring the ring, as the data have it, closest to a goal.
 
     Args:
-        diagnosis: of any measurement; or an `Estimate`; or a ring that is taken as certain.
+        diagnosis: of any measurement; or an `Estimate`; or a ring that is taken as certain, as all
+            that `load_ring` takes.
         goal: the ring whose optics are wanted, and whose strengths are the present settings of a
             ring that is given as one; None: the diagnosis's design.
         knobs: devices; kinds of `default_knobs`; or the path of a table. None: quadrupole supplies
@@ -72,6 +73,7 @@ def correct(
         UnstableRingError: the estimated ring, or the goal, stores no beam.
     """
     begun = time.perf_counter()
+    goal = None if goal is None else load_ring(goal)
     chosen = targets
     if chosen is None:
         orbit = isinstance(diagnosis, Diagnosis) and "closed_orbit" in diagnosis.measured
@@ -79,14 +81,16 @@ def correct(
     progress("posterior")
     estimate = _estimate(diagnosis, goal)
     wanted = estimate.settings if goal is None else goal
-    judged: Targets | Threading
+    compared: Targets | Threading
     if [*chosen] == [THREADING]:
-        judged = Threading(wanted, dict(chosen)[THREADING] if isinstance(chosen, Mapping) else None)
+        compared = Threading(
+            wanted, dict(chosen)[THREADING] if isinstance(chosen, Mapping) else None
+        )
     else:
-        judged = Targets(wanted, chosen)
-    devices = _knobs(knobs, estimate.settings, judged.names)
+        compared = Targets(wanted, chosen)
+    devices = _knobs(knobs, estimate.settings, compared.names)
     progress("correction")
-    problem = drawn(estimate, devices, judged, DRAWS, seed)
+    problem = drawn(estimate, devices, compared, DRAWS, seed)
     try:
         begin = problem.at(np.zeros(len(devices)))
     except UnstableRingError as error:
@@ -94,20 +98,20 @@ def correct(
     if not begin.slopes.any():
         raise TmlatticeError("no knob changes a target; name others (--knobs, --target)")
     end, order = _corrected(problem, begin)
-    found = _told(begin, end, order)
+    found = _fields(begin, end, order)
     seconds = time.perf_counter() - begun
     made = {"seed": seed, "draws": DRAWS, "knobs": len(devices), "seconds": seconds}
     return Correction(**found, ring=estimate.settings, provenance=made)
 
 
-def _estimate(diagnosis: Diagnosis | Estimate | Ring, goal: Ring | None) -> Estimate:
+def _estimate(diagnosis: Diagnosis | Estimate | Any, goal: Ring | None) -> Estimate:
     if isinstance(diagnosis, Estimate):
         return diagnosis
     if isinstance(diagnosis, Diagnosis):
         return estimate_of(diagnosis)
     if goal is None:
         raise TmlatticeError("a lattice alone has no goal; give the design (goal=, --design)")
-    return estimate_with(diagnosis, goal, None)
+    return estimate_with(load_ring(diagnosis), goal, None)
 
 
 def _knobs(
@@ -128,20 +132,20 @@ def _knobs(
 def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
     """Where the correction ends, and its knobs by falling gain."""
     every = np.arange(len(problem.knobs))
-    whole = settled(problem, begin, every)
+    whole = optimised(problem, begin, every)
     order = by_gain(whole)
     counts = [n for n in COUNTS if n < len(order)] + [len(order)]
     number, _ = fewest(whole, order, counts)
     chosen = np.array(order[:number], dtype=np.int64)
     goal, _ = whole.step(chosen)
     start = problem.better(goal, begin.square) or begin
-    end = settled(problem, start, chosen)
-    if end.square > (1 + 2 * ENOUGH) * whole.square:  # not as linear as that
+    end = optimised(problem, start, chosen)
+    if end.square > (1 + 2 * MAX_EXCESS) * whole.square:  # not as linear as that
         end, number = whole, len(order)
     return rounded(problem, end), order[:number]
 
 
-def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
+def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     """What the result says."""
     problem, targets = end.problem, end.problem.targets
     rows = targets.rows(begin.open)
@@ -180,8 +184,8 @@ def _told(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     )
     tunes = {}
     if isinstance(targets, Targets):
-        tunes = {"goal": targets.goal.tunes, "now": begin.look.values.tunes,
-                 "expected": end.look.values.tunes}  # fmt: skip
+        tunes = {"goal": targets.goal.tunes, "now": begin.shown.values.tunes,
+                 "expected": end.shown.values.tunes}  # fmt: skip
     return {
         "settings": rows_of,
         "refused": refused,
@@ -246,7 +250,7 @@ def _warnings(end: Point, settings: Sequence[Setting]) -> Iterable[str]:
         yield f"held by their limits: {', '.join(held)}"
     if "tunes" not in end.errors:
         return
-    tunes = end.look.values.tunes + end.open["tunes"][:, 0]
+    tunes = end.shown.values.tunes + end.open["tunes"][:, 0]
     mean, sigma = tunes.mean(axis=0), tunes.std(axis=0)
     for plane, (q, s) in enumerate(zip(mean, sigma, strict=True)):
         near = abs(2 * q - round(2 * q)) / 2

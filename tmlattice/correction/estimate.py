@@ -15,7 +15,7 @@ from tmlattice.diagnosis import Diagnosis
 from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
 from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import LatticeError
-from tmlattice.inference.among import Known
+from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
 
@@ -43,14 +43,14 @@ class Estimate:
     ring: Ring
     settings: Ring
     hypotheses: tuple[Hypothesis, ...] = ()
-    known: Known | None = field(default=None, repr=False)
+    known: DistributedErrors | None = field(default=None, repr=False)
     kept: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64), repr=False)
     calibrations: dict[str, float] = field(default_factory=dict, repr=False)
     dispersion: Array | float = field(default=0.0, repr=False)
     energy: float = 0.0
     energy_error: float = 0.0
 
-    def beside(
+    def with_beam(
         self, dispersion: Dispersion, energy: float = 0.0, energy_error: float = 0.0
     ) -> "Estimate":
         """With the dispersion and the energy that were found beside the ring's."""
@@ -63,11 +63,11 @@ class Estimate:
         if self.known is None:
             return np.zeros((count, 0))
         known = self.known
-        drawn = known.mixed(random.standard_normal((len(known.rms), count)))
+        drawn = known.correlated(random.standard_normal((len(known.rms), count)))
         return np.asarray((known.rms[:, None] * drawn)[self.kept].T)
 
 
-def estimate_with(ring: Ring, settings: Ring, known: Known | None) -> Estimate:
+def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -> Estimate:
     """The estimate of a ring beside which stands what is known of its errors.
 
     Args:
@@ -97,7 +97,7 @@ def estimate_with(ring: Ring, settings: Ring, known: Known | None) -> Estimate:
     )
 
 
-def estimate_of(diagnosis: Diagnosis, known: Known | None = None) -> Estimate:
+def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:
     """The estimate of a diagnosis: the ring with what was found, and its posterior.
 
     Args:
@@ -115,14 +115,14 @@ def estimate_of(diagnosis: Diagnosis, known: Known | None = None) -> Estimate:
         return found  # in first turns the energy is the injected beam's
     pairs = zip(diagnosis.causes, diagnosis.errors, strict=True)
     energies = [(c.amount, s) for c, s in pairs if c.effect == "energy_offset"]
-    return found.beside(diagnosis.dispersion, *(energies[0] if energies else (0.0, 0.0)))
+    return found.with_beam(diagnosis.dispersion, *(energies[0] if energies else (0.0, 0.0)))
 
 
-def _each_alone(diagnosis: Diagnosis) -> Known:
+def _each_alone(diagnosis: Diagnosis) -> DistributedErrors:
     sigma = {(c.effect, c.element): s for c, s, _ in diagnosis.supported if np.isfinite(s)}
-    known = Known.usual(list(sigma), {name: 1.0 for name, _ in sigma})
-    beside = tuple(c for c in diagnosis.causes if not _of_ring(c.effect))
-    return replace(known, rms=np.array(list(sigma.values())), causes=beside)
+    known = DistributedErrors.usual(list(sigma), {name: 1.0 for name, _ in sigma})
+    with_beam = tuple(c for c in diagnosis.causes if not _of_ring(c.effect))
+    return replace(known, rms=np.array(list(sigma.values())), causes=with_beam)
 
 
 def _of_ring(name: str) -> bool:
@@ -148,12 +148,12 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
             f"'{path}' and '{settings.name}' do not have the same elements; give the lattice that "
             "the diagnosis started from"
         )
-    beside, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
+    with_beam, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
     said: tuple[str, ...] = ()
-    if not beside.is_file():
-        said = (f"'{beside.name}' is not there: the estimated ring is taken as certain",)
-    found = estimate_with(ring, settings, read_known(beside, ring) if not said else None)
+    if not with_beam.is_file():
+        said = (f"'{with_beam.name}' is not there: the estimated ring is taken as certain",)
+    found = estimate_with(ring, settings, read_known(with_beam, ring) if not said else None)
     if calibration.is_file():
         energy = read_energy(calibration, ring)
-        found = found.beside(read_dispersion(calibration, ring), *energy)
+        found = found.with_beam(read_dispersion(calibration, ring), *energy)
     return found, said

@@ -243,13 +243,8 @@ COLUMNS = (
 
 
 def read_knobs(path: Path, ring: Ring) -> list[Knob]:
-    """Knobs of a table: .csv with the header `COLUMNS`, or .yaml with a list of such mappings.
-
-    A knob that the lattice shows too takes from there what the table leaves out.
-
-    Args:
-        path: of the table.
-        ring: whose strengths are the present settings.
+    """Knobs of a table: .csv with the header `COLUMNS`, or .yaml with a list of such mappings; see
+    `knobs_of`.
 
     Raises:
         MeasurementError: a table that cannot be read, with the knob.
@@ -259,6 +254,22 @@ def read_knobs(path: Path, ring: Ring) -> list[Knob]:
         rows = yaml_of(path, MeasurementError)
     else:
         rows = list(csv.DictReader(text_of(path, MeasurementError).splitlines()))
+    return knobs_of(rows, path, ring)
+
+
+def knobs_of(rows: Any, path: Path, ring: Ring) -> list[Knob]:
+    """Knobs of rows of a table, each a mapping with the keys `COLUMNS`.
+
+    A knob that the lattice shows too takes from there what the row leaves out.
+
+    Args:
+        rows: of the table.
+        path: of the file that holds them, for messages.
+        ring: whose strengths are the present settings.
+
+    Raises:
+        MeasurementError, UnknownNameError: as of `read_knobs`.
+    """
     if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows) or not rows:
         raise MeasurementError(f"{path}: it holds no list of knobs; `--example` writes one")
     every = ("supplies", "quadrupoles", "skew_quadrupoles", "correctors", "sextupoles", "rf")

@@ -29,18 +29,18 @@ from tmlattice.errors import UnstableRingError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Look = Any
+Shown = Any
 """What a ring shows, as its targets see it: `StoredOptics` or `Trajectory`."""
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 30
+MAX_ROUNDS = 30
 """Linearisations at most: a beam that is threaded gets further with each of them."""
-SETTLED = 1e-3
+MIN_FALL = 1e-3
 """Relative fall of the expected square at which a linearisation was the last."""
-HALVES = 6
+MAX_HALVINGS = 6
 """How often a step that does not lower the expected square is halved."""
-ENOUGH = 0.02
+MAX_EXCESS = 0.02
 """Relative excess over the least expected square (1 % in rms) that fewer knobs may leave."""
 AT_ONCE = 500
 """Uncertain errors whose derivatives are held at a time."""
@@ -67,7 +67,7 @@ class Problem:
     energies: Array
 
     @cached_property
-    def begin(self) -> Look:
+    def begin(self) -> Shown:
         """What the estimated ring shows.
 
         Raises:
@@ -101,8 +101,8 @@ class Problem:
         causes = [c for k, a in zip(self.knobs, amounts.tolist(), strict=True) for c in k.causes(a)]
         shift = sum(a for k, a in zip(self.knobs, amounts, strict=True) if k.kind == "rf")
         ring = self.estimate.ring
-        look = self.begin.moved(apply(ring, causes), shift) if causes or shift else self.begin
-        return Point(self, amounts, look)
+        shown = self.begin.moved(apply(ring, causes), shift) if causes or shift else self.begin
+        return Point(self, amounts, shown)
 
     def better(self, amounts: Array, least: float) -> "Point | None":
         """The point, if it stores a beam and its expected square is below."""
@@ -124,12 +124,12 @@ class Point:
 
     problem: Problem
     amounts: Array
-    look: Look
+    shown: Shown
 
     @cached_property
     def errors(self) -> dict[str, Array]:
         """Of all targets, see `Targets.errors`."""
-        errors = self.problem.targets.errors(self.look.values)
+        errors = self.problem.targets.errors(self.shown.values)
         if "dispersion" in errors:
             errors["dispersion"] = errors["dispersion"] + self.problem.estimate.dispersion
         return errors
@@ -142,7 +142,7 @@ class Point:
     @cached_property
     def by_frequency(self) -> dict[str, Array]:
         """d errors / d relative RF frequency, [1, reading, plane] each."""
-        return self.problem.targets.changes(self.look.by_frequency())
+        return self.problem.targets.changes(self.shown.by_frequency())
 
     @cached_property
     def by_knobs(self) -> dict[str, Array]:
@@ -156,7 +156,7 @@ class Point:
                 continue
             hypotheses += [(effect, member) for member in knob.members]
             owner += [k] * len(knob.members)
-        changes = targets.changes(self.look.derivatives(hypotheses))
+        changes = targets.changes(self.shown.derivatives(hypotheses))
         found = {}
         for name, errors in self.errors.items():
             found[name] = np.zeros((len(self.problem.knobs), *errors.shape))
@@ -178,12 +178,12 @@ class Point:
         noise = problem.noise * problem.sigma * self.amounts
         total = {name: np.tensordot(noise, part, 1) for name, part in self.by_knobs.items()}
         if estimate.energy_error:
-            shift = problem.energies * self.look.per_energy
+            shift = problem.energies * self.shown.per_energy
             for name, part in self.by_frequency.items():
                 total[name] += shift[:, None, None] * part
         for first in range(0, len(estimate.hypotheses), AT_ONCE):
             some = slice(first, first + AT_ONCE)
-            changes = self.look.derivatives(estimate.hypotheses[some])
+            changes = self.shown.derivatives(estimate.hypotheses[some])
             for name, part in problem.targets.changes(changes).items():
                 total[name] += np.tensordot(problem.draws[:, some], part, 1)
         return total
@@ -224,7 +224,7 @@ class Point:
         return amounts, fixed + float(left @ left)
 
 
-def settled(problem: Problem, begin: Point, knobs: Indices) -> Point:
+def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
     """The point of least expected square that some knobs reach, linearised anew as it moves.
 
     Args:
@@ -233,17 +233,17 @@ def settled(problem: Problem, begin: Point, knobs: Indices) -> Point:
         knobs: those that may change; the others are at zero.
     """
     now = begin
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         goal, _ = now.step(knobs)
         found = None
-        for half in range(HALVES):
+        for half in range(MAX_HALVINGS):
             found = problem.better(now.amounts + (goal - now.amounts) / 2**half, now.square)
             if found is not None:
                 break
         if found is None:
             return now
         log.info("expected square %.4g -> %.4g", now.square, found.square)
-        done = now.square - found.square < SETTLED * now.square
+        done = now.square - found.square < MIN_FALL * now.square
         now = found
         if done:
             break
@@ -275,7 +275,7 @@ def fewest(point: Point, order: Sequence[int], counts: Sequence[int]) -> tuple[i
     """How many of the first knobs leave hardly more than all, and the expected square that each
     number leaves, linear about a point, [count]."""
     squares = np.array([point.step(np.array(order[:n], dtype=np.int64))[1] for n in counts])
-    enough = np.flatnonzero(squares <= (1 + ENOUGH) * squares.min())
+    enough = np.flatnonzero(squares <= (1 + MAX_EXCESS) * squares.min())
     return counts[int(enough[0])], squares
 
 

@@ -6,7 +6,7 @@
 >>> diagnosis.as_json()["findings"][0]["element"]
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,8 @@ from tmlattice.diagnosis.devices import devices_of, with_devices
 from tmlattice.diagnosis.kinds import Measured, kind_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.distributed import DistributedErrors
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse, in_words
 
@@ -38,23 +40,49 @@ which wait for one another (ALS, 41,000 readings, two cores: 71 s with two threa
 
 @by_name
 def diagnose(
-    ring: Ring, measurement: Measured | Mapping[str, Measured], **options: Any
+    ring: Ring,
+    measurement: Measured | Mapping[str, Measured],
+    *,
+    reference: Measured | Mapping[str, Measured] | None = None,
+    holdout: float | None = None,
+    effects: Sequence[str] | None = None,
+    max_effects: int | None = None,
+    false_alarm: float = DEFAULT.false_alarm,
+    assume: Sequence[str] = (),
+    background: Mapping[str, float | None] | None = None,
+    known: DistributedErrors | None = None,
+    heldout: Measurement | None = None,
+    radiation: bool = False,
+    missing: bool = False,
+    seed: int = 0,
+    progress: Callable[[str], Any] = lambda _: None,
 ) -> Diagnosis:
     """Where the gap between a ring and its measurement lies, what causes it, how far it shrinks.
 
     Args:
-        ring: the design.
+        ring: the design; or a built-in name, or the path of a lattice file.
         measurement: of any kind; or several of one machine by name, which are diagnosed together.
-        options: for every kind holdout, effects, max_effects, false_alarm, assume, seed, progress
-            and reference, a measurement of the same kind and machine from before; for first turns
-            also background, heldout and radiation; for an orbit response alone missing, see
-            `diagnosis.response.diagnose_response`, and with a reference
-            `diagnosis.before_after.diagnose_change`; for several, and for those of a stored beam,
-            background, and known, what an earlier diagnosis left known of the ring as it found it
-            (`diagnosis.twin`; first turns take it too). See `diagnosis.procedure`.
+            The path of a file, a pandas DataFrame or an xarray Dataset is taken too.
+        reference: of the same kind and machine, before the fault: static errors cancel.
+        holdout: share of the shots, or of the correctors, that is the validation set; None: 0.33
+            of shots, 0.2 of the correctors of an orbit response.
+        effects: the only ones that may be the cause; None: all usual ones.
+        max_effects: findings at most; None: 8, of a change between two orbit responses 40. Of an
+            orbit response, families of errors at most; None: all.
+        false_alarm: share of faultless data sets in which something may be found.
+        assume: what was recorded wrongly everywhere, see `measurement.assume`.
+        background: rms of small errors by effect (None: the catalogue's own), or "all"; None: as
+            the data have them. Not for an orbit response.
+        known: small errors from an earlier diagnosis whose estimated ring this is
+            (`diagnosis.twin`). Not for an orbit response.
+        heldout: of first turns: the validation set itself, instead of a share.
+        radiation: of first turns: bends and wigglers of the model radiate.
+        missing: of an orbit response: weigh which effect the result still lacks.
+        seed: of the split, the simulated threshold and the bootstrap.
+        progress: called with the name of each stage.
 
-    Monitors and correctors that the lattice lacks are left out, and told, where they are half of
-    the names at most.
+    Monitors and correctors that the lattice lacks are left out, and reported, where they are half
+    of the names at most.
 
     Of fewer than 100,000 readings the result is the same to the bit on any number of threads: a
     library that shares a product among them adds in another order, and is no quicker there. Of
@@ -69,11 +97,15 @@ def diagnose(
 
     one = 1 if _readings(measurement) < MANY else None
     measurement, messages = _in_the_lattice(ring, measurement)
-    for name in ("reference", "heldout"):
-        options[name], more = _in_the_lattice(ring, options.get(name))
+    given: dict[str, Any] = {"reference": reference, "heldout": heldout}
+    for name, own in given.items():
+        given[name], more = _in_the_lattice(ring, own)
         messages += [f"the {name}: {sentence}" for sentence in more if sentence not in messages]
-        if options[name] is None:
-            del options[name]
+    given |= {"holdout": holdout, "max_effects": max_effects, "background": background,
+              "known": known, "radiation": radiation, "missing": missing}  # fmt: skip
+    options = {name: value for name, value in given.items() if value is not None}
+    options |= {"effects": effects, "false_alarm": false_alarm, "assume": assume, "seed": seed,
+                "progress": progress}  # fmt: skip
     every = [*(measurement.values() if isinstance(measurement, Mapping) else [measurement])]
     _each_once(measurement)
     with threadpool_limits(one, "blas"):

@@ -16,8 +16,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tmlattice.inference import chi2
-from tmlattice.inference.judge import Gap
 from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.validation import Gap
 from tmlattice.speaks import micrometres
 
 MISSING = 1.5
@@ -192,7 +192,7 @@ def assess(
     before = after = float("nan")
     series: tuple[float, ...] = ()
     if gap is not None:
-        before, after = gap.misfits[gap.since].rms, gap.misfits[-1].rms
+        before, after = gap.misfits[gap.baseline].rms, gap.misfits[-1].rms
         expected = gap.misfits[-1].expected
         if small_errors and expected is not None:
             series = (*(misfit.rms for misfit in gap.misfits), expected)

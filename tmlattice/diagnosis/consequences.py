@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
-from tmlattice.diagnosis.recommended_actions import undone
+from tmlattice.diagnosis.recommended_actions import compensated
 from tmlattice.effects import Cause, RingEffect, changed_elements, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Element, Ring
@@ -75,8 +75,9 @@ def _json(beam: Beam | None) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Optics:
-    """Tunes [2]; beta, dispersion and orbit [layer + 1, 2], m."""
+class StoredOptics:
+    """Tunes [2]; beta, dispersion and closed orbit at the start and at the exits of all magnets,
+    [magnet + 1, 2], m."""
 
     tunes: Array
     beta: Array
@@ -103,7 +104,7 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
     told: dict[Hypothesis, Consequences] = {}
     for cause in felt:
         others = [c for c in causes if c is not cause]
-        mended, by_hand = undone(ring, [cause])
+        mended, by_hand = compensated(ring, [cause])
         changed = _changed(ring, mended, others if by_hand else causes)
         told[cause.effect, cause.element] = Consequences(
             None if design is None else _pair(design.tunes),
@@ -120,11 +121,17 @@ def beam_with(ring: Ring, causes: Sequence[Cause]) -> Consequences:
         ring: the design.
         causes: those of monitors and of settings are passed over.
     """
-    there = assembly(ring)
-    design = _optics(there, {})
-    felt = [cause for cause in causes if _felt(cause.effect)]
-    found = _relative(design, _optics(there, _changed(ring, ring, felt)))
+    design, estimated = optics_with(ring, causes)
+    found = _relative(design, estimated)
     return Consequences(None if design is None else _pair(design.tunes), found, None)
+
+
+def optics_with(ring: Ring, causes: Sequence[Cause]) -> tuple[StoredOptics | None, ...]:
+    """Optics of the design and of the ring with all causes; None where a ring has no stable closed
+    orbit. See `beam_with`."""
+    there = assembly(ring)
+    felt = [cause for cause in causes if _felt(cause.effect)]
+    return _optics(there, {}), _optics(there, _changed(ring, ring, felt))
 
 
 def _felt(effect: str) -> bool:
@@ -139,7 +146,7 @@ def _changed(ring: Ring, mended: Ring, causes: Sequence[Cause]) -> dict[int, Ele
     return settings | changed_elements(mended, causes)
 
 
-def _optics(there: Assembly, changed: Mapping[int, Element]) -> _Optics | None:
+def _optics(there: Assembly, changed: Mapping[int, Element]) -> StoredOptics | None:
     """Of the ring with these elements; None where it has no stable closed orbit."""
     layers = Layers.of(there.maps)
     layers.put(there.layers_with(changed))
@@ -157,7 +164,7 @@ def _optics(there: Assembly, changed: Mapping[int, Element]) -> _Optics | None:
     vectors = total[:-1, :4, :4] @ modes
     position = np.stack([vectors[:, 0, 0], vectors[:, 2, 1]], axis=-1)
     dispersion = total[:-1, :4, :4] @ start + total[:-1, :4, 5]
-    return _Optics(
+    return StoredOptics(
         tunes=np.angle(values) / (2 * np.pi) % 1.0,
         beta=np.abs(position) ** 2,
         dispersion=dispersion[:, [0, 2]],
@@ -165,7 +172,7 @@ def _optics(there: Assembly, changed: Mapping[int, Element]) -> _Optics | None:
     )
 
 
-def _relative(design: _Optics | None, ring: _Optics | None) -> Beam | None:
+def _relative(design: StoredOptics | None, ring: StoredOptics | None) -> Beam | None:
     if design is None or ring is None:
         return None
     beat = ring.beta / design.beta - 1

@@ -36,11 +36,11 @@ from tmlattice.measurement import (
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.evidence import Names, Verdict, certain
-from tmlattice.observe.global_errors import Judge
-from tmlattice.observe.noise import PASSES, random_part
+from tmlattice.observe.global_errors import GlobalErrors
+from tmlattice.observe.noise import PASSES, noise_scatter
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_errors import ANOTHER, ResponseJudge, ResponseVerdict
-from tmlattice.observe.sections import Found, Passes
+from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors, ResponseVerdict
+from tmlattice.observe.sections import Passes, SectionFits
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,8 @@ CORRECTED = 0.1
 """Misfit of the typical column once wrong signs, units or an order are undone, from which it may be
 the lattice that is wrong."""
 FAR = 100.0
-"""Square of the sigma by which launches may differ from the stated ones: benchmarks/data_checks.py."""
+"""Square of the sigma by which launches may differ from the stated ones, by
+benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first monitors spoil them by."""
 SECTIONS = 4
@@ -193,7 +194,7 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
         return note(
             "energy",
             f"the data state a beam energy of {data.energy:g} GeV, the lattice {ring.energy:g}: "
-            "name this machine's lattice, or its energy (--energy)",
+            "name this machine's lattice, or its energy (`energy` in tmlattice.toml)",
         )
     return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
 
@@ -212,10 +213,10 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
-    judge = Judge(ring, data, known)
+    judge = GlobalErrors(ring, data, known)
     verdicts = judge.verdicts()
     for verdict in verdicts:
-        judge = judge.mended(verdict.names)
+        judge = judge.corrected(verdict.names)
     passes, found = judge.found(judge.measurement)
     lattice = _lattice(ring, judge, passes, found)
     if lattice.status == "wrong":  # no wrong sign, unit or order mends that
@@ -257,7 +258,7 @@ def _number(value: float) -> str:
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
 
 
-def _lattice(ring: Ring, judge: Judge, passes: Passes, found: Found) -> Check:
+def _lattice(ring: Ring, judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
     """Whether the readings follow trajectories of this ring at all."""
     share = found.share(passes)
     if not np.isfinite(share):
@@ -274,7 +275,7 @@ def _lattice(ring: Ring, judge: Judge, passes: Passes, found: Found) -> Check:
     return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
 
 
-def _launches(judge: Judge) -> Check:
+def _launches(judge: GlobalErrors) -> Check:
     """Fitted launches against the stated ones."""
     square = max(judge.square([()]), 1.0)
     data = judge.measurement
@@ -297,7 +298,7 @@ def _launches(judge: Judge) -> Check:
     return fine("launches", "the fitted launches are the stated ones")
 
 
-def _noise(judge: Judge, passes: Passes, found: Found) -> Check:
+def _noise(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
     """The stated noise against what neighbouring monitors leave."""
     level = float(np.sqrt(found.level))
     if not np.isfinite(level):
@@ -313,7 +314,7 @@ def _noise(judge: Judge, passes: Passes, found: Found) -> Check:
             "state the noise of one reading, or go on with --assume noise-from-data",
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
-    random = random_part(passes, found)
+    random = noise_scatter(passes, found)
     if random is not None and random > UNDER:
         return wrong(
             "noise",
@@ -344,7 +345,7 @@ def _micro(metres: float) -> str:
     return f"{1e6 * metres:.3g} µm"
 
 
-def _spikes(judge: Judge, passes: Passes, found: Found) -> Check:
+def _spikes(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
     """Single readings far off, where the same section of other shots agrees."""
     none = fine("spikes", "no single reading is far off")
     there = found.freedom > 2
@@ -372,10 +373,10 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
     checks = signals.monitors(ring, data.monitors, data.response)
     if any(check.status == "wrong" for check in checks):
         return checks
-    judge = ResponseJudge(ring, data)
+    judge = ResponseGlobalErrors(ring, data)
     verdicts = judge.verdicts()
     for verdict in verdicts:
-        judge = judge.mended(verdict.names)
+        judge = judge.corrected(verdict.names)
     left = judge.misfit(())
     typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
     if typical > (CORRECTED if verdicts else ANOTHER):
@@ -414,7 +415,7 @@ def _of_all(verdict: ResponseVerdict) -> Check:
     return wrong(_GLOBAL, text, assume=verdict.names)
 
 
-def _rf_step(judge: ResponseJudge) -> list[Check]:
+def _rf_step(judge: ResponseGlobalErrors) -> list[Check]:
     scale = judge.rf_scale()
     if not max(abs(scale), 1 / abs(scale)) > SCALED:
         return []

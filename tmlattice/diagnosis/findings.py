@@ -14,18 +14,18 @@ from tmlattice.diagnosis.recommended_actions import recommended_action, recommen
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
+from tmlattice.inference.alternatives import Alternative, Detection
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Outcome, fit
 from tmlattice.inference.problem import Hypothesis
-from tmlattice.inference.rivals import Detection, Rival
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
-from tmlattice.inference.search import Explanation, Named
+from tmlattice.inference.search import Explanation, Identified
 from tmlattice.lattice import Element, Ring
 
 Array = NDArray[np.float64]
 
 
-def credible(rivals: Sequence[Rival], mass: float) -> tuple[list[Rival], Array]:
+def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternative], Array]:
     """The likeliest rivals that hold the mass, and the probabilities of all."""
     evidence = np.array([rival.fit.log_evidence for rival in rivals])
     probability = np.exp(evidence - evidence.max())
@@ -78,11 +78,11 @@ def least_certain(found: Sequence[Finding], without: str) -> str:
     return max((own.verdict for own in found), key=VERDICTS.index) if found else without
 
 
-def _named(ring: Ring, explanation: Explanation, k: int, named: Named, mass: float) -> Finding:
+def _named(ring: Ring, explanation: Explanation, k: int, named: Identified, mass: float) -> Finding:
     cause = explanation.fit.causes[k]
     sigma = float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0)))
-    members, probability = credible(named.rivals, mass)
-    causes = [cause, *(m.cause for m in named.rivals[1:])]
+    members, probability = credible(named.alternatives, mass)
+    causes = [cause, *(m.cause for m in named.alternatives[1:])]
     shown = [m.cause for m in members]
     return finding_of(ring, causes, probability, shown, sigma, named.detection, mass)
 

@@ -15,9 +15,9 @@ from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.prepare import batch, prepare
 from tmlattice.diagnosis.stored_data_checks import raise_if_wrong
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
-from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     ClosedOrbit,
@@ -35,7 +35,7 @@ from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import split_columns
-from tmlattice.observe.stored import Kept, Stored
+from tmlattice.observe.stored import ModelCache, Stored
 from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
 
@@ -115,13 +115,13 @@ def part_of(label: str, measured: Measured, how: How) -> Part:
     raise TypeError(f"{type(measured).__name__} is no measurement")
 
 
-def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together:
+def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> CombinedProblem:
     """Measurements as one problem, beside those of a reference; stored beams of the same machine
     share the models made of it."""
-    kept = Kept()
+    cache = ModelCache()
     first, then = (
         [
-            replace(own, kept=kept) if isinstance(own := part.problem, Stored) else own
+            replace(own, cache=cache) if isinstance(own := part.problem, Stored) else own
             for part in some
         ]
         for some in (parts, before)
@@ -130,7 +130,7 @@ def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Together
         own.first if part.start is None else part.start
         for part, own in zip((*parts, *before), (*first, *then), strict=True)
     )
-    whole = Together.of(first, then)
+    whole = CombinedProblem.of(first, then)
     return replace(whole, places=how.places, judgement=how.judgement, starts=starts)
 
 
@@ -216,7 +216,7 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
         problem = make(how.ring, measured, how.places)
         if isinstance(problem, Stored):
             raise_if_wrong(how.ring, measured, problem)
-        messages = problem.said if isinstance(problem, ManyTurns) else ()
+        messages = problem.warnings if isinstance(problem, ManyTurns) else ()
         return Part(
             label, kind, problem, held and make(how.ring, held, how.places), messages=messages
         )

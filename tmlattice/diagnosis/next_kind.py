@@ -22,10 +22,10 @@ from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.among import Among, small_errors_of
-from tmlattice.inference.newton import settled
+from tmlattice.inference.alternatives import Alternative
+from tmlattice.inference.distributed import DistributedProblem, fit_distributed_errors
+from tmlattice.inference.newton import fit_nuisances
 from tmlattice.inference.problem import Problem
-from tmlattice.inference.rivals import Rival
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, RfStep, TuneReading
@@ -62,11 +62,13 @@ ROOM = 2**26
 """Numbers of the signatures of all small errors: where there are more, nothing is proposed."""
 
 
-def leading(ring: Ring, explanation: Explanation, mass: float) -> tuple[Rival, Rival] | None:
+def leading(
+    ring: Ring, explanation: Explanation, mass: float
+) -> tuple[Alternative, Alternative] | None:
     """The first finding's likeliest explanation, and the likeliest one that another action takes
     away: which of two mechanisms with one recommended action it is changes nothing."""
     for named in explanation.named:
-        first, *others = credible(named.rivals, mass)[0]
+        first, *others = credible(named.alternatives, mass)[0]
         done = recommended_action(ring, first.cause)
         other = next(
             (rival for rival in others if recommended_action(ring, rival.cause) != done), None
@@ -116,25 +118,25 @@ def minutes_of(ring: Ring, kind: str) -> float:
     return MINUTES[kind]
 
 
-def _among(problem: Problem, explanation: Explanation, first: Rival) -> Problem:
+def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Problem:
     """Among the small errors that are left open."""
     among = explanation.problem
-    if not isinstance(among, Among):
+    if not isinstance(among, DistributedProblem):
         return problem
     rows = int(problem.valid.sum())
     if rows * len(among.known.hypotheses) > ROOM:
         raise TmlatticeError("too many readings among small errors")
     known = among.learnt(explanation.fit)
     causes = [c for c in first.fit.causes if problem.sees((c.effect, c.element))]
-    return small_errors_of(problem, known, problem.first, causes, learn=False).problem
+    return fit_distributed_errors(problem, known, problem.first, causes, learn=False).problem
 
 
-def _separation(problem: Problem, pair: tuple[Rival, Rival]) -> float:
+def _separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> float:
     """In standard deviations; 0 where one of them has no stored beam."""
     each = [
         [c for c in one.fit.causes if problem.sees((c.effect, c.element))] for one in pair
     ]  # fmt: skip
-    first = settled(problem, each[0], problem.first)
+    first = fit_nuisances(problem, each[0], problem.first)
     second = problem.at(each[1], first.nuisances)
     if first.projection is None or second.projection is None:
         return 0.0

@@ -15,7 +15,7 @@ from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.rivals import Rival
+from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.whitening import Projection, Whitening
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import Data
@@ -73,8 +73,8 @@ class NextMeasurement:
 def next_measurement(
     ring: Ring,
     data: Data,
-    first: Rival,
-    second: Rival,
+    first: Alternative,
+    second: Alternative,
     known: Sequence[Cause] = (),
     seed: int = 0,
 ) -> NextMeasurement | None:
@@ -133,7 +133,7 @@ def _absorbed(
     whitening: Whitening,
     projection: Projection,
     launches: Array,
-    rival: Rival,
+    rival: Alternative,
     clean: Array,
 ) -> Array:
     """What of the difference another amount would explain, given how well it is known, [shot]."""
@@ -155,7 +155,7 @@ def _absorbed(
 
 
 def _candidates(
-    ring: Ring, data: Data, rivals: Sequence[Rival], seed: int
+    ring: Ring, data: Data, rivals: Sequence[Alternative], seed: int
 ) -> tuple[Array, list[Settings]]:
     """Launches [shot, 5] and settings; none of them starts on the axis."""
     measured = data.launches[data.active]

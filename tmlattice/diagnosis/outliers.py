@@ -9,8 +9,8 @@ import numpy as np
 
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.result import Finding
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.search import Explanation
-from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.speaks import micrometres
@@ -38,11 +38,11 @@ def with_silent(ring: Ring, part: Part, measured: Any) -> Part:
     return replace(part, messages=(*part.messages, messages))
 
 
-def spikes(parts: Sequence[Part], problem: Together, found: Explanation) -> Iterator[str]:
+def spikes(parts: Sequence[Part], problem: CombinedProblem, found: Explanation) -> Iterator[str]:
     """A sentence for each measurement with single readings that the search left out."""
     ends = np.cumsum([part.valid.size for part in problem.parts])
     own: dict[int, list[int]] = {}
-    for reading in found.spikes:
+    for reading in found.outliers:
         flat = int(np.ravel(reading)[-1])
         own.setdefault(int(np.searchsorted(ends, flat, side="right")), []).append(flat)
     for index, (part, one) in enumerate(zip(parts, problem.parts, strict=False)):
@@ -61,7 +61,7 @@ def rejected_readings(part: Part, found: Explanation) -> tuple[dict[str, Any], .
     reference is None."""
     rows: list[dict[str, Any]] = []
     names = part.problem.monitors
-    for (flat,) in found.spikes:
+    for (flat,) in found.outliers:
         shot, reading, plane = np.unravel_index(flat, part.problem.valid.shape)
         turn, monitor = divmod(int(reading), len(names))
         rows.append({

@@ -63,13 +63,13 @@ from tmlattice.effects import (
     rare,
 )
 from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
-from tmlattice.inference.among import Known, Learnt
+from tmlattice.inference.combined import CombinedProblem
+from tmlattice.inference.distributed import DistributedErrors, FittedErrors
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
-from tmlattice.inference.together import Together
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.first_turns import FirstTurns
@@ -94,7 +94,7 @@ def diagnose_together(
     *,
     reference: Mapping[str, Any] | None = None,
     background: Mapping[str, float | None] | None = None,
-    known: Known | None = None,
+    known: DistributedErrors | None = None,
     holdout: float = 0.33,
     heldout: Measurement | None = None,
     effects: Sequence[str] | None = None,
@@ -172,7 +172,7 @@ def diagnose_together(
         sought_out = sought_since(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
     small = sought_out.small
     if noisy and problem.alone and small is not None:  # with the noise that was learnt
-        assert isinstance(small.plain, Together)
+        assert isinstance(small.plain, CombinedProblem)
         problem = small.plain
         own = zip(parts, problem.parts, strict=True)
         parts = [replace(part, problem=learnt) for part, learnt in own]
@@ -225,9 +225,9 @@ def _of_launches(effect: Effect) -> bool:
 def _report(
     ring: Ring,
     parts: Sequence[Part],
-    problem: Together,
+    problem: CombinedProblem,
     found: Explanation,
-    small: Learnt | None,
+    small: FittedErrors | None,
     how: How,
     made: Mapping[str, Any],
 ) -> Diagnosis:
@@ -289,6 +289,7 @@ def _report(
         heldout=heldout,
         heldout_shots=() if turns is None else turns.shots[1],
         compared=compared,
+        covariance=result.covariance[: len(causes), : len(causes)],
         correlations=correlations_of(
             [(cause.effect, cause.element) for cause in causes],
             found.fit.covariance[: len(causes), : len(causes)],
@@ -335,7 +336,7 @@ def _next(
     return None
 
 
-def _by_ring(ring: Ring, problem: Together, found: Explanation) -> Explanation:
+def _by_ring(ring: Ring, problem: CombinedProblem, found: Explanation) -> Explanation:
     """Monitors that were set aside, by their place in the ring."""
     at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
     aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}

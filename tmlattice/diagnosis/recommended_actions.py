@@ -111,7 +111,7 @@ def leading(ring: Ring, cause: Cause) -> Cause:
     """The cause whose action takes this one away too, with the amount that does as much."""
     if cause.element is None or not _is_element(ring, cause.element):
         return cause
-    effect, scale = find(cause.effect).stands_for(ring[cause.element])
+    effect, scale = find(cause.effect).corrected_as(ring[cause.element])
     return Cause(effect, cause.element, scale * cause.amount)
 
 
@@ -158,8 +158,8 @@ def recommended_actions(
         if cause is causes[0] and sigma is not None:
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
         found[key] = RecommendedAction(
-            lead.effect, lead.element, key[1], _kind(ring, lead.element), lead.amount, error, share,
-            own, _strength(ring, lead),
+            lead.effect, lead.element, key[1], element_kind(ring, lead.element), lead.amount,
+            error, share, own, _strength(ring, lead),
         )  # fmt: skip
     if not found:
         return ()
@@ -197,7 +197,8 @@ def _members(ring: Ring, name: str | None) -> list[Element]:
     return own or [ring.elements[i] for i in next((some for some in shared if some), ())]
 
 
-def _kind(ring: Ring, name: str | None) -> Kind | None:
+def element_kind(ring: Ring, name: str | None) -> Kind | None:
+    """The kind of an element, or of a family's members; None for the beam."""
     return next((element.kind for element in _members(ring, name)), None)
 
 
@@ -215,7 +216,7 @@ def _strength(ring: Ring, cause: Cause) -> Strength | None:
     return Strength(effect.strength, unit, before, before * (1 + cause.amount))
 
 
-def undone(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]]:
+def compensated(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]]:
     """The ring with the settings that take causes away, and the causes that no setting does.
 
     With the causes in it, a magnet of the returned ring acts as the given ring's does: a quadrupole
@@ -233,7 +234,7 @@ def undone(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]
             by_hand.append(cause)
             continue
         places = effect.members(ring, cause.element)
-        told = [effect.undone(settings.get(i, ring.elements[i]), cause.amount) for i in places]
+        told = [effect.compensated(settings.get(i, ring.elements[i]), cause.amount) for i in places]
         if any(element is None for element in told):
             by_hand.append(cause)
             continue

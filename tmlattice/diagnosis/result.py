@@ -7,20 +7,29 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.recommended_actions import RecommendedAction, undone
+from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
-from tmlattice.diagnosis.views import JointView, PartView, ResponseView, TrajectoryView
+from tmlattice.diagnosis.tables import Tables
+from tmlattice.diagnosis.views import (
+    JointView,
+    PartView,
+    ResponseView,
+    StoredView,
+    TrajectoryView,
+)
 from tmlattice.effects import Cause, apply
-from tmlattice.inference.judge import Gap, Misfit
+from tmlattice.errors import MeasurementError
+from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.rivals import Detection
 from tmlattice.inference.search import Explanation
+from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
@@ -201,7 +210,7 @@ class Diagnosis(ShownDiagnosis):
         next: the shot that would tell the likeliest rivals apart, or None.
         sensitivity: by effect, the amount that would be seen at half of its places.
         warnings: what a reader should know.
-        left_out: single readings that the search left out: shot, turn, monitor, plane.
+        outliers: single readings that the search left out: shot, turn, monitor, plane.
         noise: rms of a reading, m, (x, y).
         noise_estimated: whether it comes from the data.
         provenance: package, lattice, options as used, seed, seconds.
@@ -227,6 +236,8 @@ class Diagnosis(ShownDiagnosis):
             None).
         compared: blocks of readings with what the result predicts of them.
         correlations: pairs of amounts that the data hardly separate.
+        covariance: of the amounts of the causes, [cause, cause]; None where none is stated, as of
+            a change between two orbit responses and of a diagnosis that was loaded. See `tables`.
         devices: what the control system calls elements, by their names.
         supports: how much of each cause comes from the data, the same length; empty where all do,
             because their priors are log-uniform.
@@ -250,7 +261,7 @@ class Diagnosis(ShownDiagnosis):
     corrected: Ring = field(repr=False)
     causes: tuple[Cause, ...]
     errors: tuple[float, ...]
-    view: TrajectoryView | ResponseView | JointView = field(repr=False)
+    view: TrajectoryView | ResponseView | JointView | StoredView = field(repr=False)
     outliers: tuple[dict[str, Any], ...] = ()
     steps: "tuple[Step, ...]" = ()
     rejected_steps: "tuple[Step, ...]" = ()
@@ -268,6 +279,12 @@ class Diagnosis(ShownDiagnosis):
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
     supports: tuple[Support, ...] = field(default=(), repr=False)
+    covariance: NDArray[np.float64] | None = field(default=None, repr=False)
+
+    @property
+    def tables(self) -> Tables:
+        """The result as pandas DataFrames by name: `diagnosis.tables["errors"]`; see `Tables`."""
+        return Tables(self)
 
     @cached_property
     def assessment(self) -> Assessment:
@@ -294,9 +311,11 @@ class Diagnosis(ShownDiagnosis):
     @property
     def measured(self) -> tuple[str, ...]:
         """Quantities of the stored beam that were measured."""
+        if isinstance(self.view, StoredView):
+            return self.view.measured
         kinds = {part.kind for part in self.parts} or {self.kind}
         found = {quantity for kind in kinds for quantity in _MEASURES.get(kind, ())}
-        if self.by_steps and np.isfinite(self.response.data[-1]).any():
+        if isinstance(self.view, ResponseView) and np.isfinite(self.view.data[-1]).any():
             found.add("dispersion")
         return tuple(sorted(found))
 
@@ -309,14 +328,28 @@ class Diagnosis(ShownDiagnosis):
     @property
     def kind(self) -> str:
         """Of the measurement, as its folder has it; "together" of several."""
+        if isinstance(self.view, StoredView):
+            return self.view.kind
         if isinstance(self.view, JointView):
             return self.view.parts[0].kind if len(self.view.parts) == 1 else "together"
         return "trajectory" if isinstance(self.view, TrajectoryView) else "orbit_response"
 
     @property
     def by_steps(self) -> bool:
-        """Whether families of errors were fitted, as to an orbit response."""
-        return isinstance(self.view, ResponseView)
+        """Whether families of errors were fitted step by step, as to an orbit response."""
+        return self.kind == "orbit_response"
+
+    @property
+    def stored(self) -> bool:
+        """Whether it is of `Diagnosis.load`, without readings, scan and covariance."""
+        return isinstance(self.view, StoredView)
+
+    @property
+    def correctors_held_out(self) -> int | None:
+        """How many correctors of an orbit response are the validation set."""
+        if isinstance(self.view, StoredView):
+            return self.view.correctors
+        return int(self.view.held.sum()) if isinstance(self.view, ResponseView) else None
 
     @property
     def since_reference(self) -> bool:
@@ -331,11 +364,12 @@ class Diagnosis(ShownDiagnosis):
     @property
     def parts(self) -> tuple[PartView, ...]:
         """The measurements, where there are several or a stored beam's."""
-        return self.view.parts if isinstance(self.view, JointView) else ()
+        return self.view.parts if isinstance(self.view, JointView | StoredView) else ()
 
     @property
     def trajectories(self) -> TrajectoryView:
         """The view of trajectories; TypeError for another kind."""
+        self._read()
         if not isinstance(self.view, TrajectoryView):
             raise TypeError(f"the diagnosis is of an {self.kind}, not of trajectories")
         return self.view
@@ -343,6 +377,7 @@ class Diagnosis(ShownDiagnosis):
     @property
     def response(self) -> ResponseView:
         """The view of an orbit response; TypeError for another kind."""
+        self._read()
         if not isinstance(self.view, ResponseView):
             raise TypeError(f"the diagnosis is of a {self.kind}, not of an orbit response")
         return self.view
@@ -353,10 +388,19 @@ class Diagnosis(ShownDiagnosis):
 
         Raises:
             TypeError: families of errors were fitted instead.
+            MeasurementError: it was loaded from a file, which does not hold it.
         """
-        if isinstance(self.view, ResponseView):
+        self._read()
+        if not isinstance(self.view, TrajectoryView | JointView):
             raise TypeError("an orbit response was fitted by families: there was no search")
         return self.view.explanation
+
+    def _read(self) -> None:
+        if self.stored:
+            raise MeasurementError(
+                "diagnosis.json does not hold the readings, the scan and the covariance: diagnose "
+                "again, or keep a pickle of the diagnosis"
+            )
 
     @property
     def calibration(self) -> tuple[Cause, ...]:
@@ -406,9 +450,9 @@ class Diagnosis(ShownDiagnosis):
         """The design with the settings that take the faults away, and what settings do not mend.
 
         Loaded into the machine as it was found, these settings make it the design again: see
-        `recommended_actions.undone`.
+        `recommended_actions.compensated`.
         """
-        return undone(self.ring, self.faults)
+        return compensated(self.ring, self.faults)
 
     @property
     def gap(self) -> dict[str, Any]:
@@ -425,10 +469,14 @@ class Diagnosis(ShownDiagnosis):
         heldout = None
         if gap is not None:
             heldout = {
-                **both(gap.misfits[gap.since], gap.misfits[-1]),
+                **both(gap.misfits[gap.baseline], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
                 "monitors": "half" if self.by_steps else "odd",
                 "steps": [dict(vars(m)) for m in gap.misfits],
+                "since": gap.baseline,
+                "readings": gap.readings,
+                "correctors": self.correctors_held_out,
+                "lost": gap.lost,
             }
         interval = None if gap is None or gap.interval is None else list(gap.interval)
         return {
@@ -454,6 +502,11 @@ class Diagnosis(ShownDiagnosis):
             "findings": [finding.as_json() for finding in self.findings],
             "steps": [step.as_json() for step in self.steps],
             "rejected_steps": [step.as_json() for step in self.rejected_steps],
+            "readings_noise": {
+                "x": self.noise[0],
+                "y": self.noise[1],
+                "estimated": self.noise_estimated,
+            },
             "bad_monitors": list(self.bad_monitors),
             "rejected_channels": [
                 {"element": name, "plane": plane} for name, plane in self.rejected_channels

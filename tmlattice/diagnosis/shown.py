@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from tmlattice.late import Method
+from tmlattice.late import ClassMethod, Method
 from tmlattice.speaks import Speaks, last_part
 
 MOST = 4
@@ -45,6 +45,11 @@ class ShownDiagnosis(Speaks):
         "tmlattice.report.speaking",
         "save",
         "Write report.html, report.txt, diagnosis.json and the figures into a folder.",
+    )
+    load = ClassMethod(
+        "tmlattice.diagnosis.load",
+        "load",
+        "Return the diagnosis of a folder of `save`, or of a diagnosis.json.",
     )
     plot = Method(
         "tmlattice.plots.speaking",

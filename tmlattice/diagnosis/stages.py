@@ -16,14 +16,19 @@ from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.views import PartView, TrajectoryView
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.among import Among, Learnt, chains, signatures_of
-from tmlattice.inference.judge import Gap, Misfit, held_out_gap
+from tmlattice.inference.combined import Blocks, CombinedProblem
+from tmlattice.inference.distributed import (
+    DistributedProblem,
+    FittedErrors,
+    chain_factors,
+    signatures_of,
+)
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.newton import Fit, settled
+from tmlattice.inference.newton import Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
-from tmlattice.inference.together import Blocks, Together
-from tmlattice.observe.first_turns import FirstTurns, judged
+from tmlattice.inference.validation import Gap, Misfit, held_out_gap
+from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -51,7 +56,10 @@ class Stage:
 
 
 def stages_of(
-    problem: Together, found: Explanation, small: Learnt | None, causes: tuple[Cause, ...]
+    problem: CombinedProblem,
+    found: Explanation,
+    small: FittedErrors | None,
+    causes: tuple[Cause, ...],
 ) -> list[Stage]:
     """The design; then with small errors and with the causes among them, or with one cause after
     the other."""
@@ -59,8 +67,8 @@ def stages_of(
     about: dict[Hypothesis, float] = {}
     if small is not None:
         inner = found.problem
-        assert isinstance(inner, Among)
-        about = dict(zip(inner.known.hypotheses, inner.about.tolist(), strict=True))
+        assert isinstance(inner, DistributedProblem)
+        about = dict(zip(inner.known.hypotheses, inner.linearised_at.tolist(), strict=True))
         for one in (found.before, found.fit)[: 1 + bool(causes)]:
             amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
             models.append((tuple(Cause(*h, a) for h, a in amounts), (), one.nuisances))
@@ -76,7 +84,7 @@ SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
 
 
 def _settled(
-    problem: Together,
+    problem: CombinedProblem,
     static: tuple[Cause, ...],
     own: tuple[Cause, ...],
     nuisances: Array,
@@ -88,7 +96,7 @@ def _settled(
             for c in static for start in [about[c.effect, c.element]]
         )  # fmt: skip
         there = replace(problem, fixed=(*problem.fixed, *some))
-        point = settled(there, own, nuisances)
+        point = fit_nuisances(there, own, nuisances)
         if not point.lost or not static:
             break
     if point.lost:
@@ -117,7 +125,7 @@ def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[A
 
 
 def views_of(
-    parts: Sequence[Part], problem: Together, stages: Sequence[Stage]
+    parts: Sequence[Part], problem: CombinedProblem, stages: Sequence[Stage]
 ) -> tuple[PartView, ...]:
     """What each measurement leaves before and after."""
     views = []
@@ -152,7 +160,9 @@ def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = (
     return Misfit(rms, float(np.mean(every**2)) if len(every) else float("nan"))
 
 
-def pairs_of(parts: Sequence[Part], problem: Together, stage: Stage) -> list[tuple[Problem, Point]]:
+def pairs_of(
+    parts: Sequence[Part], problem: CombinedProblem, stage: Stage
+) -> list[tuple[Problem, Point]]:
     """Of the measurements themselves, not of their reference."""
     return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
 
@@ -184,7 +194,7 @@ def held_out(
             ]
             there = replace(judge, fixed=tuple(seen))
             scored = there.owner() % 2 == 1
-            gives = settled(there.without(scored), (), there.first)
+            gives = fit_nuisances(there.without(scored), (), there.first)
             pairs.append((there, there.at((), gives.nuisances)))
             among.append(scored)
         misfits.append(misfit_of(pairs, among))
@@ -198,9 +208,9 @@ def held_out(
 
 def held_out_shots(
     part: Part,
-    problem: Together,
+    problem: CombinedProblem,
     found: Explanation,
-    small: Learnt | None,
+    small: FittedErrors | None,
     stages: Sequence[Stage],
     since: int,
 ) -> Gap | None:
@@ -227,11 +237,11 @@ def held_out_shots(
             explained = explained if stage.causes or found.fit.causes == () else found.before
             about = replace(judge, model=model)
             unknown = _unknown(small, explained, about, stage)
-        scored.append(judged(replace(judge, model=model, fixed=stage.causes), unknown))
+        scored.append(held_out_residuals(replace(judge, model=model, fixed=stage.causes), unknown))
     return held_out_gap(scored, since)
 
 
-def _unknown(small: Learnt, explained: Fit, other: FirstTurns, stage: Stage) -> Array | None:
+def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stage) -> Array | None:
     """Covariance of what is not known of other shots, once these have been explained.
 
     Of the small errors what the readings leave open, and of the amounts of the causes: as in
@@ -252,8 +262,8 @@ def _unknown(small: Learnt, explained: Fit, other: FirstTurns, stage: Stage) -> 
         return None
     known = among.known
     amounts = np.array([cause.amount for cause in stage.static])
-    there = chains(known, amounts)[:, None] * signatures_of(other, point, known.hypotheses)
-    there = known.mixed(known.rms[:, None] * there)
+    there = chain_factors(known, amounts)[:, None] * signatures_of(other, point, known.hypotheses)
+    there = known.correlated(known.rms[:, None] * there)
     here = explained.projection.out(among.white(among.rows))
     rows = there.T @ here
     unknown = there.T @ there - rows @ rows.T
@@ -269,7 +279,7 @@ def _unknown(small: Learnt, explained: Fit, other: FirstTurns, stage: Stage) -> 
 
 
 def trajectory_view(
-    problem: Together, found: Explanation, stages: Sequence[Stage]
+    problem: CombinedProblem, found: Explanation, stages: Sequence[Stage]
 ) -> TrajectoryView:
     """What plots of first turns need."""
     (own,) = problem.parts
@@ -280,7 +290,7 @@ def trajectory_view(
 
 
 def seen_by(
-    parts: Sequence[Part], problem: Together, point: Point, finding: Finding
+    parts: Sequence[Part], problem: CombinedProblem, point: Point, finding: Finding
 ) -> dict[str, float] | None:
     """Share of each measurement in what is known of a finding's amount."""
     own = [i for i, c in enumerate(point.causes)

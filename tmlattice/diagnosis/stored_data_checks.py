@@ -207,7 +207,7 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
             return np.full(modes.shape, complex(np.nan, np.nan))
 
     corrections = [replace(SWAPPED, undo=swaps), *_of_lines()]
-    text = [note("lines", one) for one in problem.said]
+    text = [note("lines", one) for one in problem.warnings]
     tunes = _near(ring, problem.data[:, -2:], problem.used[:, -2:])
     return [*text, tunes, *_judged(ring, "line", share, _lines(problem), corrections)]
 

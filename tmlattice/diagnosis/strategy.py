@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from tmlattice.effects import Cause, LaunchEffect, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
-from tmlattice.inference.among import MOST, Known, Learnt, small_errors_of
+from tmlattice.inference.distributed import (
+    MAX_ELEMENTS,
+    DistributedErrors,
+    FittedErrors,
+    fit_distributed_errors,
+)
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.search import Explanation, Search, explain, on_readings, revised
@@ -68,7 +73,7 @@ class Found:
     """
 
     explanation: Explanation
-    small: Learnt | None = None
+    small: FittedErrors | None = None
 
 
 def sought(
@@ -78,7 +83,7 @@ def sought(
     *,
     learn: bool,
     noisy: bool = False,
-    known: Known | None = None,
+    known: DistributedErrors | None = None,
     earlier: Found | None = None,
 ) -> Found:
     """Return what explains the data.
@@ -115,11 +120,11 @@ def sought(
             few = explain(narrow, start)
         more = few.full and few.count < search.most
         more = more and few.scan.chance < problem.judgement.false_alarm
-        if explained(few) or len(start.residual) * len(seen) > MOST:
+        if explained(few) or len(start.residual) * len(seen) > MAX_ELEMENTS:
             return Found(explain(search, start, few) if more else few)
         begun = few.fit
     search.progress("small errors")
-    first = Known.usual(seen, sizes) if known is None else known
+    first = DistributedErrors.usual(seen, sizes) if known is None else known
     learn = learn and known is None
     asides = dict.fromkeys(((), () if few is None else _outstanding(few)))
     amounts: Array | None = None
@@ -127,12 +132,12 @@ def sought(
         there = earlier.small.problem
         first, amounts = there.known, there.estimate(earlier.explanation.fit.clean)
         learn = False
-    tried: list[Learnt] = []
+    tried: list[FittedErrors] = []
     for causes in asides:
         with suppress(UnstableRingError):  # then they are none that anybody learns
-            tried.append(small_errors_of(
+            tried.append(fit_distributed_errors(
                 problem, first, begun.nuisances, causes, learn=learn, noisy=noisy,
-                about=amounts,
+                linearised_at=amounts,
             ))  # fmt: skip
     if not tried or (learn and max(small.log_evidence for small in tried) < CLEAR):
         if few is None:  # errors all along the ring: a few names at most
@@ -183,7 +188,7 @@ def sought_since(
     alone = sought(before, everywhere, sizes, learn=learn, noisy=noisy)
     common = _of_ring(alone.explanation.fit.causes)
     for _ in range(ROUNDS):
-        own = replace(search, problem=search.problem.standing(common))
+        own = replace(search, problem=search.problem.with_fixed(common))
         found = sought(own, everywhere, sizes, learn=learn, noisy=noisy, earlier=alone)
         more = _of_ring(_in_both(found.explanation))
         if not more:
@@ -203,14 +208,16 @@ def _in_both(explanation: Explanation) -> tuple[Cause, ...]:
     shared = []
     for i, cause in enumerate(result.causes):
         others = (*result.causes[:i], *result.causes[i + 1 :])
-        there = fit(problem.standing([cause]), others, result.nuisances)
+        there = fit(problem.with_fixed([cause]), others, result.nuisances)
         if there.good and there.chi2 < result.chi2:
             shared.append(cause)
     return tuple(shared)
 
 
 # --- together with distributed errors -----------------------------------------------------------
-def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Explanation, Learnt]:
+def _among(
+    search: Search, small: FittedErrors, learn: bool, noisy: bool
+) -> tuple[Explanation, FittedErrors]:
     """The small errors, linearised again at what is found where that misleads."""
     problem = search.problem
     unnamed = search.unnamed and bool(len(problem.kick_places))
@@ -218,7 +225,7 @@ def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Exp
     few = min(2, search.most)  # two findings say already whether it has to be taken again
     stale = learn  # what is found made sizes too large
     search.progress("scan")
-    narrow = replace(search, most=few, names_first=True)
+    narrow = replace(search, most=few, labelled_first=True)
     explanation = explain(replace(narrow, problem=small.problem), small.before)
     for _ in range(problem.judgement.retaken):
         doubt = _given(explanation, small, learn)
@@ -231,14 +238,14 @@ def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Exp
             again, causes = _linearised(small, beside, causes, learn, noisy, weigh)
         except UnstableRingError:
             break  # what was found is no place from which they can be taken again
-        if again.apart is not None and again.apart > AMOUNT:
-            narrow = replace(narrow, granted=frozenset((c.effect, c.element) for c in causes))
+        if again.outlier_evidence is not None and again.outlier_evidence > AMOUNT:
+            narrow = replace(narrow, established=frozenset((c.effect, c.element) for c in causes))
         other = explain(replace(narrow, problem=again.problem), again.before)
         if not explanation.count and not other.count:
             break  # it was a small error after all
         small, explanation, stale = again, other, False
     if explanation.full and search.most > few:
-        whole = replace(search, problem=small.problem, granted=narrow.granted)
+        whole = replace(search, problem=small.problem, established=narrow.established)
         explanation = explain(whole, small.before)
     narrow = replace(narrow, most=max(explanation.count, 1))
     learn = False
@@ -254,13 +261,13 @@ def _among(search: Search, small: Learnt, learn: bool, noisy: bool) -> tuple[Exp
 
 
 def _linearised(
-    small: Learnt,
+    small: FittedErrors,
     found: Fit,
     causes: Sequence[Cause],
     learn: bool,
     noisy: bool,
     weigh: bool = False,
-) -> tuple[Learnt, tuple[Cause, ...]]:
+) -> tuple[FittedErrors, tuple[Cause, ...]]:
     """The small errors again, linearised at the most probable ones given what was found, and the
     causes with their share in them.
 
@@ -270,9 +277,9 @@ def _linearised(
     known = small.problem.known
     amounts = small.problem.estimate(found.clean)
     causes, amounts = _parted(causes, amounts, known, small.plain)
-    again = small_errors_of(
+    again = fit_distributed_errors(
         small.plain, known, found.nuisances, causes, learn=learn, noisy=learn and noisy,
-        about=amounts, stored=small.problem.about, weigh=weigh,
+        linearised_at=amounts, stored=small.problem.linearised_at, weigh=weigh,
     )  # fmt: skip
     if not learn:
         again = replace(again, errors=small.errors, log_evidence=small.log_evidence)
@@ -280,7 +287,7 @@ def _linearised(
 
 
 def _parted(
-    causes: Sequence[Cause], amounts: Array, known: Known, problem: Problem
+    causes: Sequence[Cause], amounts: Array, known: DistributedErrors, problem: Problem
 ) -> tuple[tuple[Cause, ...], Array]:
     """Causes, and small errors without a share in both: all is the cause's.
 
@@ -299,8 +306,8 @@ def _parted(
 
 
 def _settled(
-    search: Search, explanation: Explanation, small: Learnt, learn: bool, noisy: bool
-) -> tuple[Explanation, Learnt]:
+    search: Search, explanation: Explanation, small: FittedErrors, learn: bool, noisy: bool
+) -> tuple[Explanation, FittedErrors]:
     """Small errors linearised at all that was found, its amounts among them, and its rivals too.
 
     What they took up of a fault before it was found spoils the slopes at which its rivals were
@@ -324,8 +331,8 @@ def _settled(
 def _undecided(explanation: Explanation) -> bool:
     """Whether something at another place does nearly as well as what was found."""
     for named in explanation.named:
-        best = named.rivals[0]
-        for other in named.rivals[1:]:
+        best = named.alternatives[0]
+        for other in named.alternatives[1:]:
             behind = best.fit.log_evidence - other.fit.log_evidence
             if behind < NEAR and other.hypothesis[1] != best.hypothesis[1]:
                 return True
@@ -333,7 +340,7 @@ def _undecided(explanation: Explanation) -> bool:
 
 
 def _given(
-    explanation: Explanation, small: Learnt, learn: bool
+    explanation: Explanation, small: FittedErrors, learn: bool
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
     """Given which fit, and which causes, small errors have to be taken again; None: they stand.
 

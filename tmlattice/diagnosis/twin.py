@@ -21,7 +21,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
-from tmlattice.inference.among import Among, Known
+from tmlattice.inference.distributed import DistributedErrors, DistributedProblem
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.posterior import posterior
 from tmlattice.lattice import Ring
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 PRODUCTS = 2e12
 """Readings times errors squared up to which the covariance of all small errors is taken from a
-response: some six minutes of processor (`docs/results/together.md`)."""
+response: some six minutes of processor (`docs/together.md`)."""
 HARDLY = 0.3
 """Relative error of a family's size from which on the usual one is not made smaller: a response
 sees kicks by the orbit in the sextupoles alone, of which it is not linear."""
@@ -58,7 +58,7 @@ def knowledge_file(lattice: Path) -> Path:
     return Path(f"{lattice}{SUFFIX}")
 
 
-def known_of(diagnosis: Diagnosis) -> Known | None:
+def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
     """What a diagnosis knows beside the ring as found; None: nothing of small errors.
 
     The small errors with their covariance. Of an orbit response they are linear about its dense
@@ -69,11 +69,16 @@ def known_of(diagnosis: Diagnosis) -> Known | None:
     view = diagnosis.view
     if isinstance(view, JointView):
         found, causes = view.explanation, diagnosis.causes
-        if not isinstance(found.problem, Among):
+        if not isinstance(found.problem, DistributedProblem):
             return None
         known = found.problem.learnt(found.fit if causes else found.before)
         beside = tuple(c for c in diagnosis.faults if not _in_ring(c))
         return replace(known, causes=(*known.causes, *beside))
+    if diagnosis.stored:
+        raise MeasurementError(
+            "diagnosis.json does not hold the covariance of the errors: take the files of "
+            "--lattice-out, or a pickle of the diagnosis"
+        )
     if not isinstance(view, ResponseView) or not diagnosis.steps or diagnosis.since_reference:
         return None  # of a change the small errors are the reference's
     usual = background_rms({"all": None})
@@ -91,7 +96,7 @@ def _together(
     view: ResponseView,
     usual: Mapping[str, float],
     everywhere: Sequence[Hypothesis],
-) -> Known:
+) -> DistributedErrors:
     """All small errors that the readings of a response allow, about its dense fit."""
     ring = diagnosis.ring
     data = response_data(ring, view.measured)
@@ -115,12 +120,14 @@ def _together(
         fixed=tuple(c for c in diagnosis.causes if (c.effect, c.element) not in fitted),
     )
     start = np.array([fitted.get(h, 0.0) for h in everywhere])
-    first = posterior(problem, Known.usual(everywhere, usual), about=start)
+    first = posterior(problem, DistributedErrors.usual(everywhere, usual), linearised_at=start)
     sizes = {
         name: size if first.errors[name] < HARDLY else max(size, usual[name])
         for name, size in first.sizes.items()
     }
-    known = posterior(problem, Known.usual(everywhere, sizes), learn=False, about=start).known
+    known = posterior(
+        problem, DistributedErrors.usual(everywhere, sizes), learn=False, linearised_at=start
+    ).known
     inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the ring as found has them
     return replace(
         known,
@@ -131,13 +138,13 @@ def _together(
 
 def _each_alone(
     diagnosis: Diagnosis, usual: Mapping[str, float], everywhere: Sequence[Hypothesis]
-) -> Known:
+) -> DistributedErrors:
     """Each error of a dense fit with its own standard deviation."""
     own = {(c.effect, c.element): s
            for c, s in zip(diagnosis.causes, diagnosis.errors, strict=True)}  # fmt: skip
     rms = [own[h] if own.get(h, 0.0) > 0 else usual[h[0]] for h in everywhere]
     count = len(everywhere)
-    return Known(
+    return DistributedErrors(
         tuple(everywhere), np.zeros(count), np.array(rms), np.zeros((0, count)), np.zeros(0),
         tuple(c for c in diagnosis.causes if _held_by_ring(c)),
     )  # fmt: skip
@@ -155,7 +162,7 @@ def _in_ring(cause: Cause) -> bool:
     return isinstance(effect, RingEffect) and not effect.calibrates
 
 
-def known_document(known: Known, lattice: Path) -> dict[str, Any]:
+def known_document(known: DistributedErrors, lattice: Path) -> dict[str, Any]:
     """As it stands in a file, beside the lattice file that it belongs to."""
     from tmlattice import __version__
 
@@ -181,7 +188,7 @@ def known_document(known: Known, lattice: Path) -> dict[str, Any]:
     }
 
 
-def read_known(path: Path, ring: Ring) -> Known:
+def read_known(path: Path, ring: Ring) -> DistributedErrors:
     """What stands beside a lattice file.
 
     Raises:
@@ -210,7 +217,7 @@ def read_known(path: Path, ring: Ring) -> Known:
                 f"{path}: '{ring.name}' has no place '{row['element']}' of {name}; it is of "
                 "another ring"
             )
-    return Known(
+    return DistributedErrors(
         tuple((row["effect"], row["element"]) for row in rows),
         np.array([row["amount"] for row in rows], dtype=float),
         np.array([row["rms"] for row in rows], dtype=float),

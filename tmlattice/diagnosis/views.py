@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.numbers import NumberRead
-from tmlattice.inference.judge import Misfit
 from tmlattice.inference.search import Explanation
+from tmlattice.inference.validation import Misfit
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
@@ -91,6 +91,23 @@ class PartView:
             "after": dict(vars(self.after)),
             **({"numbers": [n.as_json() for n in self.numbers]} if self.numbers else {}),
         }
+
+
+@dataclass(frozen=True, eq=False)
+class StoredView:
+    """What the file of a diagnosis keeps of its measurement.
+
+    Attributes:
+        kind: of the measurement, see `Diagnosis.kind`.
+        parts: the measurements, without their monitors' residuals.
+        measured: quantities of the stored beam that were measured.
+        correctors: how many of an orbit response were held out; None: no response.
+    """
+
+    kind: str
+    parts: tuple[PartView, ...]
+    measured: tuple[str, ...]
+    correctors: int | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The catalogue: every imperfection that the project knows, in one registry.
+"""The catalogue of imperfections, in one registry.
 
 >>> CATALOGUE["quadrupole_gradient"].places(ring)            # where it can sit
 >>> weaker = apply(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)])
@@ -6,7 +6,7 @@
 >>> weights, launches = beams(launches, [Cause("energy_offset", None, 1e-3)])
 """
 
-# Each registers its effects, in the order of the catalogue.
+# Each module registers its effects, in the order of the catalogue.
 # isort: off
 from tmlattice.effects import quadrupoles as quadrupoles
 from tmlattice.effects import bends as bends
@@ -41,9 +41,9 @@ from tmlattice.effects.effect import (
     names,
     register,
 )
+from tmlattice.effects.priors import background_rms, rare
 from tmlattice.effects.radiation import expected_loss, expected_radiation, expected_spread
 from tmlattice.effects.reading import Monitors
-from tmlattice.effects.sizes import background_rms, rare
 
 __all__ = [
     "CATALOGUE",

@@ -1,4 +1,4 @@
-"""Causes put into a ring: a new ring, the given one unchanged."""
+"""Causes applied to a ring: a new ring, the given one unchanged."""
 
 from collections.abc import Iterable, Mapping
 
@@ -16,11 +16,11 @@ Settings = Mapping[str, Mapping[str, float]]
 
 
 def check(ring: Ring, causes: Iterable[Cause]) -> None:
-    """Raise for the first cause that the ring cannot have.
+    """Raise for the first cause that is impossible in the ring.
 
     Raises:
         UnknownNameError: an effect or an element that does not exist.
-        EffectError: an element that the effect cannot sit on, or an amount that is no number.
+        EffectError: an element that the effect cannot sit on, or an amount that is not a number.
     """
     for cause in causes:
         find(cause.effect).check(ring, cause)
@@ -29,7 +29,7 @@ def check(ring: Ring, causes: Iterable[Cause]) -> None:
 def changed_elements(
     ring: Ring, causes: Iterable[Cause], settings: Settings | None = None
 ) -> dict[int, Element]:
-    """The elements that settings and causes change, by their place in `ring.elements`.
+    """Return the elements that settings and causes change, by their index in `ring.elements`.
 
     Settings come first: a corrector's calibration error acts on the kick that was set. Effects on
     readings and on the launch change no element.
@@ -45,11 +45,11 @@ def changed_elements(
 
 
 def apply(ring: Ring, causes: Iterable[Cause], settings: Settings | None = None) -> Ring:
-    """A ring with the settings of a shot and with these causes in it.
+    """Return a ring with the settings of a shot and with causes.
 
     Args:
-        ring: stays as it is.
-        causes: those that act on readings or on the launch are checked, and change nothing.
+        ring: is not changed.
+        causes: those on readings or on the launch are checked, and change nothing.
         settings: by element name: kick= (rad, the total of a corrector), k1_relative=,
             k2_relative=; frequency_relative= under the name rf changes no element.
 
@@ -63,7 +63,7 @@ def apply(ring: Ring, causes: Iterable[Cause], settings: Settings | None = None)
 
 
 def set_elements(ring: Ring, settings: Settings) -> dict[int, Element]:
-    """The elements that deliberate settings change, by their place in `ring.elements`.
+    """Return the elements that settings change, by their index in `ring.elements`.
 
     Raises:
         UnknownNameError: no such element.
@@ -96,7 +96,7 @@ def _set(element: Element, attribute: str, amount: float) -> Element:
 
 
 def monitors_with(ring: Ring, causes: Iterable[Cause]) -> Monitors:
-    """The ring's monitors with those of the causes that act on readings."""
+    """Return the ring's monitors with causes that act on readings."""
     at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
     monitors = Monitors.perfect(len(at))
     for cause in causes:
@@ -107,11 +107,11 @@ def monitors_with(ring: Ring, causes: Iterable[Cause]) -> Monitors:
 
 
 def beams(launches: Array, causes: Iterable[Cause]) -> tuple[Array, Array]:
-    """Launches [shot, 6] with those of the causes that act on the beam.
+    """Return launches [shot, 6] with causes that act on the beam.
 
     Returns:
-        Weights [node] and launches [node, shot, 6]: the weighted mean of their readings is what a
-        monitor reads. One node of weight 1 where no cause spreads the beam.
+        Weights [node] and launches [node, shot, 6]: a monitor reads the weighted mean of their
+        positions. One node of weight 1 without an energy spread.
     """
     weights, nodes = np.ones(1), np.asarray(launches, dtype=float)[None]
     for cause in causes:

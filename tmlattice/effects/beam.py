@@ -1,4 +1,4 @@
-"""What the beam brings along."""
+"""Errors of the beam."""
 
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
@@ -9,14 +9,13 @@ from tmlattice.effects.effect import LaunchEffect, register
 Array = NDArray[np.float64]
 
 NODES = 5
-"""Energies that stand for a Gaussian spread: exact for readings to the ninth power of delta."""
+"""Energies of a Gaussian spread: exact for readings to the ninth power of delta."""
 
 
 @register
 class EnergyOffset(LaunchEffect):
-    """The beam has another energy than the ring's magnets are set for: all shots arrive with it; in
-    an orbit response a stored beam has it, where the frequency of the RF does not fit to the way
-    around the ring."""
+    """The beam's energy differs from that of the magnets' settings. All shots arrive with it; in an
+    orbit response a stored beam has it, if the RF frequency does not match the circumference."""
 
     name = "energy_offset"
     words = "energy deviation of the beam"
@@ -31,12 +30,12 @@ class EnergyOffset(LaunchEffect):
     recommended_action = "match the energy of the beam to the ring"
     to_check = (
         "Compare the injector's energy, or of a stored beam the frequency of the RF, with the "
-        "field of the ring's bends, which all may be off by as much the other way."
+        "field of the ring's bends, which may all have the opposite error."
     )
     largest = 5e-3
 
     def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
-        """The launches at the other energy."""
+        """Return the launches at the other energy."""
         moved = launches.copy()
         moved[..., 5] += amount
         return np.ones(1), moved[None]
@@ -48,20 +47,20 @@ class EnergySpread(LaunchEffect):
 
     name = "energy_spread"
     responds = True
-    calibrates = True  # of readings, with everything else that predicts them
+    calibrates = True  # changes all readings
     words = "energy spread of the beam"
     energy = True
     one_sign = True
     unit = "relative"
     sign = "rms of the particles' relative energy deviation"
     quantity = "energy spread"
-    recommended_action = "reduce the energy spread of the beam, or take it into the model"
-    to_check = "Measure the injector's energy spread; look at its RF phases."
+    recommended_action = "reduce the energy spread of the beam, or include it in the model"
+    to_check = "Measure the injector's energy spread; check its RF phases."
     largest = 3e-3
     power = 2
 
     def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
-        """The nodes and weights of Gauss and Hermite."""
+        """Return weights and nodes of Gauss-Hermite quadrature."""
         nodes, weights = hermegauss(NODES)
         moved = np.repeat(launches[None], NODES, axis=0)
         moved[..., 5] += amount * nodes[:, None]

@@ -1,4 +1,4 @@
-"""What goes wrong with bends: the design geometry stays, the field differs from it.
+"""Errors of bends: the design geometry stays, the field differs.
 
 OCELOT's `tilt` and `angle` change the geometry, so neither is an error: a bend's errors are kicks
 spread over its body.
@@ -15,13 +15,13 @@ class _OnBend(RingEffect):
     sits_on_text = "bends"
 
     def sits_on(self, element: Element) -> bool:
-        """Bends with an angle."""
+        """Whether an element is a bend with an angle."""
         return element.kind == "bend" and element.angle != 0
 
 
 @register
 class DipoleField(_OnBend):
-    """A bend's field is off."""
+    """A wrong field of a bend."""
 
     name = "dipole_field"
     words = "wrong field of a bending magnet"
@@ -36,15 +36,15 @@ class DipoleField(_OnBend):
     largest = 5e-3
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """A horizontal kick."""
+        """Return the element with a horizontal kick."""
         return element.with_errors(kick_x=-element.angle * amount)
 
     def build(self, it: Build, amount: float) -> None:
-        """Another field."""
+        """Change the field."""
         it.scale *= 1 + amount
 
-    def undone(self, element: Element, amount: float) -> Element | None:
-        """The opposite kick: the design's geometry stays."""
+    def compensated(self, element: Element, amount: float) -> Element | None:
+        """Return the element with the opposite kick: the design's geometry stays."""
         return self.changed(element, -amount, 0.0)
 
 
@@ -63,19 +63,19 @@ class DipoleRoll(_OnBend):
     largest = 5e-3
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """A vertical kick, and a second-order horizontal one."""
+        """Return the element with a vertical kick, and a second-order horizontal one."""
         return element.with_errors(
             kick_x=amount**2 * element.angle / 2, kick_y=-amount * element.angle
         )
 
     def build(self, it: Build, amount: float) -> None:
-        """A turned magnet."""
+        """Turn the magnet."""
         it.roll += amount
 
 
 @register
 class BendGradient(_OnBend):
-    """A bend's gradient is not the model's: of combined-function magnets it is a strength."""
+    """A wrong gradient of a bend, the strength of a combined-function magnet."""
 
     name = "bend_gradient"
     responds = True
@@ -86,20 +86,20 @@ class BendGradient(_OnBend):
     quantity = "additional gradient"
     recommended_action = "correct the gradient of {}"
     to_check = (
-        "Compare its gradient and its edges in the lattice file with what was measured; look for a "
-        "beam that passes beside its axis."
+        "Compare its gradient and its edges in the lattice file with what was measured; check "
+        "whether the beam passes off its axis."
     )
     largest = 0.1
-    usual = False  # in responses, where a family of it is fitted, or where somebody names it
+    usual = False  # in responses, if a family of it is fitted, or on request
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """Another gradient."""
+        """Return the element with another gradient."""
         return element.changed(k1=element.k1 + amount)
 
     def build(self, it: Build, amount: float) -> None:
-        """Another gradient."""
+        """Change the gradient."""
         it.k1 += amount
 
-    def undone(self, element: Element, amount: float) -> Element | None:
-        """As much less."""
+    def compensated(self, element: Element, amount: float) -> Element | None:
+        """Return the element with the opposite change of its gradient."""
         return self.changed(element, -amount, 0.0)

@@ -1,7 +1,7 @@
-"""What is wrong with one element, for an engine that builds its elements by itself.
+"""Errors of one element, for an engine that builds its elements by itself.
 
-It says which physical thing changes; what the beam feels of it is the engine's own affair, so that
-no formula of the model's maps comes along.
+They state physical quantities; their effect on the beam is the engine's, so that no formula of the
+model's maps is shared.
 """
 
 from collections import defaultdict
@@ -14,7 +14,7 @@ Where = Literal["entrance", "middle"]
 
 @dataclass
 class Build:
-    """How the element to be built differs from the design.
+    """Differences of the element from the design.
 
     Attributes:
         scale: of its strength: a quadrupole's or sextupole's, a bend's field, a corrector's kick.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cause:
-    """What makes a machine differ from its model.
+    """A difference between a machine and its model.
 
     Attributes:
         effect: a name in the catalogue.

@@ -1,4 +1,4 @@
-"""What goes wrong with correctors: their design kick is zero, their setting is each shot's own."""
+"""Errors of correctors: their design kick is zero, their setting is each shot's."""
 
 import math
 from typing import ClassVar
@@ -12,7 +12,7 @@ class _OnCorrector(RingEffect):
     sits_on_text = "correctors"
 
     def sits_on(self, element: Element) -> bool:
-        """Horizontal and vertical correctors."""
+        """Whether an element is a corrector."""
         return element.kind in ("hcorrector", "vcorrector")
 
 
@@ -20,15 +20,15 @@ class _Kick(_OnCorrector):
     headline = True
     unit = "rad"
     largest = 2e-4
-    recommended_action = "take the kick of {} away"
+    recommended_action = "remove the kick of {}"
     to_check = (
         "Read back its current at setting zero: an offset of the supply, a setting that was not "
-        "recorded, a stray field beside it, or a neighbour that bends wrongly."
+        "recorded, a stray field near it, or a neighbour with a wrong field."
     )
     own: ClassVar[Kind]
 
-    def undone(self, element: Element, amount: float) -> Element | None:
-        """The opposite setting, where it is its own plane and the corrector is upright."""
+    def compensated(self, element: Element, amount: float) -> Element | None:
+        """Return the opposite setting, if the kick is in the plane of an upright corrector."""
         plane = 0.0 if self.own == "hcorrector" else math.pi / 2  # OCELOT tilts a vertical one
         if element.kind != self.own or abs(element.tilt + element.errors.roll - plane) > 1e-9:
             return None
@@ -37,7 +37,7 @@ class _Kick(_OnCorrector):
 
 @register
 class CorrectorKickX(_Kick, ErrorEffect):
-    """A horizontal kick that nobody set."""
+    """A horizontal kick beyond the setting."""
 
     name = "corrector_kick_x"
     words = "corrector that kicks horizontally beyond its setting"
@@ -49,7 +49,7 @@ class CorrectorKickX(_Kick, ErrorEffect):
 
 @register
 class CorrectorKickY(_Kick, ErrorEffect):
-    """A vertical kick that nobody set."""
+    """A vertical kick beyond the setting."""
 
     name = "corrector_kick_y"
     words = "corrector that kicks vertically beyond its setting"
@@ -61,7 +61,7 @@ class CorrectorKickY(_Kick, ErrorEffect):
 
 @register
 class CorrectorCalibration(_OnCorrector, StrengthEffect):
-    """A corrector kicks more or less than it is told to."""
+    """A wrong ratio of a corrector's kick to its setting."""
 
     name = "corrector_calibration"
     responds = True
@@ -74,8 +74,8 @@ class CorrectorCalibration(_OnCorrector, StrengthEffect):
     quantity = "calibration"
     recommended_action = "calibrate {}"
     to_check = (
-        "Step its setting and read back its current; near -200 % its cables are exchanged, near "
-        "-100 % it is off, or kicks in the other plane where that was not read."
+        "Step its setting and read back its current; near -200 % its polarity is reversed, near "
+        "-100 % it is off, or kicks in the other plane if that was not read."
     )
     background = 0.04
     largest = 2.0
@@ -95,14 +95,14 @@ class CorrectorRoll(_OnCorrector, ErrorEffect):
     sign = "positive turns the kick from x towards y"
     quantity = "roll"
     recommended_action = "turn {} upright"
-    to_check = "Measure its roll; look whether its two planes' cables are mixed up."
+    to_check = "Measure its roll; check whether the cables of its two planes are swapped."
     background = 1e-2
     largest = 0.1
 
 
 @register
 class CorrectorPosition(_OnCorrector, ErrorEffect):
-    """The field of a corrector is not where the lattice has it: iron beside it draws it away."""
+    """A misplaced corrector: its field is not at the position in the lattice."""
 
     name = "corrector_position"
     responds = True
@@ -112,7 +112,7 @@ class CorrectorPosition(_OnCorrector, ErrorEffect):
     unit = "m"
     sign = "positive is further down: the kick comes so much later"
     quantity = "place along the beam"
-    recommended_action = "enter the place of the field of {} into the lattice"
-    to_check = "Measure where it stands; iron beside it draws its field away."
+    recommended_action = "correct the position of the field of {} in the lattice"
+    to_check = "Measure its position; nearby iron displaces its field."
     largest = 0.1
-    usual = False  # in responses, where a family of it is fitted, or where somebody names it
+    usual = False  # in responses, if a family of it is fitted, or on request

@@ -1,12 +1,12 @@
-"""How a network's weights move when an effect grows: each effect as a direction in weight space.
+"""Directions of effects in the space of a network's weights.
 
-An effect of the ring changes the map of the layer that its element lies in. The derivative of that
-layer's weights by the amount, evaluated at the state at the layer's entrance, is the effect's kick
-on the trajectory at the layer's exit. Where the element is no magnet (a marker), monitors may read
-between it and the exit: then their read-outs move too.
+An effect of the ring changes the map of its element's layer. The derivative of that layer's weights
+by the amount, evaluated at the state at the layer's entrance, is the effect's kick on the
+trajectory at the layer's exit. If the element is no magnet (a marker), monitors may read between it
+and the exit: then their read-outs change too.
 
-The derivatives are central differences of the layers' own maps; every map that OCELOT was asked
-for is kept by `LayerMaps`, so that equal magnets cost one.
+The derivatives are central differences of the layers' own maps. `LayerMaps` caches every map of
+OCELOT, so that equal magnets cost one.
 """
 
 import io
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STEP = 1e-3
-"""Of the largest fault, for differences: their error is STEP^2 of an effect's nonlinearity."""
+"""Step of differences over the largest fault: their error is STEP^2 of an effect's nonlinearity."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Directions:
     E2: Array
 
     def replaced(self, which: Sequence[int], fresh: "Directions") -> "Directions":
-        """With the rows of `fresh`, whose hypotheses are `which` of these, instead of theirs."""
+        """Return the directions with rows of hypotheses `which` replaced by those of `fresh`."""
         owner = np.array(which, dtype=np.int64)
         keep = ~np.isin(self.owner, owner)
         keep_read = ~np.isin(self.read_owner, owner)
@@ -78,14 +78,14 @@ class Directions:
 
 
 MANY = 100
-"""Hypotheses whose directions are worth keeping for the next call."""
+"""Number of hypotheses from which directions are stored in the cache folder."""
 
 
 def kept_directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) -> Directions:
-    """`directions`, from the user's cache folder where they were worked out before.
+    """Return `directions`, from the user's cache folder if they were computed before.
 
     Args:
-        layers: of a ring as its file has it.
+        layers: of a ring as in its file.
         hypotheses: (effect, place).
     """
     file = layers.ring.memory.get(KEPT)
@@ -124,8 +124,8 @@ def _read(
 def directions_nearby(
     layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]
 ) -> Directions:
-    """`directions`, remembered with the maps; where those were changed from others, only of what
-    sits on changed elements anew."""
+    """Return `directions`, cached with the maps; of changed maps only those of changed elements are
+    computed anew."""
     key = ("directions", tuple(hypotheses))
     if key not in layers.memory:
         if layers.origin is None:
@@ -146,13 +146,13 @@ def directions_nearby(
 def sitting_on(
     before: Ring, after: Ring, hypotheses: Sequence[tuple[str, str | None]], places: Collection[int]
 ) -> list[int]:
-    """Which hypotheses sit on elements that differ, in one of two rings.
+    """Indices of hypotheses on elements that differ, in one of two rings.
 
     Args:
-        before: remembers who sits where.
+        before: caches the places of hypotheses.
         after: the same ring but for some elements.
         hypotheses: (effect, place), effects of the ring only.
-        places: of these elements.
+        places: indices of these elements.
     """
     key = ("sitting on", tuple(hypotheses))
     if key not in before.memory:
@@ -167,17 +167,17 @@ def sitting_on(
         before.memory[key] = (at, families)
     at, families = before.memory[key]
     found = {i for place in places for i in at.get(place, ())}
-    changed = set(places)  # a magnet of a family may have been off, or be off now
+    changed = set(places)  # members of a family may be off in one of the rings
     found |= {i for i, effect, place in families
               if not changed.isdisjoint(effect.members(after, place))}  # fmt: skip
     return sorted(found)
 
 
 def ring_effect(name: str) -> RingEffect:
-    """The effect of this name, which acts on the ring.
+    """Return the effect of this name, which acts on the ring.
 
     Raises:
-        TypeError: it does not.
+        TypeError: it does not act on the ring.
     """
     effect = find(name)
     if not isinstance(effect, RingEffect):
@@ -188,7 +188,7 @@ def ring_effect(name: str) -> RingEffect:
 def directions(
     layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], step: float = STEP
 ) -> Directions:
-    """The directions of effects in the weights of a ring's layers.
+    """Return the directions of effects in the weights of a ring's layers.
 
     Args:
         layers: of the ring, with its settings.
@@ -236,7 +236,7 @@ ARRAYS = ("owner", "layer", "D0", "D1", "D2", "read_owner", "monitor", "E0", "E1
 def _derivative(
     layers: LayerMaps, effect: RingEffect, element: Element, h: float
 ) -> Quadratic | None:
-    """d (map of the element) / d amount; None where the effect does not change it."""
+    """d (map of the element) / d amount; None if the effect does not change it."""
     energy = layers.ring.energy
     plus, minus = (effect.changed(element, a, energy) for a in (h, -h))
     if plus is minus:  # a corrector's calibration without a kick

@@ -1,8 +1,8 @@
-"""What an effect is: its name, unit and sizes, where it can sit, and how it acts.
+"""An effect: its name, unit, size and places, and its action.
 
-There are three kinds, by what they act on: the ring (a magnet has another map), the readings (a
-monitor tells something else than where the beam is), and the launch (the beam starts otherwise).
-To add an effect, write a class of one of them and `register` it: see docs/new_effect.md.
+There are three kinds: on the ring (a magnet has another map), on readings (a monitor reads another
+position), and on the launch (the beam starts differently). To add an effect, write a class of one
+of them and `register` it: see docs/new_effect.md.
 """
 
 from abc import ABC, abstractmethod
@@ -30,46 +30,44 @@ Group = Literal[
 """Effects that a figure draws in one colour."""
 
 
-LEAST_LEFT = 0.01
-"""Share of a strength below which nothing is left of it."""
+MIN_STRENGTH = 0.01
+"""Smallest remaining share of a strength."""
 
 
 class Effect(ABC):
-    """One imperfection that the project knows.
+    """One imperfection.
 
     Attributes:
         name: in commands, reports and files.
-        words: what it is, in the words of a control room: "wrong strength of a quadrupole".
-        group: of what it is drawn with.
+        words: description in a control room's terms: "wrong strength of a quadrupole".
+        group: effects drawn in one colour.
         unit: of the amount; "relative" and "discrete" have none.
         sign: what a positive amount does.
-        background: rms of the amount on a machine in good order, or None where such a machine
-            does not have it.
-        largest: the largest amount of a fault, by modulus.
-        sits_on_text: the elements it can sit on, for people.
+        background: rms of the amount on a healthy machine; None: absent there.
+        largest: largest modulus of a fault's amount.
+        sits_on_text: possible elements, in words.
         power: readings change as amount ** power to leading order.
-        discrete: it is there or not; the amount says in which form.
-        forms: what the amounts of a discrete effect stand for, where there are several.
-        curved: the square of an amount within the largest fault acts as much as the amount: what
-            is linear about none of it misleads.
+        discrete: present or not; the amount states the form.
+        forms: names of a discrete effect's amounts, if there are several.
+        curved: within the largest fault the square of the amount acts as much as the amount, so
+            that a linearisation at zero misleads.
         one_sign: a fault's amount is positive.
         energy: it needs six coordinates.
-        modelled: an amount can be fitted; else it is named from the data alone.
-        acts_on_settings: it changes what an element makes of its setting: nothing without one.
-        calibrates: a file of calibrations may hold it.
-        headline: a short report states how little of it would be seen.
-        usual: looked for, and drawn by the challenge, where nobody says which effects to take.
-        of_turns: seen in turns of a stored beam alone, and looked for there.
-        whole: its amounts on a machine are whole numbers; a fit finds what is near to one.
-        responds: a closed orbit's response to a corrector sees it alone, to first order.
+        modelled: an amount can be fitted; else it is identified from the data alone.
+        acts_on_settings: it scales a setting, and has no effect without one.
+        calibrates: allowed in a calibration file.
+        headline: a short report states the smallest visible amount.
+        usual: searched for, and drawn by the challenge, by default.
+        of_turns: visible in turns of a stored beam alone.
+        whole: its amounts are whole numbers; a fit starts from each.
+        responds: visible to first order in a closed orbit's response to one corrector.
         multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
-        quantity: what the amount is of, as a action says it ("integrated gradient"); else `words`.
-        recommended_action: what takes it away, of the element's name in {}: "turn {} upright".
-        to_check: what to look at on the machine, one sentence.
-        natural: no fault: known physics that the model leaves out, and nothing is to be repaired.
-        odds: how often it is the fault where it stands for itself (see `stands_for`), beside an
-            ordinary kind of fault: a field that no magnet there makes is rarer than a magnet whose
-            own field is wrong.
+        quantity: what the amount is of, in a report ("integrated gradient"); else `words`.
+        recommended_action: recommended action, with the element's name for {}: "turn {} upright".
+        to_check: what to check on the machine, one sentence.
+        natural: no fault but physics that the model lacks; nothing is to be repaired.
+        odds: prior odds against an ordinary fault, if it is corrected as itself (`corrected_as`):
+            a field that no magnet there makes is rarer than a wrong field of a magnet.
     """
 
     name: ClassVar[str]
@@ -96,58 +94,58 @@ class Effect(ABC):
     responds: ClassVar[bool] = False
     multiplies: ClassVar[bool] = False
     quantity: ClassVar[str] = ""
-    recommended_action: ClassVar[str] = "find out what acts at {}"
-    to_check: ClassVar[str] = "Look at what stands there, and at what its record says."
+    recommended_action: ClassVar[str] = "find the source of the error at {}"
+    to_check: ClassVar[str] = "Check the equipment there, and its records."
     natural: ClassVar[bool] = False
     odds: ClassVar[float] = 1.0
 
     @property
     def label(self) -> str:
-        """Its name where there is little room."""
+        """Short name."""
         return self.name.replace("_", " ")
 
     @abstractmethod
     def places(self, ring: Ring) -> list[str | None]:
-        """The elements, or families, that it can sit on, in beam order; [None] for the beam."""
+        """Return the elements or families of the effect in beam order; [None] for the beam."""
 
-    def stands_for(self, element: Element) -> tuple[str, float]:
-        """The effect whose action takes this one away too, and its amount for 1 of this one.
+    def corrected_as(self, element: Element) -> tuple[str, float]:
+        """Return the effect whose recommended action also corrects this one, and its amount for 1.
 
-        At one element two effects share a action where the same adjustment of the element takes
-        both away, to first order in the beam's place: a thin gradient in a quadrupole is undone by
-        the quadrupole's own gradient. Most stand for themselves.
+        At one element two effects share an action if the same adjustment corrects both, to first
+        order in the beam's position: a quadrupole's own gradient corrects a thin gradient in it.
+        Most effects are corrected as themselves.
         """
         return self.name, 1.0
 
     def chain(self, amount: float) -> float:
-        """d readings / d amount of what is there, over a signature, which is of more on top of it.
+        """Return d readings / d amount over the signature, which is of a further amount.
 
-        It is one over what is left of a strength, see `some_left`.
+        It is one over the remaining share of a strength, see `floored`.
         """
         if not self.multiplies:
             return float(self.power * amount ** (self.power - 1))
-        return float(1 / (1 + self.some_left(amount)))
+        return float(1 / (1 + self.floored(amount)))
 
     def joined(self, one: float, other: float) -> float:
-        """The amount that does what two of them do."""
+        """Return the amount equivalent to two amounts together."""
         return (1 + one) * (1 + other) - 1 if self.multiplies else one + other
 
-    def some_left(self, amount: float) -> float:
-        """The amount; of a strength that would be gone, `LEAST_LEFT` is kept.
+    def floored(self, amount: float) -> float:
+        """Return the amount, of a strength with at least `MIN_STRENGTH` remaining.
 
-        Two amounts of it act as (1 + a)(1 + b): at a = -1 more of the effect has nothing to act on.
+        Two amounts of it act as (1 + a)(1 + b): at a = -1 a further amount has no effect.
         """
         left = 1 + amount
-        if not self.multiplies or abs(left) >= LEAST_LEFT:
+        if not self.multiplies or abs(left) >= MIN_STRENGTH:
             return amount
-        return float(np.copysign(LEAST_LEFT, left) - 1)
+        return float(np.copysign(MIN_STRENGTH, left) - 1)
 
     def check(self, ring: Ring, cause: Cause) -> None:
-        """Raise where a cause of this effect is impossible in the ring.
+        """Raise if a cause of this effect is impossible in the ring.
 
         Raises:
             UnknownNameError: no such element.
-            EffectError: an element that cannot have it, a missing name, an amount not finite.
+            EffectError: an unsuitable element, a missing name, an amount that is not finite.
         """
         if not np.isfinite(cause.amount):
             raise EffectError(f"{self.name}: the amount is {cause.amount}; give a number")
@@ -177,11 +175,11 @@ class Effect(ABC):
             )
 
     def _named(self, ring: Ring) -> list[str | None]:
-        """All names by which somebody may call its places."""
+        """All names of its places, also those of several families."""
         return self.places(ring)
 
     def _allowed(self, ring: Ring) -> frozenset[str | None]:
-        """Its places without regard to case: found once a ring, for thousands of small errors."""
+        """Its places in any case, cached with the ring: there are thousands of errors."""
         key = ("places", self.name)
         if key not in ring.memory:
             ring.memory[key] = frozenset(p and p.casefold() for p in self._named(ring))
@@ -197,26 +195,26 @@ class RingEffect(Effect):
         raise NotImplementedError
 
     def places(self, ring: Ring) -> list[str | None]:
-        """Names of the elements that can have it, in beam order."""
+        """Return the names of possible elements in beam order."""
         return [element.name for element in ring.elements if self.sits_on(element)]
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
-        """The places in `ring.elements` that a cause at `place` changes."""
+        """Indices in `ring.elements` that a cause at `place` changes."""
         assert place is not None
         return [ring.index(place)]
 
     @abstractmethod
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """The element with this much of it more, as the model sees it; energy in GeV."""
+        """Return the element with a further amount, as the model sees it; energy in GeV."""
 
     @abstractmethod
     def build(self, it: Build, amount: float) -> None:
-        """Put it, all causes at the element added up, into what another engine is to build."""
+        """Add the sum of all causes at the element to what another engine builds."""
 
-    def undone(self, element: Element, amount: float) -> Element | None:
-        """The element set so that with this much of the effect it acts as designed.
+    def compensated(self, element: Element, amount: float) -> Element | None:
+        """Return the element with a setting that compensates this amount.
 
-        None where no setting of its own does that: somebody has to move, turn or mend it.
+        None if no setting of its own does: it must be moved, turned or repaired.
         """
         return None
 
@@ -232,11 +230,11 @@ class ErrorEffect(RingEffect):
     error: ClassVar[str]
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """The element with this much more of the error."""
+        """Return the element with a further amount of the error."""
         return element.with_errors(**{self.error: amount})
 
     def build(self, it: Build, amount: float) -> None:
-        """Add to what an engine calls the same."""
+        """Add to the engine's error of the same name."""
         setattr(it, self.error, getattr(it, self.error) + amount)
 
 
@@ -253,16 +251,16 @@ class ThinKickEffect(RingEffect):
     where: ClassVar[Where] = "middle"
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """The element with this much more of the kick."""
+        """Return the element with a further amount of the kick."""
         return element.with_errors(**{self.where: tuple(amount * slope for slope in self.slopes)})
 
     def build(self, it: Build, amount: float) -> None:
-        """The kick as a matrix."""
+        """Add the kick as a matrix."""
         it.add_slopes(self.where, *(amount * slope for slope in self.slopes))
 
 
 class StrengthEffect(RingEffect):
-    """An effect that scales what an element is set to.
+    """An effect that scales a setting of an element.
 
     Attributes:
         strength: k1, k2, or the angle that a corrector is set to.
@@ -272,40 +270,40 @@ class StrengthEffect(RingEffect):
     strength: ClassVar[str]
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
-        """The strength times 1 + amount; the same element where it has none."""
+        """Return the element with its strength times 1 + amount; the same one without strength."""
         strength = getattr(element, self.strength)
         if strength == 0:
             return element
         return element.changed(**{self.strength: strength * (1 + amount)})
 
     def build(self, it: Build, amount: float) -> None:
-        """Scale the whole."""
+        """Scale the strength."""
         it.scale *= 1 + amount
 
-    def undone(self, element: Element, amount: float) -> Element | None:
-        """The strength over 1 + amount; None where that is almost no field at all."""
-        if abs(1 + amount) < LEAST_FIELD:
+    def compensated(self, element: Element, amount: float) -> Element | None:
+        """Return the element with strength / (1 + amount); None if hardly any field is left."""
+        if abs(1 + amount) < MIN_FIELD:
             return None
         return self.changed(element, 1 / (1 + amount) - 1, 0.0)
 
 
 class FamilyEffect(StrengthEffect):
-    """The same error of all magnets of a family: their supply's."""
+    """The same error of all magnets of a family: of their power supply."""
 
     def places(self, ring: Ring) -> list[str | None]:
-        """Families in the order of their first members; where every magnet is a family of its own,
-        what several of their names begin with; and those that nothing but the design has alike."""
+        """Return families in the order of their first members; common prefixes of names where each
+        magnet is a family; and groups of equal design strength."""
         powered = [e for e in ring.elements if self.sits_on(e)]
-        named = _several(e.family for e in powered)
-        return [*(named or _several(stem(e.name) for e in powered)), *self._alike(ring)]
+        named = _repeated(e.family for e in powered)
+        return [*(named or _repeated(stem(e.name) for e in powered)), *self._alike(ring)]
 
     def _named(self, ring: Ring) -> list[str | None]:
-        """And what the names of several families begin with."""
-        begin = _several(stem(e.name) for e in ring.elements if self.sits_on(e))
+        """Add the common prefixes of several families' names."""
+        begin = _repeated(stem(e.name) for e in ring.elements if self.sits_on(e))
         return [*self.places(ring), *begin]
 
     def _alike(self, ring: Ring) -> dict[str, list[int]]:
-        """Supplies that the design tells alone, and who of each can have the effect."""
+        """Groups of equal design strength, and the possible members of each."""
         there = {
             name: [i for i in map(ring.index, own) if self.sits_on(ring.elements[i])]
             for name, own in ring.supplies.items()
@@ -313,8 +311,8 @@ class FamilyEffect(StrengthEffect):
         return {name: own for name, own in there.items() if own}
 
     def members(self, ring: Ring, place: str | None) -> list[int]:
-        """All magnets of the family; or, where none is called so, those whose names begin so, up
-        to an underscore, a dot or a number of their own; or those that the design has alike."""
+        """Indices of all magnets of the family; or of those whose names begin with it, up to an
+        underscore, a dot or a number; or of those with equal design strength."""
         name = (place or "").casefold()
         for alike, own in self._alike(ring).items():
             if name == alike.casefold():
@@ -324,32 +322,32 @@ class FamilyEffect(StrengthEffect):
         return family or [i for i in powered if stem(ring.elements[i].name) == name]
 
 
-def _several(names: Iterable[str]) -> list[str]:
-    """Those that stand more than once, in their order."""
+def _repeated(names: Iterable[str]) -> list[str]:
+    """Names that occur more than once, in their order."""
     return [name for name, count in Counter(names).items() if count > 1]
 
 
-LEAST_FIELD = 0.1
-"""Share of its field below which a magnet is broken: no setting makes ten times as much of it."""
+MIN_FIELD = 0.1
+"""Share of its field below which a magnet is broken: no setting compensates a factor of ten."""
 
 
 class ReadingEffect(Effect):
-    """An effect on what one monitor tells."""
+    """An effect on one monitor's readings."""
 
     sits_on_text: ClassVar[str] = "monitors"
     group: ClassVar[Group] = "monitors"
 
     def places(self, ring: Ring) -> list[str | None]:
-        """All monitors."""
+        """Return all monitors."""
         return [monitor.name for monitor in ring.monitors]
 
     @abstractmethod
     def change(self, beam: Array, amount: float) -> Array:
-        """What a monitor with this amount alone reads of the beam [..., 2] (x, y), m, less beam."""
+        """Reading of the beam [..., 2] (x, y), m, with this amount alone, less beam."""
 
     @abstractmethod
     def set(self, monitors: "Monitors", at: int | slice, amount: float) -> None:
-        """Put this much more of it into monitor `at` of `monitors`, or into some, in place."""
+        """Add this amount to one or some of `monitors`, in place."""
 
 
 class LaunchEffect(Effect):
@@ -357,7 +355,7 @@ class LaunchEffect(Effect):
 
     Attributes:
         shifts: the coordinate of (x, px, y, py, tau, p) to which it adds the amount in every shot;
-            None where it moves no centroid.
+            None if it moves no centroid.
     """
 
     sits_on_text: ClassVar[str] = "the beam"
@@ -365,19 +363,19 @@ class LaunchEffect(Effect):
     shifts: ClassVar[int | None] = None
 
     def places(self, ring: Ring) -> list[str | None]:
-        """The beam."""
+        """Return [None], the beam."""
         return [None]
 
     @abstractmethod
     def beams(self, launches: Array, amount: float) -> tuple[Array, Array]:
-        """Launches whose weighted mean reading is the reading: weights [node], [node, shot, 6]."""
+        """Return weights [node] and launches [node, shot, 6] whose weighted mean is the reading."""
 
 
 class Catalogue(dict[str, Effect], Speaks):
-    """Effects by name; a name that is not there is answered with the nearest ones."""
+    """Effects by name; an unknown name is an error with the nearest ones."""
 
     def __missing__(self, name: str) -> Effect:
-        """UnknownNameError: no such effect."""
+        """Raise UnknownNameError: no such effect."""
         raise unknown_name("effect", name, self)
 
     __repr__ = Speaks.__repr__
@@ -394,13 +392,13 @@ CATALOGUE = Catalogue()
 
 
 def register(effect: type[Effect]) -> type[Effect]:
-    """Put an effect into the catalogue (a class decorator)."""
+    """Add an effect to the catalogue (a class decorator)."""
     CATALOGUE[effect.name] = effect()
     return effect
 
 
 def find(name: str) -> Effect:
-    """The effect of this name.
+    """Return the effect of this name.
 
     Raises:
         UnknownNameError: with the nearest names.
@@ -412,7 +410,7 @@ def find(name: str) -> Effect:
 
 
 def names(chosen: Iterable[str] | None = None) -> list[str]:
-    """Names of the chosen effects, checked, in the catalogue's order; all usual ones by default."""
+    """Return the chosen effects' names, checked, in the catalogue's order; default: all usual."""
     if chosen is None:
         return [name for name, effect in CATALOGUE.items() if effect.usual]
     wanted = {find(name).name for name in chosen}
@@ -420,8 +418,8 @@ def names(chosen: Iterable[str] | None = None) -> list[str]:
 
 
 def modelled(chosen: Iterable[str] | None = None, turns: bool = False) -> list[str]:
-    """Those of `names` whose amount can be fitted; with what only turns of a stored beam show where
-    there are such."""
+    """Return those of `names` whose amount can be fitted, and those of turn-by-turn readings if
+    there are any."""
     if chosen is None and turns:
         chosen = [name for name, effect in CATALOGUE.items() if effect.usual or effect.of_turns]
     effects = [CATALOGUE[name] for name in names(chosen)]

@@ -1,4 +1,4 @@
-"""What goes wrong with wigglers and undulators."""
+"""Errors of wigglers and undulators."""
 
 from tmlattice.effects.build import Build
 from tmlattice.effects.effect import ErrorEffect, ThinKickEffect, register
@@ -7,7 +7,7 @@ from tmlattice.lattice import Element
 
 @register
 class InsertionDeviceFocusing(ErrorEffect):
-    """A wiggler, or another element that is given by its matrix, has another focusing."""
+    """A wrong focusing of a wiggler, or of another element given by its matrix."""
 
     name = "insertion_device_focusing"
     words = "unmodelled focusing of an insertion device"
@@ -21,23 +21,23 @@ class InsertionDeviceFocusing(ErrorEffect):
     recommended_action = "correct the focusing of {}"
     to_check = (
         "Read its gap and its end coils; compare the focusing in the lattice file with the one "
-        "measured, and make it good with the quadrupoles beside it."
+        "measured, and compensate the difference with the adjacent quadrupoles."
     )
     largest = 0.03
     sits_on_text = "wigglers, matrix elements"
 
     def build(self, it: Build, amount: float) -> None:
-        """A thin quadrupole."""
+        """Add a thin quadrupole."""
         it.add_gradient("entrance", normal=amount)
 
     def sits_on(self, element: Element) -> bool:
-        """Wigglers, and elements that are a matrix, whatever their name."""
+        """Whether an element is a wiggler, or a matrix of any name."""
         return element.kind in ("wiggler", "matrix")
 
 
 @register
 class VerticalFocusing(ThinKickEffect):
-    """What a planar undulator does, and a dipole's edges: vertical focusing alone."""
+    """Vertical focusing alone, as of a planar undulator or of a dipole's edges."""
 
     name = "vertical_focusing"
     words = "vertical focusing of an insertion device or of a dipole's edges"
@@ -46,18 +46,18 @@ class VerticalFocusing(ThinKickEffect):
     sign = "thin, in the middle: py -= amount y"
     slopes = (0.0, 0.0, 0.0, -1.0)
     quantity = "integrated vertical focusing"
-    recommended_action = "make the vertical focusing at {} good"
+    recommended_action = "correct the vertical focusing at {}"
     to_check = (
-        "Read the gap of the insertion device that stands there, and make its focusing good with "
-        "the quadrupoles beside it; of a dipole, compare edge angles and fringe integrals with the "
-        "lattice file's."
+        "Read the gap of the insertion device there, and compensate its focusing with the adjacent "
+        "quadrupoles; of a dipole, compare edge angles and fringe integrals with the lattice "
+        "file's."
     )
     largest = 0.03
     sits_on_text = "dipoles, wigglers, markers, drifts of half a metre or more"
-    usual = False  # in responses, where a family of it is fitted, or where somebody names it
+    usual = False  # in responses, if a family of it is fitted, or on request
 
     def sits_on(self, element: Element) -> bool:
-        """Where an insertion device is, or may stand; and dipoles."""
+        """Whether an element is or may contain an insertion device, or is a dipole."""
         return element.kind in ("wiggler", "marker", "bend") or (
             element.kind == "drift" and element.length >= 0.5
         )

@@ -1,4 +1,4 @@
-"""What goes wrong with monitors: see `Monitors` for all of it at once."""
+"""Errors of monitors: see `Monitors` for all of them together."""
 
 from typing import ClassVar
 
@@ -15,9 +15,9 @@ class _Offset(ReadingEffect):
     headline = True
     unit = "m"
     sign = "reading minus beam"
-    recommended_action = "correct the zero of {}"
+    recommended_action = "correct the offset of {}"
     to_check = (
-        "Find its zero by steering the beam through the middle of the quadrupole beside it; look "
+        "Find its offset by steering the beam through the centre of the adjacent quadrupole; check "
         "for a lost offset in its electronics."
     )
     background = 2e-4
@@ -25,7 +25,7 @@ class _Offset(ReadingEffect):
     plane: int
 
     def change(self, beam: Array, amount: float) -> Array:
-        """The offset."""
+        """Return the offset."""
         change = np.zeros_like(beam)
         change[..., self.plane] = amount
         return change
@@ -37,7 +37,7 @@ class _Offset(ReadingEffect):
 
 @register
 class MonitorOffsetX(_Offset):
-    """A monitor whose zero is not on the axis, in x."""
+    """A horizontal offset of a monitor."""
 
     name = "monitor_offset_x"
     words = "horizontal offset of a monitor"
@@ -47,7 +47,7 @@ class MonitorOffsetX(_Offset):
 
 @register
 class MonitorOffsetY(_Offset):
-    """A monitor whose zero is not on the axis, in y."""
+    """A vertical offset of a monitor."""
 
     name = "monitor_offset_y"
     words = "vertical offset of a monitor"
@@ -61,8 +61,8 @@ class _Gain(ReadingEffect):
     calibrates = True
     recommended_action = "calibrate {}"
     to_check = (
-        "Look at its attenuators, gains and cables; near -200 % two cables of the plane are "
-        "exchanged, near -100 % a signal is lost."
+        "Check its attenuators, gains and cables; near -200 % two cables of the plane are "
+        "swapped, near -100 % a signal is lost."
     )
     unit = "relative"
     sign = "reading = (1 + amount) beam; -2 is a reversed one"
@@ -71,7 +71,7 @@ class _Gain(ReadingEffect):
     plane: int
 
     def change(self, beam: Array, amount: float) -> Array:
-        """The share that is read too much."""
+        """Return the change by the gain error."""
         change = np.zeros_like(beam)
         change[..., self.plane] = amount * beam[..., self.plane]
         return change
@@ -83,7 +83,7 @@ class _Gain(ReadingEffect):
 
 @register
 class MonitorGainX(_Gain):
-    """A monitor that reads x too large or too small."""
+    """A wrong gain of a monitor in x."""
 
     name = "monitor_gain_x"
     responds = True
@@ -94,7 +94,7 @@ class MonitorGainX(_Gain):
 
 @register
 class MonitorGainY(_Gain):
-    """A monitor that reads y too large or too small."""
+    """A wrong gain of a monitor in y."""
 
     name = "monitor_gain_y"
     responds = True
@@ -112,7 +112,7 @@ class MonitorRoll(ReadingEffect):
     words = "monitor rolled about the beam axis"
     quantity = "roll"
     recommended_action = "turn {} upright, or its readings"
-    to_check = "Measure its roll, and look at how its pick-ups are mounted."
+    to_check = "Measure its roll, and check the mounting of its pick-ups."
     calibrates = True
     unit = "rad"
     sign = "x_read = x cos + y sin, y_read = -x sin + y cos"
@@ -120,7 +120,7 @@ class MonitorRoll(ReadingEffect):
     largest = 0.3
 
     def change(self, beam: Array, amount: float) -> Array:
-        """Coordinates in turned axes, less those in the ring's."""
+        """Return the coordinates in rotated axes, less those in the ring's."""
         cos, sin = np.cos(amount), np.sin(amount)
         return np.asarray(beam @ np.array([[cos - 1, -sin], [sin, cos - 1]]))
 
@@ -146,7 +146,7 @@ class MonitorCoupling(ReadingEffect):
     largest = 0.3
 
     def change(self, beam: Array, amount: float) -> Array:
-        """The other plane's share."""
+        """Return the share of the other plane."""
         return np.asarray(amount * beam[..., ::-1])
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
@@ -156,14 +156,14 @@ class MonitorCoupling(ReadingEffect):
 
 @register
 class MonitorSwap(ReadingEffect):
-    """A monitor whose two planes are exchanged."""
+    """A monitor with swapped planes."""
 
     name = "monitor_swap"
     responds = True
     words = "monitor with its planes exchanged"
     quantity = "planes exchanged"
-    recommended_action = "exchange the cables of {}"
-    to_check = "Follow its cables from the pick-ups to the electronics: x and y are exchanged."
+    recommended_action = "swap the cables of {} back"
+    to_check = "Follow its cables from the pick-ups to the electronics: x and y are swapped."
     calibrates = True
     unit = "discrete"
     sign = "1: x and y are exchanged"
@@ -171,23 +171,23 @@ class MonitorSwap(ReadingEffect):
     discrete = True
 
     def change(self, beam: Array, amount: float) -> Array:
-        """The other plane instead of the own."""
+        """Return the other plane less its own."""
         return np.asarray(amount * (beam[..., ::-1] - beam))
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
-        """Exchange the planes (0 does not)."""
+        """Swap the planes (0 does not)."""
         monitors.swapped[at] ^= amount != 0
 
 
 @register
 class MonitorTurnOffset(ReadingEffect):
-    """A monitor that counts its turns from another one than the others do."""
+    """A monitor with a wrong turn count."""
 
     name = "monitor_turn_offset"
     words = "monitor that counts its turns off"
     quantity = "count of turns"
     recommended_action = "set the turn count of {}"
-    to_check = "Look at its trigger and at the delay of its turn clock."
+    to_check = "Check its trigger and the delay of its turn clock."
     unit = "turns"
     sign = "what it calls turn t is the beam's turn t + amount"
     largest = 3.0
@@ -197,11 +197,11 @@ class MonitorTurnOffset(ReadingEffect):
     whole = True
 
     def change(self, beam: Array, amount: float) -> Array:
-        """Nothing on a turn by itself."""
+        """Return nothing for a single turn."""
         return np.zeros_like(beam)
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
-        """Count later."""
+        """Add to the turn offset."""
         monitors.late[at] += amount
 
 
@@ -213,7 +213,7 @@ class MonitorDead(ReadingEffect):
     words = "dead monitor"
     quantity = "readings"
     recommended_action = "repair {}"
-    to_check = "Look at its cables, power and electronics, and whether its data are refreshed."
+    to_check = "Check its cables, power and electronics, and whether its data are refreshed."
     calibrates = True
     modelled = False
     forms: ClassVar = {1.0: "no signal", 2.0: "frozen readings"}
@@ -223,12 +223,12 @@ class MonitorDead(ReadingEffect):
     discrete = True
 
     def change(self, beam: Array, amount: float) -> Array:
-        """No reading, or the first one of all, [shot, turn, ..., 2]."""
+        """Return no reading, or the first one of all, [shot, turn, ..., 2]."""
         if amount == 1:
             return np.full_like(beam, np.nan)
         first = beam[(0,) * (beam.ndim - 1)] if amount == 2 else beam
         return np.asarray(first - beam)
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
-        """Silence it, or freeze it."""
+        """Silence or freeze the monitor."""
         (monitors.frozen if amount == 2 else monitors.silent)[at] = amount != 0

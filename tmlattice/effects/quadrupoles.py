@@ -1,4 +1,4 @@
-"""What goes wrong with quadrupoles, and with gradients anywhere."""
+"""Errors of quadrupoles, and gradients anywhere."""
 
 from tmlattice.effects.build import Build
 from tmlattice.effects.effect import (
@@ -16,13 +16,13 @@ class _OnQuadrupole(RingEffect):
     sits_on_text = "quadrupoles with k1 not 0"
 
     def sits_on(self, element: Element) -> bool:
-        """Powered quadrupoles."""
+        """Whether an element is a powered quadrupole."""
         return element.kind == "quadrupole" and element.k1 != 0
 
 
 @register
 class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
-    """A quadrupole's strength is not what its setting says."""
+    """A wrong strength of a quadrupole."""
 
     name = "quadrupole_gradient"
     responds = True
@@ -50,40 +50,40 @@ class _Gradient(RingEffect):
     sits_on_text = "quadrupoles, skew quadrupoles, sextupoles, wigglers, markers"
 
     def sits_on(self, element: Element) -> bool:
-        """Magnets that may hide a gradient, and markers."""
+        """Whether an element is a marker, or a magnet that may contain a gradient."""
         return element.kind in ("quadrupole", "sextupole", "wiggler", "marker")
 
 
 @register
 class GradientAbsolute(_Gradient, ErrorEffect):
-    """A gradient where the model has none, or more than it has."""
+    """A gradient beyond the model's."""
 
     name = "gradient_absolute"
     words = "focusing error (quadrupole field) in the middle of an element"
     error = "k1l"
     quantity = "additional integrated gradient"
-    recommended_action = "take the quadrupole field at {} away"
+    recommended_action = "remove the quadrupole field at {}"
     to_check = (
-        "Look for a quadrupole field that the model has not: a shorted turn, a trim winding, iron "
-        "beside the beam, or a neighbour whose gradient is wrong."
+        "Look for a quadrupole field that is not in the model: a shorted turn, a trim winding, "
+        "iron near the beam, or a neighbour with a wrong gradient."
     )
     sign = "integrated k1 L, thin, in the middle: px -= amount x, py += amount y"
 
     def build(self, it: Build, amount: float) -> None:
-        """A thin quadrupole."""
+        """Add a thin quadrupole."""
         it.add_gradient("middle", normal=amount)
 
-    def stands_for(self, element: Element) -> tuple[str, float]:
-        """A powered quadrupole's own gradient, or a wiggler's focusing."""
+    def corrected_as(self, element: Element) -> tuple[str, float]:
+        """Return a powered quadrupole's own gradient, or a wiggler's focusing."""
         if element.kind == "quadrupole" and element.k1 * element.length != 0:
             return QuadrupoleGradient.name, 1 / (element.k1 * element.length)
         if element.kind == "wiggler":
             return "insertion_device_focusing", 1.0
         return self.name, 1.0
 
-    def undone(self, element: Element, amount: float) -> Element | None:
-        """As much less of a powered quadrupole's own gradient."""
-        if self.stands_for(element)[0] != QuadrupoleGradient.name:
+    def compensated(self, element: Element, amount: float) -> Element | None:
+        """Return the element with the opposite change of a powered quadrupole's gradient."""
+        if self.corrected_as(element)[0] != QuadrupoleGradient.name:
             return None
         return element.changed(k1=element.k1 - amount / element.length)
 
@@ -96,19 +96,19 @@ class SkewGradient(_Gradient, ErrorEffect):
     words = "skew quadrupole field in the middle of an element"
     error = "k1sl"
     quantity = "integrated skew gradient"
-    recommended_action = "take the skew quadrupole field at {} away"
+    recommended_action = "remove the skew quadrupole field at {}"
     to_check = (
-        "Look for a skew quadrupole that is powered, a magnet that has turned, or iron that stands "
-        "on one side of the beam."
+        "Look for a powered skew quadrupole, a magnet that has turned, or iron on one side of the "
+        "beam."
     )
     sign = "integrated k1s L, thin, in the middle: px += amount y, py += amount x"
 
     def build(self, it: Build, amount: float) -> None:
-        """A thin skew quadrupole."""
+        """Add a thin skew quadrupole."""
         it.add_gradient("middle", skew=amount)
 
-    def stands_for(self, element: Element) -> tuple[str, float]:
-        """The roll of a powered quadrupole: by theta it has k1s L = -2 theta k1 L."""
+    def corrected_as(self, element: Element) -> tuple[str, float]:
+        """Return the roll of a powered quadrupole: theta has k1s L = -2 theta k1 L."""
         if element.kind == "quadrupole" and element.k1 * element.length != 0:
             return QuadrupoleRoll.name, -1 / (2 * element.k1 * element.length)
         return self.name, 1.0
@@ -128,7 +128,7 @@ class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
     quantity = "roll"
     recommended_action = "turn {} upright"
     to_check = (
-        "Measure its roll with a level or the survey; if it stands upright, look for a skew field: "
+        "Measure its roll with a level or the survey; if it is upright, look for a skew field: "
         "poles powered unevenly."
     )
     background = 2e-4
@@ -137,7 +137,7 @@ class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
 
 @register
 class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
-    """A quadrupole that stands beside its axis."""
+    """A horizontal misalignment of a quadrupole."""
 
     name = "quadrupole_offset_x"
     words = "quadrupole displaced horizontally"
@@ -154,7 +154,7 @@ class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
 
 @register
 class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
-    """A quadrupole that stands above or below its axis."""
+    """A vertical misalignment of a quadrupole."""
 
     name = "quadrupole_offset_y"
     words = "quadrupole displaced vertically"
@@ -171,7 +171,7 @@ class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
 
 @register
 class FamilyGradient(_OnQuadrupole, FamilyEffect):
-    """The power supply of a family of quadrupoles is off: all of them have the same error."""
+    """A wrong current of a quadrupole family's power supply: a common error of its members."""
 
     name = "family_gradient"
     responds = True
@@ -187,6 +187,6 @@ class FamilyGradient(_OnQuadrupole, FamilyEffect):
     )
     largest = 0.05
     sits_on_text = (
-        "families of two or more quadrupoles with k1 not 0, by the family's name, or of what the "
-        "design has alike"
+        "families of two or more quadrupoles with k1 not 0, by the family's name, or groups of "
+        "equal design strength"
     )

@@ -1,4 +1,4 @@
-"""What monitors make of where the beam is."""
+"""Readings of monitors with errors."""
 
 from dataclasses import dataclass, replace
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Monitors:
-    """What each monitor makes of the beam: all errors at once.
+    """Monitors with all their errors.
 
     reading = diag(1 + gain) C Rot(roll) beam + offset, C = [[1, c], [c, 1]], then the swap, then
     noise; Rot: x_read = x cos + y sin, y_read = -x sin + y cos.
@@ -20,7 +20,7 @@ class Monitors:
     Attributes:
         gain, offset: [monitor, 2], relative and m.
         roll, coupling: [monitor], rad and 1.
-        late: how many turns after the beam's turn t comes what it calls turn t, [monitor].
+        late: turns by which the monitor's turn t is later than the beam's turn t, [monitor].
         swapped, silent, frozen: [monitor], true or false.
     """
 
@@ -35,31 +35,31 @@ class Monitors:
 
     @classmethod
     def perfect(cls, count: int) -> "Monitors":
-        """Monitors that read where the beam is."""
+        """Return monitors without errors."""
         plane, flag = np.zeros((count, 2)), np.zeros(count, dtype=bool)
         one = np.zeros(count)
         return cls(plane, plane.copy(), one, one.copy(), one.copy(), flag, flag.copy(), flag.copy())
 
     @classmethod
     def of(cls, matrix: Array) -> "Monitors":
-        """Monitors with d reading / d beam [monitor, 2, 2], none of them swapped: the inverse of
-        `matrix`. One that reads nothing of a plane in that plane has a gain of -1 there."""
+        """Return monitors with d reading / d beam [monitor, 2, 2], none swapped: the inverse of
+        `matrix`. One that reads nothing of a plane has a gain of -1 there."""
         found = cls.perfect(len(matrix))
         own, other = matrix[:, [0, 1], [0, 1]], matrix[:, [0, 1], [1, 0]]
         angle = np.arctan(np.divide(other, own, out=np.zeros_like(own), where=own != 0))
         found.roll = (angle[:, 0] - angle[:, 1]) / 2
         found.coupling = np.tan((angle[:, 0] + angle[:, 1]) / 2)
-        # a row of C Rot(roll) is as long as one of C
+        # rows of C Rot(roll) and of C have the same norm
         longer = np.hypot(1, found.coupling)[:, None]
         found.gain = np.sign(own) * np.hypot(own, other) / longer - 1
         return found
 
     def copy(self) -> "Monitors":
-        """Monitors of their own with the same errors."""
+        """Return a copy with the same errors."""
         return replace(self, **{name: value.copy() for name, value in vars(self).items()})
 
     def matrix(self) -> Array:
-        """diag(1 + gain) C Rot(roll), then the swap: d reading / d beam, [monitor, 2, 2]."""
+        """Return d reading / d beam, diag(1 + gain) C Rot(roll), then the swap, [monitor, 2, 2]."""
         cos, sin, c = np.cos(self.roll), np.sin(self.roll), self.coupling
         turned = np.array([[cos + -c * sin, sin + c * cos], [c * cos - sin, c * sin + cos]])
         matrix = (1 + self.gain)[:, :, None] * np.moveaxis(turned, -1, 0)
@@ -67,24 +67,24 @@ class Monitors:
         return np.asarray(matrix)
 
     def constant(self) -> Array:
-        """What they read without a beam, [monitor, 2], m."""
+        """Return the readings without a beam, [monitor, 2], m."""
         return np.where(self.swapped[:, None], self.offset[:, ::-1], self.offset)
 
     @property
     def ahead(self) -> int:
-        """Turns of the beam, behind those that are asked for, of which some monitor tells."""
+        """Number of later turns of the beam that some monitor reads."""
         return int(max(np.ceil(self.late.max(initial=0.0)), 0))
 
     def counted(self, beam: Array, turns: int, before: Array | float = np.nan) -> Array:
-        """The beam on the turns that each monitor counts, [shot, turn, monitor, 2].
+        """Return the beam on the turns that each monitor counts, [shot, turn, monitor, 2].
 
         Args:
-            beam: on turns from 0 on, `ahead` more than are asked for.
+            beam: on turns from 0 on, `ahead` more than `turns`.
             turns: of each shot.
-            before: where it was before turn 0, of a shape that fits [shot, turn, monitor, 2].
+            before: position before turn 0, broadcastable to [shot, turn, monitor, 2].
 
         Raises:
-            EffectError: a monitor is off by a part of a turn.
+            EffectError: a turn offset is not a whole number.
         """
         if not self.late.any():
             return beam[:, :turns]
@@ -99,9 +99,9 @@ class Monitors:
         return seen
 
     def read(self, beam: Array) -> Array:
-        """Readings without noise of the beam [..., monitor, 2] (x, y), m; NaN where silent.
+        """Return readings without noise of the beam [..., monitor, 2] (x, y), m; NaN if silent.
 
-        A frozen monitor goes on telling what it does: see `machine`.
+        A frozen monitor reads on here: see `machine`.
         """
         readings = np.einsum("mij,...mj->...mi", self.matrix(), beam) + self.constant()
         readings[..., self.silent, :] = np.nan

@@ -1,4 +1,4 @@
-"""Shots with equal settings are tracked together."""
+"""Groups of shots with equal settings, which are tracked together."""
 
 from collections.abc import Iterator, Sequence
 
@@ -11,14 +11,14 @@ from tmlattice.effects.apply import Settings
 def groups(
     settings: Sequence[Settings] | None, shots: int
 ) -> Iterator[tuple[NDArray[np.intp], Settings]]:
-    """The shots [index] of each setting that occurs, and the setting.
+    """Return the shots [index] of each different setting, and the setting.
 
     Args:
         settings: one for each shot; None or empty: the design's for all.
-        shots: their number.
+        shots: number of shots.
 
     Raises:
-        ValueError: another number of settings than of shots.
+        ValueError: the numbers of settings and shots differ.
     """
     if not settings:
         yield np.arange(shots), {}

@@ -1,4 +1,4 @@
-"""What goes wrong with sextupoles."""
+"""Errors of sextupoles."""
 
 from tmlattice.effects.effect import (
     ErrorEffect,
@@ -15,13 +15,13 @@ class _OnSextupole(RingEffect):
     sits_on_text = "sextupoles with k2 not 0"
 
     def sits_on(self, element: Element) -> bool:
-        """Powered sextupoles."""
+        """Whether an element is a powered sextupole."""
         return element.kind == "sextupole" and element.k2 != 0
 
 
 @register
 class SextupoleStrength(_OnSextupole, StrengthEffect):
-    """A sextupole's strength is not what its setting says."""
+    """A wrong strength of a sextupole."""
 
     name = "sextupole_strength"
     words = "wrong strength of a sextupole"
@@ -32,7 +32,7 @@ class SextupoleStrength(_OnSextupole, StrengthEffect):
     quantity = "integrated strength"
     recommended_action = "set or repair the strength of {}"
     to_check = (
-        "Read back the current of its supply; near -200 % its cables are exchanged, near -100 % it "
+        "Read back the current of its supply; near -200 % its polarity is reversed, near -100 % it "
         "is off."
     )
     background = 5e-3
@@ -41,7 +41,7 @@ class SextupoleStrength(_OnSextupole, StrengthEffect):
 
 @register
 class SextupoleOffsetX(_OnSextupole, ErrorEffect):
-    """A sextupole that stands beside its axis."""
+    """A horizontal misalignment of a sextupole."""
 
     name = "sextupole_offset_x"
     responds = True
@@ -52,14 +52,14 @@ class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     sign = "x of the magnet's centre"
     quantity = "horizontal displacement"
     recommended_action = "move {} back horizontally"
-    to_check = "Survey its horizontal position against the quadrupoles beside it."
+    to_check = "Survey its horizontal position against the adjacent quadrupoles."
     background = 1e-4
     largest = 3e-3
 
 
 @register
 class SextupoleOffsetY(_OnSextupole, ErrorEffect):
-    """A sextupole that stands above or below its axis."""
+    """A vertical misalignment of a sextupole."""
 
     name = "sextupole_offset_y"
     responds = True
@@ -70,18 +70,18 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     sign = "y of the magnet's centre"
     quantity = "vertical displacement"
     recommended_action = "move {} back vertically"
-    to_check = "Survey its height against the quadrupoles beside it."
+    to_check = "Survey its height against the adjacent quadrupoles."
     background = 1e-4
     largest = 3e-3
 
 
 @register
 class FamilySextupole(_OnSextupole, FamilyEffect):
-    """The power supply of a family of sextupoles is off: all of them have the same error."""
+    """A wrong current of a sextupole family's power supply: a common error of its members."""
 
     name = "family_sextupole"
     words = "wrong strength of a whole family of sextupoles"
-    usual = False  # between two measurements of one machine, or where somebody names it
+    usual = False  # between two measurements of one machine, or on request
     strength = "k2"
     unit = "relative"
     sign = "k2 of every member becomes (1 + amount) k2; -2 reverses them"

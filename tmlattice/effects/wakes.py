@@ -1,4 +1,4 @@
-"""What the beam's own fields do in a chamber that is not smooth."""
+"""Wake fields of the beam in a chamber that is not smooth."""
 
 from tmlattice.effects.effect import ThinKickEffect, register
 from tmlattice.lattice import Element
@@ -9,12 +9,12 @@ class _WakeKick(ThinKickEffect):
     unit = "1/m"
     largest = 0.03
     sits_on_text = "cavities, wigglers and their narrow chambers, markers (collimators, tapers)"
-    recommended_action = "find what drives the wake field at {}"
-    to_check = "Repeat at another charge: a wake field grows with it; look at the chamber there."
-    usual = False  # a pulse that is injected to be threaded is too weak for it
+    recommended_action = "find the source of the wake field at {}"
+    to_check = "Repeat at another charge: a wake field is proportional to it; check the chamber."
+    usual = False  # too weak for a single injected pulse
 
     def sits_on(self, element: Element) -> bool:
-        """Where a chamber is not smooth; a collimator or a taper is a marker in most lattices."""
+        """Whether an element has a chamber that is not smooth; markers may be collimators."""
         return element.kind in ("cavity", "wiggler", "marker")
 
 

@@ -14,18 +14,18 @@ ALIKE = 3.0
 def advice(methods: Sequence[MethodFit]) -> str:
     """A few sentences: what to trust, how the others stand to it, why the recipe cannot do it."""
     best = trusted(methods)
-    told = [_trust(methods, best)]
+    told = [_recommended(methods, best)]
     for method in methods:
         if method.method != "adam" and method is not best and best is not None:
-            told.append(_beside(method, best))
+            told.append(_compared(method, best))
         elif method.method == "adam":
             told.append(_recipe(method))
     return " ".join(sentence for sentence in told if sentence)
 
 
-def _trust(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
+def _recommended(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
     if best is not None:
-        why = f"it {_left(best)}"
+        why = f"it {_residual(best)}"
         if best.method == "map":
             return f"Trust map: {why}, most strengths nearly right and a few far off."
         if not best.named:
@@ -40,17 +40,17 @@ def _trust(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
         return "Nothing here is to be trusted: add --method sparse, which names magnets."
     least = min(others, key=lambda m: m.rms)
     return (
-        f"Trust none: {least.method} leaves least, and it {_left(least)}, so something is "
+        f"Trust none: {least.method} leaves least, and it {_residual(least)}, so something is "
         "there other than strengths of quadrupoles and sextupoles, or launches and noise are not "
         "as stated; `tmlattice diagnose` looks for every effect, launches free."
     )
 
 
-def _beside(method: MethodFit, best: MethodFit) -> str:
+def _compared(method: MethodFit, best: MethodFit) -> str:
     if method.tunes is None:
         return f"{method.method.capitalize()} has no tunes."
     if not method.explains:
-        return f"{method.method.capitalize()} {_left(method)}."
+        return f"{method.method.capitalize()} {_residual(method)}."
     if best.tunes is None or best.tune_sigma is None or method.tune_sigma is None:
         return ""
     away = np.abs((method.tunes - best.tunes + 0.5) % 1.0 - 0.5)
@@ -69,10 +69,10 @@ def _recipe(method: MethodFit) -> str:
     )
     if method.chi2 is None or method.explains:
         return f"{why}."
-    return f"{why}; it {_left(method)}."
+    return f"{why}; it {_residual(method)}."
 
 
-def _left(method: MethodFit) -> str:
+def _residual(method: MethodFit) -> str:
     """What a method leaves of the readings, against their noise."""
     if method.explains:
         return f"leaves the readings' noise ({1e6 * method.rms:.3g} of {1e6 * method.noise:.3g} µm)"

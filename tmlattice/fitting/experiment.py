@@ -20,8 +20,9 @@ from tmlattice.errors import (
     UnstableRingError,
     unknown_choice,
 )
+from tmlattice.fitting.adam import Regularization
 from tmlattice.fitting.launches import FreeLaunches, with_noise
-from tmlattice.fitting.method_fit import METHODS, MethodFit
+from tmlattice.fitting.method_fit import METHODS, SPARSE_METHODS, MethodFit
 from tmlattice.fitting.methods import fine_tune
 from tmlattice.fitting.outcome import TuneFit
 from tmlattice.harmonics import MIN_TURNS, tunes
@@ -112,8 +113,16 @@ def tune_fit(
     seed: int = 0,
     *,
     methods: Sequence[str] = METHODS,
+    candidates: Sequence[str] | None = None,
+    epochs: int = 1000,
+    learning_rate: float = 1e-6,
+    regularization: Regularization | str = "symplectic",
+    regularization_rate: float = 1e-10,
+    relative_to_design: bool = False,
+    free: Sequence[str] | None = None,
+    clip: float = 1.0,
+    patience: int | None = 200,
     progress: bool = True,
-    **options: Any,
 ) -> TuneFit:
     """Perturb one magnet, measure one first turn, fine-tune the design's network, predict tunes.
 
@@ -125,10 +134,12 @@ def tune_fit(
         noise: rms of a reading, m; drawn from the seed.
         turns: tracked for the tunes, at a vanishing amplitude.
         seed: of the noise.
-        methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map".
+        methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map"; or "told".
+        candidates: names of the only magnets that may have changed, of "told".
+        epochs, learning_rate, regularization, regularization_rate: of "adam", see
+            `fitting.adam.fit_adam`.
+        relative_to_design, free, clip, patience: of the same.
         progress: show a bar where there is a terminal.
-        options: of the recipe, passed to `fitting.adam.fit_adam`; or method=, of `fine_tune`,
-            alone, and its own.
 
     Raises:
         UnstableRingError: the design or the perturbed ring has no tune.
@@ -141,7 +152,12 @@ def tune_fit(
     start = np.asarray(launch, dtype=float)
     if start.shape != (4,) or not np.isfinite(start).all():
         raise TmlatticeError("a launch has four finite numbers: x, px, y, py in m and rad")
-    work = _Work(_ordered(methods, options), _enough(turns), start, progress, options)
+    recipe = {
+        "epochs": epochs, "learning_rate": learning_rate, "regularization": regularization,
+        "regularization_rate": regularization_rate, "relative_to_design": relative_to_design,
+        "free": free, "clip": clip, "patience": patience,
+    }  # fmt: skip
+    work = _Work(_ordered(methods), _enough(turns), start, progress, recipe, candidates)
     name = middle_of_first_arc(ring).name if magnet is None else ring[magnet].name
     with work.watch.stage("compile"):
         for element in {e.kind: e for e in ring.elements}.values():
@@ -178,7 +194,7 @@ def tune_fit_measurement(
     methods: Sequence[str] = METHODS,
     source: str | None = None,
     progress: bool = True,
-    **options: Any,
+    **recipe: Any,
 ) -> TuneFit:
     """Fine-tune the design's network on the first turns of a measurement, predict the tunes.
 
@@ -193,8 +209,7 @@ def tune_fit_measurement(
         methods: some of `METHODS`.
         source: where the data are from, for the report.
         progress: show a bar where there is a terminal.
-        options: of the recipe, passed to `fitting.adam.fit_adam`; or method=, of `fine_tune`,
-            alone, and its own.
+        recipe: options of `fitting.adam.fit_adam`.
 
     Raises:
         MeasurementError: nothing of the first turn was read, every launch is on the axis exactly,
@@ -203,7 +218,7 @@ def tune_fit_measurement(
         UnstableRingError: the design has no tune.
         BeamLostError: a launch is lost on the first turn, or the fit diverged.
     """
-    names, turns = _ordered(methods, options), _enough(turns)
+    names, turns = _ordered(methods), _enough(turns)
     dimension = 6 if measurement.launches[:, 4].any() else 4
     sigma = launch_errors(measurement, dimension)
     if not (measurement.launches.any() or sigma.any()):
@@ -219,7 +234,7 @@ def tune_fit_measurement(
         )
     start = np.zeros(dimension)
     start[:4] = DEFAULT_LAUNCH  # both planes move, whatever the shots did
-    work = _Work(names, turns, start, progress, options)
+    work = _Work(names, turns, start, progress, recipe)
     with work.watch.stage("compile"):
         for element in {e.kind: e for e in ring.elements}.values():
             element_map(element, ring.map_energy, dimension)
@@ -245,28 +260,27 @@ def tune_fit_measurement(
 
 
 class _Work:
-    """What the methods share: which, how many turns from where, and the recipe's options."""
+    """What the methods share: which, how many turns from where, and the options of "adam" and of
+    "told"."""
 
     def __init__(
         self, methods: tuple[str, ...], turns: int, start: Array, progress: bool,
-        options: dict[str, Any],
+        recipe: dict[str, Any], candidates: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
-        self.methods, self.turns, self.start = methods, turns, start
-        self.progress, self.options = progress, options
+        self.methods, self.turns, self.start, self.progress = methods, turns, start, progress
+        self.options = {"adam": recipe, "told": {"candidates": candidates}}
         self.watch, self.begun = _Stopwatch(), time.perf_counter()
 
 
-def _ordered(methods: Sequence[str], options: dict[str, Any]) -> tuple[str, ...]:
-    """In the order of `METHODS`, each once; the one of `method=` alone, whose the options then
-    are."""
-    if "method" in options:
-        return (str(options["method"]),)
-    unknown = [name for name in methods if name not in METHODS]
+def _ordered(methods: Sequence[str]) -> tuple[str, ...]:
+    """In the order of `METHODS`, "told" last, each once."""
+    known = (*METHODS, *(name for name in SPARSE_METHODS if name not in METHODS))
+    unknown = [name for name in methods if name not in known]
     if unknown:
         raise unknown_choice("method", unknown[0], METHODS)
     if not methods:
         raise TmlatticeError(f"no method is named; there are {', '.join(METHODS)}")
-    return tuple(name for name in METHODS if name in methods)
+    return tuple(name for name in known if name in methods)
 
 
 def _enough(turns: int) -> int:
@@ -319,9 +333,7 @@ def _column(
     read, noise = measurement.readings[:, 0], measurement.noise
     assert noise is not None
     begun = time.perf_counter()
-    alone = "method" in work.options
-    options = {k: v for k, v in work.options.items() if k != "method" and (alone or name == "adam")}
-    options = {"launch_sigma": sigma} | options
+    options = {"launch_sigma": sigma} | work.options.get(name, {})
     tune, signal, growth, problem = None, None, None, None
     fit = None
     try:

@@ -30,7 +30,7 @@ STEP = 1e-6
 """m, rad or relative: half the way between the two launches of a slope."""
 
 
-ROUGH = 1e-4
+GUESSED_NOISE = 1e-4
 """m; stands for the noise while the launches are fitted for its estimate."""
 
 
@@ -52,7 +52,7 @@ def with_noise(
     there = np.asarray(np.isfinite(measurement.readings[:, 0]).any(axis=0))
     if noise is not None and np.isfinite(noise[there]).all():
         return measurement, False
-    data = of_measurement(ring, measurement).with_sigma(np.full(2, ROUGH))
+    data = of_measurement(ring, measurement).with_sigma(np.full(2, GUESSED_NOISE))
     model = Model(ring, data.settings, 1, dimension=dimension)
     start = fit(FirstTurns(model=model, data=data, places={}), (), data.launches)
     if start.point.lost:

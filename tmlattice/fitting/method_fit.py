@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.fitting.adam import FitResult
-from tmlattice.fitting.few import BY_CHANCE
+from tmlattice.fitting.sparse import MAX_MISFIT
 from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 METHODS = ("adam", "sparse", "map")
 """The paper's recipe first; of the others the one that names magnets."""
 
-NAMING = ("sparse", "told")
+SPARSE_METHODS = ("sparse", "told")
 """Those that name a few magnets; the second knows which might have changed."""
 
 
@@ -67,14 +67,14 @@ class MethodFit(Speaks):
     @property
     def named(self) -> dict[str, tuple[float, float]]:
         """The magnets that `sparse` names, with their relative change and its error."""
-        return self.fit.changes if self.fit is not None and self.method in NAMING else {}
+        return self.fit.changes if self.fit is not None and self.method in SPARSE_METHODS else {}
 
     @property
     def explains(self) -> bool:
         """Whether the fit leaves no more than the noise of the readings."""
         if self.chi2 is None:
             return False
-        return self.chi2 <= 1 + BY_CHANCE * float(np.sqrt(2 / self.readings))
+        return self.chi2 <= 1 + MAX_MISFIT * float(np.sqrt(2 / self.readings))
 
     def as_json(self, true: Array | None) -> dict[str, Any]:
         """An entry of "methods" in `tmlattice-tune-fit`."""
@@ -100,7 +100,7 @@ def trusted(methods: Sequence[MethodFit]) -> MethodFit | None:
     """The method whose tunes to take: one that leaves the noise alone and states its error, the
     one of fewest magnets first; None where none does."""
     good = [m for m in methods if m.method != "adam" and m.tunes is not None and m.explains]
-    return min(good, key=lambda m: m.method not in NAMING, default=None)
+    return min(good, key=lambda m: m.method not in SPARSE_METHODS, default=None)
 
 
 def errors(tunes: Array | None, true: Array | None) -> tuple[Array | None, Array | None]:

@@ -1,7 +1,9 @@
 """`fine_tune`: one call, four methods."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import StrEnum
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,18 @@ from numpy.typing import ArrayLike
 
 from tmlattice.by_name import by_name
 from tmlattice.errors import unknown_choice
-from tmlattice.fitting.adam import FitResult, fit_adam
-from tmlattice.fitting.few import EFFECTS, fit_sparse, sparse_fit, warn_of_launches
-from tmlattice.fitting.many import fit_map
+from tmlattice.fitting.adam import FitResult, Regularization, fit_adam
+from tmlattice.fitting.map_fit import Prior, fit_map
+from tmlattice.fitting.sparse import (
+    EFFECTS,
+    FAULT,
+    LARGEST_NUMBER,
+    REFINED,
+    fit_sparse,
+    sparse_causes,
+    warn_of_launches,
+)
+from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
 from tmlattice.observe.data import NOISE_FLOOR, first_turn
@@ -32,48 +43,99 @@ def fine_tune(
     measurement: Measurement,
     *,
     method: Method | str = "adam",
-    **options: Any,
+    launch_sigma: ArrayLike | None = None,
+    progress: bool = True,
+    epochs: int = 1000,
+    learning_rate: float = 1e-6,
+    regularization: Regularization | str = "symplectic",
+    regularization_rate: float = 1e-10,
+    relative_to_design: bool = False,
+    free: Sequence[str] | None = None,
+    clip: float = 1.0,
+    patience: int | None = 200,
+    ring: Ring | None = None,
+    kinds: Sequence[str] = ("quadrupole", "sextupole"),
+    noise: float | None = None,
+    fault: float = FAULT,
+    largest_number: int = LARGEST_NUMBER,
+    refined: int = REFINED,
+    candidates: Sequence[str] | None = None,
+    prior: Prior | str = Prior.FAULTS,
+    scale: float | None = None,
+    iterations: int = 12,
 ) -> FitResult:
     """Fit a network to the first turn of a measurement; the given network is left as it is.
 
     Args:
         network: the design.
-        measurement: launches and readings.
+        measurement: launches and readings; a path or a DataFrame is taken too.
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
             (`fitting.many.fit_map`); "sparse", as few changed magnets as the evidence asks for
             (`fitting.few.fit_sparse`); "told", the same that knows which magnets may have changed
             (`candidates=`): nothing else can be better. All but the first state the error of their
             tunes.
-        options: of the method, see there.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n], m and
+            rad; 0: exact; inf: unknown; None: the measurement's own.
+        progress: show a bar where there is a terminal.
+        epochs, learning_rate, regularization, regularization_rate: of "adam", see
+            `fitting.adam.fit_adam`.
+        relative_to_design, free, clip, patience: of the same.
+        ring, kinds, noise: of the others: the ring whose magnets change (None: the network's own),
+            the kinds of magnets, and the rms of one reading, m (None: the measurement's).
+        fault, largest_number, refined: of "sparse" and "told".
+        candidates: of the same: the only magnets that may have changed.
+        prior, scale, iterations: of "map".
 
-    Launches are as exact as the measurement states (`launch_sigma=` overrides it). A warning says
-    where the readings contradict that.
+    A warning says where the readings contradict the stated errors of the launches.
 
     Raises:
         ChoiceError: an unknown method; it is a ValueError too.
-        ValueError: an option's value.
+        ValueError: an option's value, or an option without meaning for the method.
         TmlatticeError: a measurement that cannot be fitted, see the methods.
     """
+    given = dict(locals())
     try:
         chosen = Method(method)
     except ValueError:
         raise unknown_choice("method", method, Method) from None
-    if chosen is Method.ADAM:
-        result = fit_adam(network, measurement, **options)
-        _check_launches(network, measurement, options.get("launch_sigma"))
-        return _judged(result, measurement)
-    if chosen is Method.MAP:
-        return _judged(fit_map(network, measurement, **options), measurement)
-    if chosen is Method.TOLD and not options.get("candidates"):
+    fit = _FITS[chosen]
+    options = _options_of(fit, given, chosen)
+    if chosen is Method.TOLD and not candidates:
         raise ValueError(
             "method 'told' is told the magnets that may have changed: give candidates="
         )
-    if isinstance(network, SymplecticNetwork):
+    if fit is fit_sparse and isinstance(network, SymplecticNetwork):
         if network.ring is None:
             raise ValueError("methods 'sparse' and 'told' need a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
-    return _judged(fit_sparse(network, measurement, **options), measurement)
+    result = fit(network, measurement, **options)
+    if chosen is Method.ADAM:
+        _check_launches(network, measurement, launch_sigma)
+    return _with_chi2(result, measurement)
+
+
+_FITS: dict[Method, Callable[..., FitResult]] = {
+    Method.ADAM: fit_adam, Method.MAP: fit_map, Method.SPARSE: fit_sparse, Method.TOLD: fit_sparse,
+}  # fmt: skip
+
+
+def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: Method) -> dict[str, Any]:
+    """Those of the arguments that the method has.
+
+    Raises:
+        ValueError: another one was given.
+    """
+    own = signature(fit).parameters
+    options = {}
+    for name, parameter in signature(fine_tune).parameters.items():
+        if parameter.kind is not parameter.KEYWORD_ONLY or name == "method":
+            continue
+        if name in own:
+            options[name] = given[name]
+        elif given[name] != parameter.default:
+            raise ValueError(f"the option '{name}' has no meaning for method '{method}'")
+    return options
 
 
 def _check_launches(
@@ -86,10 +148,10 @@ def _check_launches(
     if not any(e.k1 or e.k2 for e in ring.elements if e.kind in EFFECTS):
         return
     data = first_turn(network.monitors, measurement, None, sigma, n)
-    warn_of_launches(ring, data, n, sparse_fit(ring, data, dimension=n))
+    warn_of_launches(ring, data, n, sparse_causes(ring, data, dimension=n))
 
 
-def _judged(result: FitResult, measurement: Measurement) -> FitResult:
+def _with_chi2(result: FitResult, measurement: Measurement) -> FitResult:
     """The result with its chi-square."""
     noise = result.options.get("noise")
     ordered = measurement.in_order_of(result.network.monitors)

@@ -185,8 +185,10 @@ def run_case(
             fit = fine_tune(design, measurement, progress=False, **options)
             predicted = network_tunes(fit.network, start, turns)[0]
         else:
-            only = {"candidates": names} if method == "told" else {}
-            fit = fine_tune(design, measurement, method=method, noise=noise, progress=False, **only)
+            only = names if method == "told" else None
+            fit = fine_tune(
+                design, measurement, method=method, noise=noise, candidates=only, progress=False
+            )
             if fit.tunes is None:
                 return dataclasses.replace(known, problem="the fitted network has no tune")
             predicted = fit.tunes
@@ -292,7 +294,7 @@ def study_tune_fit(
     seeds: int = 1,
     seed: int = 0,
     scheduler: str | None = None,
-    workers: int | None = None,
+    jobs: int | None = None,
     folder: Path | None = None,
     sequence: str | None = None,
     energy: float | None = None,
@@ -312,7 +314,7 @@ def study_tune_fit(
         seeds: noises for each magnet and method, seed, seed + 1, ...
         seed: the first.
         scheduler: address of a Dask scheduler; None: local processes.
-        workers: local processes; 1: this one; else one a core.
+        jobs: local processes; 1: this one; else one a core.
         folder: where every case is written as it ends, and read from when the study goes on.
         sequence, energy, monitors, correctors, particle: see `load_ring`.
         progress: show a bar where there is a terminal.
@@ -333,7 +335,7 @@ def study_tune_fit(
     ring = load_ring(*where)
     need_monitors(ring)
     names = faults(ring, magnets, kind)
-    jobs = [(n, m, seed + i) for n in names for m in dict.fromkeys(methods) for i in range(seeds)]
+    tasks = [(n, m, seed + i) for n in names for m in dict.fromkeys(methods) for i in range(seeds)]
     from tmlattice import __version__
 
     made_from = (__version__, contents(ring), sorted(options.items(), key=str))
@@ -342,14 +344,14 @@ def study_tune_fit(
             _open_folder(folder, {**dict(zip(_LATTICE, where, strict=False)), **options})
         results = run_batch(
             _work,
-            {_name_of(job): partial(tuple, (where, job, options)) for job in jobs},
+            {_name_of(job): partial(tuple, (where, job, options)) for job in tasks},
             folder / "cases" if folder is not None else Path(str(temporary)),
-            jobs=workers,
+            jobs=jobs,
             scheduler=scheduler,
             progress=progress,
-            made_by=dict.fromkeys(map(_name_of, jobs), fingerprint(*made_from)),
+            made_by=dict.fromkeys(map(_name_of, tasks), fingerprint(*made_from)),
         )
-    return [_case(job, results[_name_of(job)]) for job in jobs]
+    return [_case(job, results[_name_of(job)]) for job in tasks]
 
 
 def summarise(cases: Sequence[Case]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ from tmlattice.fitting.weight_parts import (
     split,
     stacked,
 )
-from tmlattice.inference.scan import BLIND
+from tmlattice.inference.scan import MIN_VISIBLE
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
@@ -216,7 +216,7 @@ def _read(
     M = seen.information[:, effects.layer]
     norm = np.einsum("shi,shij,shj->h", kicks, M, kicks)
     whole = np.einsum("shi,shij,shj->h", kicks, seen.whole[:, effects.layer], kicks)
-    visible = (norm > BLIND**2 * whole) & (norm > 0)
+    visible = (norm > MIN_VISIBLE**2 * whole) & (norm > 0)
     if network is None:
         inner = np.einsum("shi,shi->h", kicks, seen.pull[:, effects.layer])
         gradient = seen.gradient()

@@ -5,10 +5,10 @@
 >>> print("\\n".join(brought.assumed))          # units, signs, steps: what the files do not prove
 """
 
-from tmlattice.importers.bring_in import Options, bring_in
+from tmlattice.importers.bring_in import Options, bring_in, import_data
 from tmlattice.importers.imported import Imported, described, write_imported
 from tmlattice.importers.speaking import read_measurement
-from tmlattice.importers.told import Told, read_told
+from tmlattice.importers.told import Told
 
 __all__ = [
     "Imported",
@@ -16,7 +16,7 @@ __all__ = [
     "Told",
     "bring_in",
     "described",
+    "import_data",
     "read_measurement",
-    "read_told",
     "write_imported",
 ]

@@ -1,15 +1,17 @@
 """Which importer files are for: by what they hold, not by their names."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from tmlattice.errors import MeasurementError, TmlatticeError, plain
-from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, text_of
+from tmlattice.by_name import is_frame
+from tmlattice.errors import MeasurementError, TmlatticeError, plain, unknown_name
+from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, as_frame, read_columns, text_of
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported, counted
@@ -21,8 +23,10 @@ from tmlattice.importers.tables import bring_table, bring_turns, is_response_tab
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
-from tmlattice.measurement import OrbitResponse
-from tmlattice.measurement.tables import Unit
+from tmlattice.measurement import Measurement, OrbitResponse, TuneReading
+from tmlattice.measurement.arrays import Unit
+from tmlattice.measurement.assume import ASSUMPTIONS, assume
+from tmlattice.measurement.frames import of_document
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +46,9 @@ class Options:
         energy: GeV; else what the lattice states.
         turns: the kind of a turn-by-turn file, see `bring_turns`.
         unit: of the readings of first turns or turns; else as the file says, or from their size.
-        told: what a map says of a table of readings.
-        ring: instead of `lattice`, one that is loaded already.
+        told: what a machine file says of a table of readings.
+        ring: instead of `lattice`, one that is loaded already, or a function that loads it where a
+            file needs one.
         noise: rms of a reading, or of an orbit change, m, where the files give none.
     """
 
@@ -56,10 +61,12 @@ class Options:
     unit: Unit | None = None
     noise: float | None = None
     told: Told | None = None
-    ring: Ring | None = None
+    ring: Ring | Callable[[], Ring] | None = None
 
 
-def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imported:
+def bring_in(
+    paths: Sequence[str | PathLike[str] | Any], options: Options | None = None
+) -> Imported:
     """The measurement of one file or of several that belong together.
 
     Args:
@@ -67,7 +74,8 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
             with the table of names (`.json`) and the lattice (`.mat`); or the Middle Layer's
             response, dispersion and noise (`.mat`) with the machine's LOCO file; or a table
             (`.csv`, `.tsv`, `.txt`, `.h5`, `.sdds`) of readings or of a response; or any other
-            file, which the package `turn_by_turn` is asked to read.
+            file, which the package `turn_by_turn` is asked to read; or one pandas DataFrame or
+            xarray Dataset, which is read as a table.
         options: how they are read.
 
     Raises:
@@ -75,7 +83,10 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         LatticeError: a lattice that cannot be made.
     """
     options = options or Options()
-    files = [Path(path) for path in paths]
+    frames = [path for path in paths if is_frame(path)]
+    if frames and len(frames) < len(paths):
+        raise MeasurementError("a frame is imported alone; give no file with it")
+    files = [] if frames else [Path(path) for path in paths]
     for path in files:
         if not path.is_file():
             raise MeasurementError(f"no file '{path}'; check the path")
@@ -87,7 +98,8 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
     matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
     hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
     try:
-        brought = _bring(files, matlab, hdf5, options)
+        some = _framed(frames[0], options) if frames else None
+        brought = some or _bring(files, matlab, hdf5, options)
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
         if isinstance(error, TmlatticeError):
             raise
@@ -97,9 +109,10 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         raise MeasurementError(
             f"{shown}: fields have other types or sizes than a reader knows ({said}); save it again"
         ) from error
-    if options.noise is not None and brought.measurement.noise is None:
-        noise = np.full((len(brought.measurement.monitors), 2), options.noise)
-        brought = replace(brought, measurement=replace(brought.measurement, noise=noise))
+    data = brought.measurement
+    if options.noise is not None and not isinstance(data, TuneReading) and data.noise is None:
+        noise = np.full((len(data.monitors), 2), options.noise)
+        brought = replace(brought, measurement=replace(data, noise=noise))
         brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as told")
     if isinstance(brought.measurement, OrbitResponse):
         brought = _with_all_noise(brought, brought.measurement)
@@ -111,6 +124,50 @@ def bring_in(paths: Sequence[str | Path], options: Options | None = None) -> Imp
         assumed=(*brought.assumed, *confirmed),
         doubts=(*brought.doubts, *contradicted),
     )
+
+
+def import_data(
+    source: str | PathLike[str] | Sequence[str | PathLike[str]] | Any,
+    *,
+    ring: Ring | None = None,
+    lattice: str | None = None,
+    sequence: str | None = None,
+    energy: float | None = None,
+    unit: Unit | None = None,
+    noise: float | None = None,
+    turns: str | None = None,
+    names: Mapping[str, str] | None = None,
+    bad: Sequence[str] = (),
+    iteration: Iteration = "first",
+    keep_bad: bool = False,
+) -> Imported:
+    """Import a measurement of another program, with what was assumed of it.
+
+    Args:
+        source: a file, several that belong together (see `bring_in`), or a pandas DataFrame or
+            xarray Dataset.
+        ring: the lattice; or its `lattice`, `sequence` and `energy` (GeV), see `load_ring`.
+        unit: of readings that state none; None: from their size.
+        noise: rms of a reading, or of an orbit change, m, where the source gives none.
+        turns: the kind of a turn-by-turn file, see `read_turn_by_turn`.
+        names: device or column of the source -> the lattice's monitor.
+        bad: monitors to leave out, by either name; patterns.
+        iteration, keep_bad: of a LOCO fit, see `bring_loco`.
+
+    Returns:
+        `measurement`, `ring`, `assumed` and `doubts`; `write_imported` writes them to a folder.
+
+    Raises:
+        MeasurementError: a source that is not known, or does not fit together.
+        LatticeError: a lattice that cannot be made.
+    """
+    told = Told(names=dict(names or {}), bad=tuple(bad)) if names or bad else None
+    one = is_frame(source) or isinstance(source, str | PathLike)
+    options = Options(
+        iteration, keep_bad, sequence, lattice, energy, turns, unit, noise, told, ring
+    )
+    every: Any = [source] if one else source
+    return bring_in(every, options)
 
 
 def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
@@ -138,9 +195,9 @@ def _bring(
         path, ring = files[0], _ring(options)
         suffix = path.suffix.lower()
         if not options.turns and suffix in (*CSV, *HDF5):
-            return _table(path, ring, options)
+            return _with_conventions(_table(path, ring, options), ring, options)
         if options.turns or suffix not in NAMES:
-            return _turns(path, ring, options)
+            return _with_conventions(_turns(path, ring, options), ring, options)
     loco = [(path, content) for path, content in matlab if is_loco(content)]
     rest = [(path, content) for path, content in matlab if not is_loco(content)]
     if hdf5:
@@ -177,15 +234,28 @@ def _bring(
 
 def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
     """A response by its columns, else readings as they come."""
-    if path.suffix.lower() in CSV and is_response_table(path):
-        return bring_table(path, ring)
+    if path.suffix.lower() in CSV and is_response_table(read_columns(path)):
+        return bring_table(path, ring, options.told)
     return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
+
+
+def _framed(frame: Any, options: Options) -> Imported:
+    """As of `to_dataframe`, or as a table of a file."""
+    ring = _ring(options)
+    stated = of_document(as_frame(frame))
+    if stated is not None:
+        return Imported(stated, ring, ("everything is as `to_dataframe` wrote it",))
+    if is_response_table(read_columns(frame)):
+        return bring_table(frame, ring)
+    return bring_readings(frame, ring, with_unit(options.told, options.unit, options.noise))
 
 
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
     """Turns of a known kind; of SDDS of another, columns as they come."""
     try:
-        return bring_turns(path, ring, options.turns, options.unit)
+        told = with_unit(options.told, options.unit, None)
+        unit = cast("Unit | None", "um" if told.unit == "µm" else told.unit)
+        return bring_turns(path, ring, options.turns, unit, told)
     except MeasurementError:
         if options.turns or ring is None or path.suffix.lower() not in SDDS:
             raise
@@ -193,7 +263,31 @@ def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
         return bring_readings(path, ring, told)
 
 
+def _with_conventions(brought: Imported, ring: Ring | None, options: Options) -> Imported:
+    """The readings with the stated conventions of signs and units undone; those that have a meaning
+    for this kind of measurement."""
+    data: Any = brought.measurement
+    stated = options.told.assume if options.told else ()
+    for name in stated:
+        if name not in ASSUMPTIONS:
+            raise unknown_name("assumption", name, ASSUMPTIONS)
+    first, response = isinstance(data, Measurement), isinstance(data, OrbitResponse)
+    own = [
+        name for name in stated
+        if (first and ASSUMPTIONS[name].trajectory) or (response and ASSUMPTIONS[name].response)
+    ]  # fmt: skip
+    if left := [name for name in stated if name not in own]:
+        brought = brought.saying(f"of no meaning for these data, not undone: {', '.join(left)}")
+    if not own:
+        return brought
+    names = data.monitors if ring is None else [monitor.name for monitor in ring.monitors]
+    brought = replace(brought, measurement=assume(data, own, names))
+    return brought.saying(f"conventions of the machine file, undone: {', '.join(own)}")
+
+
 def _ring(options: Options) -> Ring | None:
+    if callable(options.ring):
+        return options.ring()
     if options.ring is not None or options.lattice is None:
         return options.ring
     return load_ring(options.lattice, options.sequence, options.energy)

@@ -61,12 +61,17 @@ class Column:
     values: list[str]
 
 
-def read_columns(path: Path) -> list[Column]:
-    """All columns of a file, of the same length.
+def read_columns(path: Path | Any) -> list[Column]:
+    """All columns of a file, or of a frame (see `by_name.is_frame`), of the same length.
 
     Raises:
         MeasurementError: no such file, or no table in it.
     """
+    if not isinstance(path, Path):
+        found = _of_frame(path)
+        if not found or not found[0].values:
+            raise MeasurementError(f"{label(path)}: no rows; nothing was read")
+        return found
     suffix = path.suffix.lower()
     if suffix in HDF5:
         found = _hdf5(path)
@@ -76,6 +81,53 @@ def read_columns(path: Path) -> list[Column]:
         found = _csv(path)
     if not found or not found[0].values:
         raise MeasurementError(f"{path}: no rows below the header; nothing was read")
+    return found
+
+
+def label(source: Path | Any) -> str:
+    """What messages call a file or a frame."""
+    return str(source) if isinstance(source, Path) else f"the {type(source).__name__}"
+
+
+def as_frame(table: Any) -> Any:
+    """A pandas DataFrame of a frame or of an xarray Dataset or DataArray, its index as columns.
+
+    Several levels of columns become one, joined by blanks; an index of texts without a name holds
+    the monitors, one of times the shots.
+    """
+    if hasattr(table, "dims"):
+        if not hasattr(table, "data_vars"):
+            table = table.to_dataset(name=table.name or "value")
+        units = {n: v.attrs["units"] for n, v in table.variables.items() if "units" in v.attrs}
+        attributes = table.attrs | {"units": units}
+        table = table.to_dataframe(dim_order=list(table.dims))
+    else:
+        attributes = table.attrs
+    index = table.index
+    if index.nlevels == 1 and index.name is None:
+        name = {"O": "monitor", "M": "time"}.get(index.dtype.kind)
+        table = table.rename_axis(name) if name else table
+    levels = [name for name in table.index.names if name is not None and name not in table.columns]
+    table = table.reset_index(level=levels) if levels else table.copy(deep=False)
+    if table.columns.nlevels > 1:
+        names = [" ".join(map(str, own)).strip() for own in table.columns]
+        table = table.set_axis(names, axis=1)
+    table.attrs = attributes
+    return table
+
+
+def _of_frame(table: Any) -> list[Column]:
+    frame = as_frame(table)
+    units = frame.attrs.get("units") or {}
+    found = []
+    for place, text in enumerate(map(str, frame.columns)):
+        name, unit = named(text)
+        column = frame.iloc[:, place]
+        texts = [
+            "" if missing else repr(value) if isinstance(value, float) else str(value).strip()
+            for value, missing in zip(column.tolist(), column.isna().tolist(), strict=True)
+        ]
+        found.append(Column(name, unit or str(units.get(text, "")), texts))
     return found
 
 

@@ -1,8 +1,8 @@
 """What a measured response says of how it was made and written down, beside the design's.
 
-A wrong sign, unit or order everywhere is found by the data checks (`diagnosis.data_checks`). Here each
-corrector and each monitor is set beside the design's own, and it is asked whether the RF frequency
-stood still or the momentum did. Nothing is mended.
+The data checks (`diagnosis.data_checks`) find a wrong sign, unit or order everywhere. Here each
+corrector and each BPM is compared with the design's, and the data decide whether the RF frequency
+or the momentum was constant. Nothing is corrected.
 """
 
 from dataclasses import dataclass

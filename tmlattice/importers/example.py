@@ -1,13 +1,14 @@
 """Templates of the files that are taken as they come: `tmlattice import --example`."""
 
 import csv
+import os
 from pathlib import Path
 
 import numpy as np
 
 from tmlattice.files import output_folder
-from tmlattice.importers.told import TEMPLATE
-from tmlattice.lattice import Ring
+from tmlattice.importers.told import machine_text
+from tmlattice.lattice import Ring, builtin_lattices
 from tmlattice.measurement import Measurement
 from tmlattice.observe.calibration import calibrated_response
 
@@ -19,18 +20,19 @@ FILES = {
     "readings_long.csv": "a row a shot and monitor",
     "readings.h5": "x and y [shot, monitor], with the monitors' names",
     "response.csv": "an orbit response: a row a corrector and monitor (here the design's)",
-    "map.yaml": "what the files do not say: names, unit, noise, bad monitors (--map)",
+    "tmlattice.toml": "what the files do not state: lattice, unit, names, bad BPMs (--machine)",
 }
 
 
-def write_example(folder: Path, ring: Ring, measurement: Measurement) -> None:
+def write_example(folder: Path, lattice: str, ring: Ring, measurement: Measurement) -> None:
     """Write every file of `FILES`.
 
     Args:
         folder: made where it is not there; files of these names are replaced.
+        lattice: built-in name or path of the ring.
         ring: whose names they have.
         measurement: first turns to stand in them, in mm; the wide table has names such as a
-            control room's, which the map explains.
+            control room's, which the machine file explains.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -71,9 +73,15 @@ def write_example(folder: Path, ring: Ring, measurement: Measurement) -> None:
                 for monitor, xy in zip(every, orbit, strict=True)
             ],
         )
-        names = "\n".join(f"  {c}: {m}" for c, m in zip(channels, monitors, strict=True))
-        text = TEMPLATE.format(names=names, bad=f"'{monitors[-1]}'")
-        (place / "map.yaml").write_text(text, encoding="utf-8")
+        named = lattice.casefold() in builtin_lattices()
+        text = machine_text(
+            lattice if named else os.path.relpath(lattice, folder),
+            {"unit": "mm", "noise": "20 um", "bad": [monitors[-1]]},
+            {},
+            dict(zip(channels, monitors, strict=True)),
+            {"knob": "qd", "unit": "A", "present": 100.0, "curve": [[0, 0], [120, -0.6]]},
+        )
+        (place / "tmlattice.toml").write_text(text, encoding="utf-8")
 
 
 def _correctors(ring: Ring) -> list[str] | None:

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder
 from tmlattice.lattice import Ring, save_ring
-from tmlattice.measurement import Measurement, OrbitResponse, TurnByTurn, write_measurement
+from tmlattice.measurement import (
+    AnyMeasurement,
+    Measurement,
+    OrbitResponse,
+    TurnByTurn,
+    in_words,
+    write_measurement,
+)
 from tmlattice.measurement.write import check_free
 
 Array = NDArray[np.float64]
@@ -22,16 +29,18 @@ class Imported:
     """A measurement as the package has it.
 
     Attributes:
-        measurement: an orbit response, first turns, or turns of a stored beam.
+        measurement: an orbit response, first turns, or turns of a stored beam; of a frame any.
         ring: the model that the files hold or that the caller named; None: neither.
         assumed: what the files do not prove: units, signs, steps; a sentence each.
         doubts: what the data contradict; a sentence each.
+        unit: of readings, where it is taken from their size.
     """
 
-    measurement: OrbitResponse | Measurement | TurnByTurn
+    measurement: AnyMeasurement
     ring: Ring | None = None
     assumed: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    unit: str | None = None
 
     def saying(self, *sentences: str) -> "Imported":
         """The same with more that was assumed."""
@@ -138,6 +147,8 @@ def described(brought: Imported) -> str:
             f"orbit response: monitors {read[0]} x, {read[1]} y; correctors {planes[0]} x, "
             f"{planes[1]} y; {step}{noise}"
         )
+    if not isinstance(data, Measurement | TurnByTurn):
+        return in_words(data)
     shots, turns, monitors, _ = data.readings.shape
     what = "turn by turn" if isinstance(data, TurnByTurn) else "first turns"
     return f"{what}: {shots} shots, {turns} turns, {monitors} monitors"

@@ -54,7 +54,8 @@ def elements_of(content: Mapping[str, Any], path: Path, sequence: str | None = N
     if len(found) != 1:
         which = ", ".join(found) if found else f"none of {', '.join(content) or 'its variables'}"
         raise LatticeError(
-            f"'{path}' has no single lattice ({which}); name its variable with --sequence"
+            f"'{path}' has no single lattice ({which}); name its variable: `sequence` in "
+            "[lattice] of tmlattice.toml"
         )
     ((name, elements),) = found.items()
     fields = [dict(e) for e in elements if str(e.get("Class", "")).lower() != "ringparam"]

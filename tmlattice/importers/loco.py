@@ -159,7 +159,8 @@ def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
     stated = [value for value in given if is_number(value) and value > 0]
     if not stated:
         raise MeasurementError(
-            "neither RINGData nor its elements state an energy: name it (--energy, GeV)"
+            "neither RINGData nor its elements state an energy: name it: `energy` in [lattice] of "
+            "tmlattice.toml, GeV"
         )
     return float(stated[0]) * (1e-9 if stated[0] > 1e5 else 1.0)
 

@@ -85,7 +85,7 @@ def _energy(new: dict[str, Any], energy: float | None, said: list[str]) -> None:
     ring["Energy"] = USUAL_ENERGY
     said.append(
         f"no energy is stated: {USUAL_ENERGY:g} GeV is assumed, for the closed orbits of electrons "
-        "hardly depend on it (--energy names it)"
+        "hardly depend on it (`energy` in [lattice] of tmlattice.toml names it)"
     )
 
 

@@ -10,14 +10,14 @@ BPMs had a beam.
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
-from tmlattice.importers.columns import Column, read_columns
+from tmlattice.importers.columns import Column, label, read_columns
 from tmlattice.importers.imported import Imported, counted, device_names
 from tmlattice.importers.told import METRES, Told
 from tmlattice.lattice import Ring
@@ -61,7 +61,7 @@ class Place:
 
 
 def bring_readings(
-    path: Path,
+    source: Path | Any,
     ring: Ring | None,
     told: Told | None = None,
     monitors: Sequence[str] | None = None,
@@ -69,17 +69,17 @@ def bring_readings(
     """The measurement of a file whose columns are not known.
 
     Args:
-        path: CSV of any separator, HDF5 or SDDS.
+        source: CSV of any separator, HDF5 or SDDS; or a frame.
         ring: the lattice, whose monitors are looked for; None: names are as the file has them.
         told: names, unit, noise, bad monitors.
         monitors: names to look for, instead of the lattice's.
 
     Raises:
         MeasurementError: no table, no monitor of the ring, or a field that is no number.
-        UnknownNameError: the map names a monitor that the ring does not have.
+        UnknownNameError: `told` names a monitor that the ring does not have.
     """
     told = told or Told()
-    columns = read_columns(path)
+    columns, path = read_columns(source), label(source)
     found = _long(path, columns, told) or _wide(path, columns, told)
     shots, turns, places, values, units = found
     position = np.array([place.plane != SUM for place in places])
@@ -87,12 +87,12 @@ def bring_readings(
     if not devices:
         raise MeasurementError(f"{path}: sum signals without x and y; give the positions too")
     names = list(monitors or devices if ring is None else [e.name for e in ring.monitors])
-    finder = _Finder(names, told)
+    finder = _Finder(names, told, [] if ring is None else [e.name for e in ring.elements])
     monitor = finder.all(path, devices)
     for place in places:
         monitor.setdefault(place.device, finder.find(place.device))
     scale = np.ones(len(values))
-    scale[position], of_unit = _scale(
+    scale[position], of_unit, guessed = _scale(
         values[position], [u for u, p in zip(units, position, strict=True) if p], told
     )
     both = np.full((len(set(shots)), max(turns) + 1, len(names), 3), np.nan)
@@ -153,14 +153,14 @@ def bring_readings(
     if bad:
         said.append(f"bad monitors, left out as told: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
-    return Imported(data, ring, tuple(said), doubts)
+    return Imported(data, ring, tuple(said), doubts, guessed)
 
 
 Found = tuple[list[str], list[int], list[Place], Array, list[str]]
 """Of every number: its shot, turn, place, value, and unit."""
 
 
-def _long(path: Path, columns: Sequence[Column], told: Told) -> Found | None:
+def _long(path: str, columns: Sequence[Column], told: Told) -> Found | None:
     """A row a monitor; None where no column holds names."""
     names = _called(columns, "monitor", MONITORS, told)
     if names is None or all(_is_number(text) for text in names.values):
@@ -189,7 +189,7 @@ def _long(path: Path, columns: Sequence[Column], told: Told) -> Found | None:
     return _joined(path, [(shots, turns, places, column) for places, column in parts])
 
 
-def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
+def _wide(path: str, columns: Sequence[Column], told: Told) -> Found:
     """A row a shot, a column a monitor and plane."""
     rows = len(columns[0].values)
     turns = _turns(path, columns, told)
@@ -201,6 +201,12 @@ def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
         if (place := place_of(column.name, told)) is not None and _holds(place.plane, column)
     ]  # fmt: skip
     if not used:
+        alone = [column.name for column in columns if _plane(column.name) is not None]
+        if alone:
+            raise MeasurementError(
+                f"{path}: no column 'monitor' beside '{alone[0]}'; add it, with the name of the "
+                "BPM of each row, or name each column as 'bpm_1 x'"
+            )
         raise MeasurementError(
             f"{path}: no column holds readings that are known; name columns such as "
             "'bpm_1 x [mm]', a monitor and a plane (`tmlattice import --example` writes some)"
@@ -213,7 +219,7 @@ def _wide(path: Path, columns: Sequence[Column], told: Told) -> Found:
 
 
 def _joined(
-    path: Path, parts: Iterable[tuple[list[str], list[int], list[Place | None], Column]]
+    path: str, parts: Iterable[tuple[list[str], list[int], list[Place | None], Column]]
 ) -> Found:
     shots: list[str] = []
     turns: list[int] = []
@@ -239,7 +245,12 @@ def _holds(plane: int, column: Column) -> bool:
     return plane != SUM or all(map(_is_number, column.values))
 
 
-def _number(path: Path, row: int, name: str, text: str) -> float:
+def numbers_of(path: str, column: Column) -> list[float]:
+    """The numbers of a column; NaN where nothing was read."""
+    return [_number(path, row, column.name, text) for row, text in enumerate(column.values)]
+
+
+def _number(path: str, row: int, name: str, text: str) -> float:
     if text.casefold() in ("", "nan", "na", "null", "none", "-", "invalid", "disconnected"):
         return float("nan")
     try:
@@ -277,7 +288,7 @@ def _labels(
     return None if column is None else column.values
 
 
-def _turns(path: Path, columns: Sequence[Column], told: Told) -> list[int] | None:
+def _turns(path: str, columns: Sequence[Column], told: Told) -> list[int] | None:
     column = _called(columns, "turn", TURNS, told)
     if column is None:
         return None
@@ -323,22 +334,25 @@ def _norm(text: str) -> str:
 class _Finder:
     """The lattice's monitor of a device."""
 
-    def __init__(self, names: Sequence[str], told: Told) -> None:
+    def __init__(self, names: Sequence[str], told: Told, elements: Sequence[str] = ()) -> None:
         self._names = list(names)
         self._exact = {name.casefold(): i for i, name in enumerate(self._names)}
         self._plain = _unique(_norm, self._names)
         self._told: dict[str, int] = {}
         self._in_order = told.in_order
-        self._bad = tuple(pattern.casefold() for pattern in told.bad)
+        self._stated = told
+        others = {name.casefold() for name in elements}
         self.bad: set[int] = set()
         self.said: list[str] = []
         for device, name in told.names.items():
             plain = name if name.casefold() in self._exact else name.rpartition(" ")[0]
+            if plain.casefold() not in self._exact and name.casefold() in others:
+                continue  # a corrector's
             if plain.casefold() not in self._exact:
                 raise unknown_name("monitor", name, self._names)
             self._told[_norm(device)] = self._exact[plain.casefold()]
 
-    def all(self, path: Path, devices: Sequence[str]) -> dict[str, int | None]:
+    def all(self, path: str, devices: Sequence[str]) -> dict[str, int | None]:
         """Place among the ring's monitors of each device; None: not found.
 
         Raises:
@@ -348,7 +362,7 @@ class _Finder:
             if len(devices) != len(self._names):
                 raise MeasurementError(
                     f"{path}: {len(devices)} devices, and the lattice has {len(self._names)} "
-                    "monitors; name them in the map, they are not the same in order"
+                    "monitors; name them in [channels], they are not the same in order"
                 )
             self.said.append("devices are the lattice's monitors in beam order, as told")
             found: dict[str, int | None] = {device: i for i, device in enumerate(devices)}
@@ -357,8 +371,8 @@ class _Finder:
         if all(at is None for at in found.values()):
             error = unknown_name("monitor", devices[0], self._names)
             raise MeasurementError(
-                f"{path}: {error}; say which is which in a map (--map, `names:`; "
-                "`tmlattice import --example` writes one)"
+                f"{path}: {error}; say which is which in [channels] of "
+                "tmlattice.toml (`tmlattice import --example` writes one)"
             )
         loose = [d for d, at in found.items() if at is not None and not self._same(d, at)]
         if loose and not self._in_order:
@@ -371,8 +385,7 @@ class _Finder:
         for device, at in found.items():
             if at is None:
                 continue
-            both = device.casefold(), self._names[at].casefold()
-            if any(fnmatchcase(name, pattern) for name in both for pattern in self._bad):
+            if self._stated.is_bad(device, self._names[at]):
                 self.bad.add(at)
         return found
 
@@ -406,8 +419,8 @@ def _unique(key: Callable[[str], str], names: Sequence[str]) -> dict[str, int]:
     return {name: i for name, i in table.items() if name not in twice}
 
 
-def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str]:
-    """Metres per unit of each number, and what is to be said of it."""
+def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str, str | None]:
+    """Metres per unit of each number, what is to be said of it, and a unit that is a guess."""
     known = {"µm": "um", "μm": "um", "micron": "um", "metre": "m", "meter": "m"}
     plain = [known.get(unit.strip().casefold(), unit.strip().casefold()) for unit in units]
     strange = [unit for unit in plain if unit and unit not in METRES]
@@ -419,18 +432,20 @@ def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str]
     scale = np.array([METRES[unit] if unit else 1.0 for unit in plain])
     stated = sorted(set(plain) - {""})
     if not silent.any():
-        return scale, f"readings are in {' and '.join(stated)}, as the file says"
+        return scale, f"readings are in {' and '.join(stated)}, as the file says", None
     if told.unit is not None:
         scale[silent] = METRES[told.unit]
-        return scale, f"readings are in {told.unit}, as told"
+        return scale, f"readings are in {told.unit}, as told", None
     own = np.abs(values[silent])
     own = own[np.isfinite(own)]
     size = float(np.percentile(own, 95)) if len(own) else 0.0
     unit = next(unit for below, unit in SIZES if size < below)
     scale[silent] = METRES[unit]
-    return scale, (
+    return (
+        scale,
         f"no unit is given: readings are taken in {unit}, for most are below {size:.3g} "
-        "(--unit says otherwise)"
+        "(`unit` in [data] of tmlattice.toml says otherwise)",
+        unit,
     )
 
 

@@ -6,20 +6,23 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from tmlattice.by_name import by_name, is_frame
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.bring_in import Options, bring_in
-from tmlattice.importers.columns import CSV, HDF5, SDDS
+from tmlattice.importers.columns import CSV, HDF5, SDDS, label, read_columns
+from tmlattice.importers.imported import Imported
 from tmlattice.importers.readings import bring_readings, with_unit
 from tmlattice.importers.tables import is_response_table
 from tmlattice.lattice import Ring
 from tmlattice.measurement import AnyMeasurement, folder
-from tmlattice.measurement.tables import Unit
+from tmlattice.measurement.arrays import Unit
 
 log = logging.getLogger(__name__)
 
 
+@by_name
 def read_measurement(
-    path: str | PathLike[str],
+    path: str | PathLike[str] | Any,
     monitors: Sequence[str] | None = None,
     turn_by_turn: str | None = None,
     unit: Unit | None = None,
@@ -33,7 +36,8 @@ def read_measurement(
 
     Args:
         path: a measurement folder, its measurement.json, or a file that `bring_in` takes: a table
-            (`.csv`, `.tsv`, `.txt`, `.h5`, `.sdds`), turns, a LOCO file.
+            (`.csv`, `.tsv`, `.txt`, `.h5`, `.sdds`), turns, a LOCO file; or a pandas DataFrame or
+            an xarray Dataset.
         monitors: the ring's names. Of a folder, a monitor that is not among them is an error.
         turn_by_turn: the path is a turn-by-turn file of this kind, see `read_turn_by_turn`.
         unit: of the readings of a file that states none; else taken from their size.
@@ -43,26 +47,34 @@ def read_measurement(
         MeasurementError: nothing there, or nothing that is known; one sentence.
         UnknownNameError: a monitor that the ring does not have.
     """
+    if is_frame(path):
+        return _logged(bring_in([path], Options(ring=ring, unit=unit)), label(path))
     place = Path(path)
     if turn_by_turn is not None or not place.is_file() or place.name == "measurement.json":
         return folder.read_measurement(place, monitors, turn_by_turn, unit or "m")
     suffix = place.suffix.lower()
-    response = suffix in CSV and is_response_table(place)
+    response = suffix in CSV and is_response_table(read_columns(place))
     if monitors is not None and suffix in (*CSV, *HDF5, *SDDS) and not response:
         brought = bring_readings(place, None, with_unit(None, unit, None), monitors)
     else:
         brought = bring_in([place], Options(ring=ring, unit=unit))
+    return _logged(brought, str(place))
+
+
+def _logged(brought: Imported, name: str) -> AnyMeasurement:
     for sentence in (*brought.assumed, *brought.doubts):
-        log.info("%s: %s", place, sentence)
+        log.info("%s: %s", name, sentence)
     return brought.measurement
 
 
-def measured(path: str | PathLike[str], ring: Ring | None = None) -> Any:
-    """The measurement of a path that was given where a measurement is taken.
+def measured(path: str | PathLike[str] | Any, ring: Ring | None = None) -> Any:
+    """The measurement of a path or a frame that was given where a measurement is taken.
 
     Raises:
         MeasurementError: a file of another program without the ring; see `read_measurement`.
     """
+    if is_frame(path):
+        return read_measurement(path, ring=ring)
     place = Path(path)
     if ring is None and place.is_file() and place.name != "measurement.json":
         raise MeasurementError(f"'{place}' is a file of another program: give the ring with it")

@@ -6,20 +6,19 @@ column `name [mm/mrad]` for each corrector, whose steps are not known then. Unit
 header, in brackets; without one they are m, rad and m/rad. Names are the lattice's.
 """
 
-import csv
-import re
 from collections.abc import Sequence
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
-from tmlattice.importers.columns import SDDS, text_of
-from tmlattice.importers.imported import Imported, counted
+from tmlattice.importers.columns import SDDS, Column, label, read_columns
+from tmlattice.importers.imported import Imported, counted, device_names
 from tmlattice.importers.middle_layer import METRES, RADIANS
+from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     Measurement,
@@ -27,9 +26,10 @@ from tmlattice.measurement import (
     TurnByTurn,
     read_turn_by_turn,
 )
+from tmlattice.measurement.arrays import Unit
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
-from tmlattice.measurement.tables import KINDS, Unit
+from tmlattice.measurement.tables import KINDS
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
@@ -38,43 +38,39 @@ Array = NDArray[np.float64]
 LIGHT = 299792458.0
 KICK = 1e-4
 """rad; the step that a wide table is taken to have been made with."""
-_HEADER = re.compile(r"^\s*(?P<name>.*?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*$")
 _PLANES = {"hcorrector": "x", "vcorrector": "y"}
 
 
-def is_response_table(path: Path) -> bool:
-    """Whether a CSV table is an orbit response, by its header: correctors in a column, or a row for
+def is_response_table(columns: Sequence[Column]) -> bool:
+    """Whether a table is an orbit response, by its header: correctors in a column, or a row for
     each monitor and plane."""
-    try:
-        lines = csv.reader(StringIO(text_of(path), newline=""), skipinitialspace=True)
-        header = next((row for row in lines if row), [])
-    except csv.Error:
-        return False
-    names = [m["name"].lower() for name in header if (m := _HEADER.match(name))]
+    names = [column.name.lower() for column in columns]
     return "corrector" in names or (names[:2] == ["monitor", "plane"] and "value" not in names)
 
 
-def bring_table(path: Path, ring: Ring | None) -> Imported:
-    """An orbit response of a CSV table.
+def bring_table(source: Path | Any, ring: Ring | None, told: Told | None = None) -> Imported:
+    """An orbit response of a CSV table or a frame.
 
     Args:
-        path: the file.
+        source: the file or frame.
         ring: the lattice, which knows the correctors' planes.
+        told: names of monitors and correctors, bad monitors.
 
     Raises:
         MeasurementError: a header that is not known, or a field that is no number: with its line.
         UnknownNameError: a name that the lattice does not have.
     """
-    header, rows = _read(path)
+    columns, path = read_columns(source), label(source)
+    header = [(column.name, column.unit) for column in columns]
+    rows = list(zip(*(column.values for column in columns), strict=True))
     names = [name.lower() for name, _ in header]
     if ring is None:
         raise MeasurementError(
-            f"'{path}' is an orbit response: name its lattice with --lattice, which knows the "
-            "planes of its correctors"
+            f"'{path}' is an orbit response: name its lattice with --lattice (in Python: ring=), "
+            "which knows the planes of its correctors"
         )
-    if "corrector" in names:
-        return _long(path, header, rows, ring)
-    return _wide(path, header, rows, ring)
+    read = _long if "corrector" in names else _wide
+    return read(path, header, rows, ring, told or Told())
 
 
 _FILES = (
@@ -84,7 +80,11 @@ _FILES = (
 
 
 def bring_turns(
-    path: Path, ring: Ring | None, kind: str | None = None, unit: Unit | None = None
+    path: Path,
+    ring: Ring | None,
+    kind: str | None = None,
+    unit: Unit | None = None,
+    told: Told | None = None,
 ) -> Imported:
     """Turns of the beam, of a file that the package `turn_by_turn` reads.
 
@@ -95,6 +95,7 @@ def bring_turns(
         ring: the lattice, whose names the monitors then have; None: names as they are.
         kind: see `read_turn_by_turn`; None: lhc, then sps.
         unit: of the file; None: mm.
+        told: names of monitors.
 
     Raises:
         OtherFormatError: it cannot be read.
@@ -111,7 +112,7 @@ def bring_turns(
             continue
         doubts: tuple[str, ...] = ()
         if ring is not None:
-            data, doubts = _of_ring(data, ring)
+            data, doubts = _of_ring(data, ring, told or Told())
         read = np.atleast_2d(np.isfinite(data.readings).any(axis=(0, 1)))
         single = int((read.sum(axis=1) == 1).sum())
         said = [
@@ -136,10 +137,10 @@ def bring_turns(
     ) from why
 
 
-def _of_ring(data: Measurement, ring: Ring) -> tuple[Measurement, tuple[str, ...]]:
+def _of_ring(data: Measurement, ring: Ring, told: Told) -> tuple[Measurement, tuple[str, ...]]:
     """The monitors that the ring has, under its names and in its order, and what it has not."""
     ours = Names("monitor", [element.name for element in ring.monitors])
-    place = {name: ours.find(name) for name in data.monitors}
+    place = {name: ours.find(told.name_of(name)) for name in data.monitors}
     there = sorted((at, name) for name, at in place.items() if at is not None)
     missing = [name for name, at in place.items() if at is None]
     if not there:
@@ -180,25 +181,7 @@ Header = list[tuple[str, str]]
 """Name and unit of each column."""
 
 
-def _read(path: Path) -> tuple[Header, list[list[str]]]:
-    try:
-        lines = csv.reader(StringIO(text_of(path), newline=""), skipinitialspace=True)
-        rows = [row for row in lines if row]
-    except csv.Error as error:
-        raise MeasurementError(f"'{path}' cannot be read as CSV ({error})") from error
-    if len(rows) < 2:
-        raise MeasurementError(f"{path}: no rows below the header; nothing was read")
-    matched = [_HEADER.match(name) for name in rows[0]]
-    header = [(m["name"], m["unit"] or "") for m in matched if m]
-    for line, row in enumerate(rows[1:], 2):
-        if len(row) != len(header):
-            raise MeasurementError(
-                f"{path}, row {line}: {len(row)} fields where the header has {len(header)}"
-            )
-    return header, rows[1:]
-
-
-def _number(path: Path, line: int, text: str) -> float:
+def _number(path: str, line: int, text: str) -> float:
     try:
         value = float(text) if text.strip() else np.nan
     except ValueError:
@@ -206,7 +189,7 @@ def _number(path: Path, line: int, text: str) -> float:
     return value
 
 
-def _factor(path: Path, name: str, unit: str, of: dict[str, float]) -> float:
+def _factor(path: str, name: str, unit: str, of: dict[str, float]) -> float:
     if not unit:
         return 1.0
     if unit.strip().lower() not in of:
@@ -214,7 +197,9 @@ def _factor(path: Path, name: str, unit: str, of: dict[str, float]) -> float:
     return of[unit.strip().lower()]
 
 
-def _long(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
+def _long(
+    path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring, told: Told
+) -> Imported:
     place = {name.lower(): i for i, (name, _) in enumerate(header)}
     for name in ("corrector", "monitor", "x", "y", "kick"):
         if name not in place:
@@ -243,11 +228,13 @@ def _long(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring)
     said = [f"x in {header[place['x']][1] or 'm'}, kicks in {header[place['kick']][1] or 'rad'}"]
     return _response(
         ring, {n: (angle * kicks[n], own) for n, own in columns.items()},
-        None if rf is None or rf_orbit is None else (kicks[rf], rf_orbit), said,
+        None if rf is None or rf_orbit is None else (kicks[rf], rf_orbit), said, told,
     )  # fmt: skip
 
 
-def _wide(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring) -> Imported:
+def _wide(
+    path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring, told: Told
+) -> Imported:
     place = {name.lower(): i for i, (name, _) in enumerate(header)}
     for name in ("monitor", "plane"):
         if name not in place:
@@ -271,7 +258,7 @@ def _wide(path: Path, header: Header, rows: Sequence[Sequence[str]], ring: Ring)
         f"the table is orbit per kick, in {header[-1][1] or 'm/rad'}: what the steps were is not "
         f"known, and {KICK:g} rad is taken"
     ]
-    return _response(ring, columns, None, said)
+    return _response(ring, columns, None, said, told)
 
 
 def _response(
@@ -279,29 +266,37 @@ def _response(
     columns: dict[str, tuple[float, dict[str, tuple[float, float]]]],
     rf: tuple[float, dict[str, tuple[float, float]]] | None,
     said: Sequence[str],
+    told: Told,
 ) -> Imported:
-    monitors = list(dict.fromkeys(ring[m].name for _, own in columns.values() for m in own))
+    every = dict.fromkeys(m for _, own in columns.values() for m in own)
+    of = {device: ring[told.name_of(device)].name for device in (*columns, *every)}
+    bad = [m for m in every if told.is_bad(m, of[m])]
+    monitors = list(dict.fromkeys(of[m] for m in every if m not in bad))
     index = {name: i for i, name in enumerate(monitors)}
 
     def orbit(own: dict[str, tuple[float, float]]) -> Array:
         spread = np.full((len(monitors), 2), np.nan)
         for name, xy in own.items():
-            spread[index[ring[name].name]] = xy
+            if of[name] in index:
+                spread[index[of[name]]] = xy
         return spread
 
     planes = []
     for name in columns:
-        if ring[name].kind not in _PLANES:
-            raise MeasurementError(f"'{name}' is a {ring[name].kind} of the lattice, no corrector")
-        planes.append(_PLANES[ring[name].kind])
+        kind = ring[of[name]].kind
+        if kind not in _PLANES:
+            raise MeasurementError(f"'{of[name]}' is a {kind} of the lattice, no corrector")
+        planes.append(_PLANES[kind])
     more = [
         "each step is from one side to the other",
         "the RF frequency stood still while correctors were stepped",
         "no noise is given",
     ]
+    if bad:
+        more.append(f"bad monitors, left out as told: {counted(bad)}")
     return Imported(
         OrbitResponse(
-            correctors=tuple(ring[name].name for name in columns),
+            correctors=tuple(of[name] for name in columns),
             planes=tuple(planes),
             kicks=np.array([kick for kick, _ in columns.values()]),
             monitors=tuple(monitors),
@@ -309,6 +304,7 @@ def _response(
             rf=None if rf is None else _step(ring, rf[0], orbit(rf[1])),
             lattice="lattice.json",
             energy=ring.energy,
+            devices=device_names((own, device) for device, own in of.items()),
         ),
         ring,
         (*said, *more, *(["no response to the RF's step is given"] if rf is None else [])),

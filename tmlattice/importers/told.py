@@ -1,26 +1,13 @@
-"""What a user tells of a file in a small YAML file: names, unit, noise, monitors to leave out."""
+"""What a user states of files of readings (the machine file): names, unit, noise, bad monitors."""
 
-import re
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-
-from tmlattice.errors import MeasurementError, plain
-from tmlattice.input_files import check_shape, yaml_of
+from fnmatch import fnmatchcase
+from typing import Any
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
-IN_ORDER = "in-order"
 COLUMNS = ("monitor", "plane", "value", "shot", "turn")
-
-TEMPLATE = """\
-# What tmlattice is told of a file of readings (--map FILE); every line may be left out.
-unit: mm               # of readings whose header has none: m, mm, um or nm; else taken from size
-noise: 20 um           # rms of one reading; else estimated from the readings
-names:                 # device or column in the file: the lattice's monitor (or: names: in-order)
-{names}
-bad: [{bad}]  # monitors to leave out; patterns such as 'BPM_9*' too
-columns: {{}}            # where they are called otherwise, e.g. {{monitor: pv, shot: cycle}}
-"""
 
 
 @dataclass(frozen=True)
@@ -29,11 +16,12 @@ class Told:
 
     Attributes:
         unit: of readings whose header has none; None: from their size.
-        noise: rms of a reading, m; None: not known.
-        names: device or column in the file -> the lattice's monitor.
+        noise: rms of a reading, m; None: unknown.
+        names: device or column in the file -> the lattice's monitor or corrector.
         in_order: the devices are the lattice's monitors in beam order, whatever their names.
         bad: monitors to leave out, by either name; patterns.
         columns: what columns are called: of `COLUMNS`, the name in the file.
+        assume: conventions that the readings have, see `measurement.assume`.
     """
 
     unit: str | None = None
@@ -42,41 +30,95 @@ class Told:
     in_order: bool = False
     bad: tuple[str, ...] = ()
     columns: Mapping[str, str] = field(default_factory=dict)
+    assume: tuple[str, ...] = ()
 
+    def name_of(self, device: str) -> str:
+        """The lattice's name of a device, or the device's own."""
+        plain = device.casefold()
+        return next((own for key, own in self.names.items() if key.casefold() == plain), device)
 
-def read_told(path: Path) -> Told:
-    """The file of `--map`.
-
-    Raises:
-        MeasurementError: no YAML, or a key or value that is not known.
-    """
-    document = yaml_of(path, MeasurementError)
-    document = {} if document is None else document
-    check_shape(path, document, "map", MeasurementError)
-    stated = {key: value for key, value in document.items() if value is not None}
-    names = stated.get("names", {})
-    if isinstance(names, str) and names != IN_ORDER:
-        raise MeasurementError(f"{path}: names are 'device: monitor', or {IN_ORDER}")
-    bad = stated.get("bad", [])
-    return Told(
-        unit=stated.get("unit"),
-        noise=_length(stated["noise"], path) if "noise" in stated else None,
-        names={} if names == IN_ORDER else names,
-        in_order=names == IN_ORDER,
-        bad=(bad,) if isinstance(bad, str) else tuple(bad),
-        columns=stated.get("columns", {}),
-    )
-
-
-def _length(value: str, path: Path) -> float:
-    """m, of a number or of a number with its unit."""
-    match = re.match(r"^\s*([-+0-9.eE]+)\s*(m|mm|um|µm|nm)?\s*$", value)
-    try:
-        length = float(match[1]) * METRES[match[2] or "m"] if match else 0.0
-    except ValueError:
-        length = 0.0
-    if not 0 < length < 1:
-        raise MeasurementError(
-            f"{path}: the noise is '{plain(value, 40)}'; give a length below 1 m, such as 20 um"
+    def is_bad(self, *names: str) -> bool:
+        """Whether a pattern of the bad monitors is like one of the names."""
+        return any(
+            fnmatchcase(name.casefold(), pattern.casefold())
+            for name in names
+            for pattern in self.bad
         )
-    return length
+
+
+def machine_text(
+    lattice: str,
+    stated: Mapping[str, Any],
+    silent: Mapping[str, Any],
+    channels: Mapping[str, str | None],
+    knob: Mapping[str, Any],
+) -> str:
+    """The text of a machine file (TOML): what is known is filled in, the rest is a comment.
+
+    Args:
+        lattice: a built-in name, or a path from the folder of the file.
+        stated: values of the keys of [lattice] and [data], of any of them.
+        silent: values that are shown in comments.
+        channels: device or column in the data -> the lattice's BPM; None: a comment.
+        knob: of a power supply, as an example.
+    """
+
+    every = {**EXAMPLES, **silent, "file": lattice, **stated}
+
+    def lines(*keys: str) -> list[str]:
+        used = ["" if key == "file" or key in stated else "# " for key in keys]
+        values = [
+            f"{mark}{key} = {_toml(every[key])}" for mark, key in zip(used, keys, strict=True)
+        ]
+        return [f"{v:<36}  # {MEANINGS[key]}" for v, key in zip(values, keys, strict=True)]
+
+    named = [
+        f"{'' if name else '# '}{_toml(device)} = {_toml(name or '')}"
+        for device, name in channels.items()
+    ]
+    return "\n".join([
+        "# The machine file of tmlattice: with it, commands need none of this, nor LATTICE, again.",
+        "# Every line may be left out. Paths are relative to this file.", "",
+        "[lattice]",
+        *lines("file", "sequence", "energy", "particle", "monitors", "correctors"), "",
+        "[data]  # of files of other programs; a measurement folder states all of it itself",
+        *lines("unit", "noise", "bad", "assume", "in_order", "columns"), "",
+        "[channels]  # device or column in the data = BPM or corrector of the lattice",
+        *(named or ['# "SR:BPM-001" = "bpm_1"']), "",
+        "# Power supplies, for `tmlattice correct`: what is left out is taken from the lattice.",
+        '# Or a table, above [lattice]: supplies = "knobs.csv" (`tmlattice correct --example`).',
+        "# [[supplies]]",
+        *(f"# {key} = {_toml(value)}" for key, value in knob.items()), "",
+    ])  # fmt: skip
+
+
+EXAMPLES: Mapping[str, Any] = {
+    "sequence": "ring", "energy": 6.0, "particle": "electron", "monitors": ["BPM*"],
+    "correctors": ["COR*"], "unit": "mm", "noise": "20 um", "bad": ["BPM_9*"],
+    "assume": ["x-reversed"], "in_order": True, "columns": {"monitor": "pv", "shot": "cycle"},
+}  # fmt: skip
+MEANINGS: Mapping[str, str] = {
+    "file": "or a built-in name",
+    "sequence": "of a file that holds several",
+    "energy": "GeV; else what the lattice states",
+    "particle": 'or "proton"; else what the lattice states',
+    "monitors": "elements that are BPMs although the file has them as markers or drifts",
+    "correctors": "elements that are correctors too",
+    "unit": "of readings whose file states none: m, mm, um, nm; else taken from their size",
+    "noise": "rms of one reading; else estimated",
+    "bad": "BPMs to leave out, by name or channel",
+    "assume": "signs and units that are not the package's; `tmlattice check` names them",
+    "in_order": "the channels are the lattice's BPMs in beam order, whatever their names",
+    "columns": "what columns are called, where the names are not the usual ones",
+}
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_toml(own)}" for key, own in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, str):
+        value = value.encode(errors="replace").decode()
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -8,7 +8,7 @@ from scipy.special import chdtrc, chdtri, stdtr, stdtrit
 
 
 def sf(statistic: ArrayLike, freedom: ArrayLike) -> Any:
-    """Chance that a chi-square of so many degrees reaches this; NaN without a degree.
+    """Probability that a chi-square with these degrees of freedom exceeds a value; NaN without any.
 
     Source: `scipy.stats.chi2.sf`, which calls the same function.
     """
@@ -17,11 +17,11 @@ def sf(statistic: ArrayLike, freedom: ArrayLike) -> Any:
 
 
 def known(square: float, freedom: float) -> float:
-    """The chi-square of one degree that is as rare as the square of Student's t.
+    """Chi-square of one degree of freedom with the tail probability of a squared Student's t.
 
     Args:
         square: of an amount over its error, whose variance is itself an estimate.
-        freedom: degrees of that estimate; infinite: it is known.
+        freedom: degrees of freedom of that estimate; infinite: the variance is known.
     """
     if not np.isfinite(freedom):
         return square
@@ -29,12 +29,12 @@ def known(square: float, freedom: float) -> float:
 
 
 def estimated(square: float, freedom: float) -> float:
-    """The square of Student's t that is as rare as this chi-square of one degree: see `known`."""
+    """Squared Student's t with the tail probability of a chi-square of one degree: see `known`."""
     if not np.isfinite(freedom):
         return square
     return float(stdtrit(freedom, max(0.5 * chdtrc(1, square), 1e-300)) ** 2)
 
 
 def isf(rate: ArrayLike, freedom: ArrayLike) -> Any:
-    """What a chi-square of so many degrees reaches at this rate; NaN without a degree."""
+    """Quantile of chi-square at an upper tail probability; NaN without a degree of freedom."""
     return np.where(np.asarray(freedom) > 0, chdtri(freedom, rate), np.nan)[()]

@@ -1,12 +1,10 @@
-"""Errors of a fit whose readings share what the model lacks: by column, or by monitor.
+"""Cluster-robust errors of a fit whose readings share model discrepancy, by column or by monitor.
 
-A posterior takes readings for independent. But what the model lacks of a corrector's column is
-often a wave that all of its readings have, and what it lacks at a monitor stays there in all
-columns: so many readings then tell as much as few. Each cluster of readings (those of one column,
-or of one monitor) is therefore taken out of the normal equations by itself, and its number held
-against what all others say (a jackknife, exact for linear least squares: Bell and McCaffrey, Survey
-Methodology 28 (2002) 169). By the model the mismatch of each is one standard deviation; by how much
-it is more, the errors are.
+A posterior takes readings as independent. Model discrepancy of a corrector's column is often a wave
+in all of its readings, and that at a monitor is the same in all columns. Each cluster of readings
+(one column, or one monitor) is therefore taken out of the normal equations and compared with the
+prediction of all others (a jackknife, exact for linear least squares: Bell and McCaffrey, Survey
+Methodology 28 (2002) 169). Errors grow by the ratio of the observed to the expected mismatch.
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,31 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from tmlattice.inference.common import beside
+from tmlattice.inference.common import times_precision
 from tmlattice.inference.normal import shared_by
 from tmlattice.inference.slopes import Slopes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-ALONE = 0.75
-"""Share of what is known of a number from which a cluster is not held against the others: they know
-too little of it. The cluster is then taken for as far off as it is elsewhere."""
+MAX_LEVERAGE = 0.75
+"""Leverage of a cluster above which the other readings know too little to test it. The mean
+mismatch of the others is then used in its place."""
 
-MOST = 64
-"""Columns, and monitors, that are taken out, drawn at random where there are more: what is sought
-is how much they contradict one another in the mean."""
+MAX_CLUSTERS = 64
+"""Columns, and monitors, that are taken out at most, drawn at random."""
 
-LEAST = 1e-11
-"""What others know of a number beside a cluster, at least, as a share."""
+MIN_SHARE = 1e-11
+"""Smallest share of the information that the other readings have of a quantity."""
 
 
 class Rows(NamedTuple):
-    """What readings do for each parameter, as `normal.normal_equations` has it.
+    """Derivatives of readings, as in `normal.normal_equations`.
 
     Attributes:
         plane: in which each column is read, [column].
-        by_monitor, by_column: of each reading's own number, [column, monitor].
+        by_monitor, by_column: [column, monitor].
         by_ring: [error, column, monitor].
     """
 
@@ -50,7 +47,7 @@ class Rows(NamedTuple):
     by_ring: Array
 
     def times(self, column: Indices, monitor: Indices, other: Array) -> Array:
-        """Those of some readings times [parameter, any], [reading, any]."""
+        """Return rows of some readings times [parameter, any], [reading, any]."""
         columns, monitors = self.by_monitor.shape
         ring = 2 * monitors + columns
         out = self.by_ring[:, column, monitor].T @ other[ring:]
@@ -60,7 +57,7 @@ class Rows(NamedTuple):
         return np.asarray(out)
 
 
-class Found(NamedTuple):
+class LinearFit(NamedTuple):
     """A linear fit, and quantities that are linear in its parameters.
 
     Attributes:
@@ -76,55 +73,55 @@ class Found(NamedTuple):
     variance: Array
 
     @classmethod
-    def of(cls, matrix: Array, covariance: Array) -> "Found":
-        """Of the parameters themselves."""
+    def of(cls, matrix: Array, covariance: Array) -> "LinearFit":
+        """Return the fit with its parameters as the quantities."""
         return cls(matrix, covariance, covariance, np.diag(covariance))
 
 
-def widened(
-    rows: Rows, weight: Array, residual: Array, found: Found, taken: Array | None = None
+def cluster_robust_errors(
+    rows: Rows, weight: Array, residual: Array, found: LinearFit, taken: Array | None = None
 ) -> Array:
-    """Errors of a fit's quantities, widened where clusters of readings contradict one another.
+    """Standard errors of a fit's quantities, larger where clusters of readings disagree.
 
-    Where readings are independent they are the posterior's: up to some per cent that chance adds.
+    For independent readings they are the posterior's errors, up to a few per cent by chance.
 
     Args:
-        rows: of all readings.
+        rows: derivatives of all readings.
         weight: 1 / variance, 0 where missing, [column, monitor].
-        residual: what the fit leaves, [column, monitor].
+        residual: of the fit, [column, monitor].
         found: the fit.
-        taken: from the weights by what the readings of a column have in common, L of
-            `inference.common.common`, [column, monitor, pattern]; None: they have nothing.
+        taken: L of `inference.common.common`, the readings' common modes, [column, monitor,
+            pattern]; None: no common modes.
 
     Returns:
         Standard deviations, [quantity].
     """
-    # what the readings' noise makes of the variance; the rest is the prior's
-    told = (found.along * (found.matrix @ found.along)).sum(axis=0)
-    more = np.zeros_like(told)
+    # the readings' part of the variance; the rest is the prior's
+    noise_variance = (found.along * (found.matrix @ found.along)).sum(axis=0)
+    more = np.zeros_like(noise_variance)
     for clusters in (_of_columns, _of_monitors):
         shares, mismatch = _mismatches(clusters(rows, weight, residual, taken), found)
         size = np.maximum(shares.sum(axis=0), 1e-300)
         more += np.maximum((shares * mismatch).sum(axis=0) / size - 1, 0)
-    return np.asarray(np.sqrt(np.maximum(found.variance + told * more, 0)))
+    return np.asarray(np.sqrt(np.maximum(found.variance + noise_variance * more, 0)))
 
 
 def _drawn(weight: Array, axis: int) -> Indices:
-    """Clusters that are taken out, of those that have readings along an axis."""
+    """Clusters to take out, of those that have readings along an axis."""
     found = np.flatnonzero(weight.sum(axis))
-    if len(found) <= MOST:
+    if len(found) <= MAX_CLUSTERS:
         return found
-    return np.sort(np.random.default_rng(0).permutation(found)[:MOST])
+    return np.sort(np.random.default_rng(0).permutation(found)[:MAX_CLUSTERS])
 
 
 class _Cluster(NamedTuple):
-    """Readings that are taken out together, white beside all those that stay.
+    """Readings that are taken out together, white given all others.
 
     Attributes:
         rows, column, monitor: of the readings.
-        root: by which they become white, [reading] or [reading, reading].
-        others: what the other readings of their columns tell, [reading, parameter]; None: nothing.
-        left: what the fit leaves, white, [reading].
+        root: whitens them, [reading] or [reading, reading].
+        others: prediction from the other readings of their columns, [reading, parameter]; or None.
+        left: whitened residual, [reading].
     """
 
     rows: Rows
@@ -144,7 +141,7 @@ class _Cluster(NamedTuple):
 def _of_columns(
     rows: Rows, weight: Array, residual: Array, taken: Array | None
 ) -> Iterator[_Cluster]:
-    """Of one column each: nothing that stays has anything in common with them."""
+    """Clusters of one column each; columns are independent."""
     for own in _drawn(weight, axis=1):
         monitor = np.flatnonzero(weight[own])
         column = np.full(len(monitor), own)
@@ -160,9 +157,8 @@ def _of_columns(
 def _of_monitors(
     rows: Rows, weight: Array, residual: Array, taken: Array | None
 ) -> Iterator[_Cluster]:
-    """Of one monitor each, one reading of a column: by the inverse covariance of the column, less
-    what its other readings tell."""
-    pulled = weight * residual if taken is None else beside(weight, taken, residual)
+    """Clusters of one monitor each: one reading per column, given the column's other readings."""
+    weighted = weight * residual if taken is None else times_precision(weight, taken, residual)
     shared = (
         None if taken is None else (taken, shared_by(*rows[:3], (Slopes(rows.by_ring),), taken))
     )
@@ -171,16 +167,16 @@ def _of_monitors(
         monitor, alone, others = np.full(len(column), own), weight[column, own], None
         root = np.sqrt(alone)
         if shared is not None:
-            here, told = shared[0][column, own], shared[1][:, column]
+            here, noise_variance = shared[0][column, own], shared[1][:, column]
             root = np.sqrt(alone - np.sum(here**2, axis=1))
-            others = np.einsum("ck,pck->cp", here / root[:, None], told)
-        left = pulled[column, own] / root
+            others = np.einsum("ck,pck->cp", here / root[:, None], noise_variance)
+        left = weighted[column, own] / root
         yield _Cluster(rows, column, monitor, alone / root, others, left)
 
 
-def _mismatches(clusters: Iterable[_Cluster], found: Found) -> tuple[Array, Array]:
-    """Of each cluster its share of what is known of every quantity, and the square of what it says
-    beside all others over what is expected of that, [cluster, quantity]."""
+def _mismatches(clusters: Iterable[_Cluster], found: LinearFit) -> tuple[Array, Array]:
+    """Leverage of each cluster, and its squared mismatch over the expected one, [cluster,
+    quantity]."""
     known = found.variance > 0
     shares, mismatch = [], []
     for cluster in clusters:
@@ -194,18 +190,18 @@ def _mismatches(clusters: Iterable[_Cluster], found: Found) -> tuple[Array, Arra
         whole = np.where(known, found.variance + grown, 1.0)
         share = np.where(known, grown / whole, 0.0)
         own = moved**2 / grown
-        judged = np.where(share < ALONE, share, 0.0)
-        elsewhere = float(judged @ own) / max(float(judged.sum()), 1e-300)
+        leverage = np.where(share < MAX_LEVERAGE, share, 0.0)
+        elsewhere = float(leverage @ own) / max(float(leverage.sum()), 1e-300)
         shares.append(share)
-        mismatch.append(np.where(share < ALONE, own, elsewhere))
+        mismatch.append(np.where(share < MAX_LEVERAGE, own, elsewhere))
     return np.array(shares), np.array(mismatch)
 
 
 def _apart(inside: Array, right: Array) -> Array:
-    """(1 - inside)^-1 right; what a cluster knows alone is limited to what can be told from 1."""
-    matrix = (1 + LEAST) * np.eye(len(inside)) - inside
+    """(1 - inside)^-1 right, with eigenvalues of at least `MIN_SHARE`."""
+    matrix = (1 + MIN_SHARE) * np.eye(len(inside)) - inside
     try:
         return np.asarray(cho_solve(cho_factor(matrix), right))
-    except np.linalg.LinAlgError:  # lost in rounding: readings far above their noise
+    except np.linalg.LinAlgError:  # by rounding: readings far above their noise
         size, vectors = np.linalg.eigh(matrix)
-        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, LEAST)[:, None]))
+        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, MIN_SHARE)[:, None]))

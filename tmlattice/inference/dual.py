@@ -1,8 +1,8 @@
-"""Many small causes at once: the most probable amounts under a prior, more of them than readings.
+"""Most probable amounts of many errors under a prior, more amounts than readings.
 
-Gauss and Newton in the space of the readings: with the slopes J and the prior's variances P the
-amounts are P J^T (J P J^T + C)^-1 target. J is not needed itself, only its products, which the
-problem knows (`Slopes`). Tails give each amount a variance of its own, found as the fit goes.
+Gauss-Newton in the space of the readings: with slopes J and prior variances P the amounts are
+P J^T (J P J^T + C)^-1 target. Only products with J are needed (`Slopes`). Heavy tails give each
+amount a variance of its own, which is updated during the fit.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,25 +18,25 @@ from tmlattice.inference.priors import Student
 
 Array = NDArray[np.float64]
 
-FIRST_TRUST = 30.0
-"""The fit begins with a noise of the residual's rms over this, and ends with the readings' own: a
-linear model is worth no more, and a fit that believes it exactly runs away."""
+INITIAL_NOISE = 30.0
+"""The residual's rms over the first added noise, which falls to zero: a linear model that is
+believed exactly far from the solution diverges."""
 
 WIDEST, NARROWING = 1000.0, 1.78
-"""Tails have many local maxima: they begin this much wider, near a Gaussian, and every time that
-the variances are found anew they are narrower by the second figure."""
+"""Heavy tails have many local maxima: the prior starts wider by the first number, near a Gaussian,
+and narrows by the second at every update of the variances."""
 
-HALVES = 8
-"""A step is halved so often at most, where the linear model does not reach."""
+MAX_HALVINGS = 8
+"""Halvings of a step, at most, beyond the linear range."""
 
-CHOOSING = 4
-"""Iterations in which the scale of the prior follows the evidence."""
+SCALE_ITERATIONS = 4
+"""Iterations in which the prior's scale follows the evidence."""
 
 SCALES = np.logspace(-4, 3, 141)
 
 
 class Slopes(Protocol):
-    """d readings / d amounts about one point, as products."""
+    """d readings / d amounts at one point, as products."""
 
     def times(self, amounts: Array) -> Array:
         """J amounts, [row]."""
@@ -46,13 +46,13 @@ class Slopes(Protocol):
 
     @property
     def matrix(self) -> Array:
-        """J itself, [row, amount]: asked for where amounts are fewer than rows."""
+        """J itself, [row, amount]: used if there are fewer amounts than rows."""
 
     def kernel(self, variance: Array) -> Array:
         """J P J^T for variances P [amount], [row, row]."""
 
 
-class Many(Protocol):
+class AmountProblem(Protocol):
     """Readings as a function of many amounts."""
 
     @property
@@ -61,39 +61,39 @@ class Many(Protocol):
 
     @property
     def largest(self) -> float:
-        """No amount is larger."""
+        """Largest amount."""
 
     def residual(self, amounts: Array) -> Array:
-        """Measured less model, m, [row]; BeamLostError where there is none."""
+        """Measured less model, m, [row]; raises BeamLostError without a beam."""
 
     def slopes(self, amounts: Array) -> Slopes:
-        """About these amounts."""
+        """Slopes at these amounts."""
 
     def nuisances(self, amounts: Array) -> Array:
-        """Covariance of the readings by what else is not known, m^2, [row, row]."""
+        """Covariance of the readings by nuisances, m^2, [row, row]."""
 
 
 @dataclass(frozen=True)
 class MostProbable:
-    """Where a fit stands.
+    """A fit: amounts, residual and history.
 
     Attributes:
         amounts: [amount].
         residual: measured less model, m, [row].
-        prior: with the width as it is.
+        prior: with its final width.
         chi2: of every step.
-        settled: whether the last step was smaller than the noise.
+        converged: whether the last step was smaller than the noise.
     """
 
     amounts: Array
     residual: Array
     prior: Student
     chi2: tuple[float, ...]
-    settled: bool = False
+    converged: bool = False
 
 
 def most_probable(
-    problem: Many,
+    problem: AmountProblem,
     prior: Student,
     start: Array,
     *,
@@ -101,49 +101,51 @@ def most_probable(
     wide: bool = True,
     iterations: int = 12,
 ) -> MostProbable:
-    """The most probable amounts, from a noise far above the readings' own down to it.
+    """Most probable amounts, with an added noise that falls to zero.
 
     Args:
         problem: readings as a function of amounts.
         prior: of each amount.
         start: first guess, [amount].
-        choose: the width of the prior follows the evidence.
-        wide: tails begin wide; not where the start is a maximum of its own.
-        iterations: at most, at each level of noise.
+        choose: fit the width of the prior by the evidence.
+        wide: start with wide tails; not where the start is a local maximum to keep.
+        iterations: at most, at each level of added noise.
     """
     residual = problem.residual(start)
     now = MostProbable(start, residual, prior, (_chi2(problem, residual),))
     widening = WIDEST if wide and np.isfinite(prior.freedom) else 1.0
-    trust = float(np.sqrt(np.mean(residual**2))) / FIRST_TRUST
+    added_noise = float(np.sqrt(np.mean(residual**2))) / INITIAL_NOISE
     least = float(problem.sigma.min())
     while True:
-        trust = 0.0 if trust < least else trust
+        added_noise = 0.0 if added_noise < least else added_noise
         for i in range(iterations):
-            now, widening = _iterated(problem, now, trust, widening, choose and i < CHOOSING)
-            if now.settled:
+            now, widening = _iterated(
+                problem, now, added_noise, widening, choose and i < SCALE_ITERATIONS
+            )
+            if now.converged:
                 break
-        if trust == 0.0:
+        if added_noise == 0.0:
             return now
-        trust /= 10
+        added_noise /= 10
 
 
-def cost(problem: Many, found: MostProbable) -> float:
-    """- log of likelihood and prior, up to constants, with the readings' own noise."""
+def cost(problem: AmountProblem, found: MostProbable) -> float:
+    """Negative log posterior, up to constants, with the readings' own noise."""
     half = cho_factor(_base(problem, found.amounts, 0.0))
     return _cost(half, found.residual, found.prior, found.amounts)
 
 
-def posterior_base(problem: Many, found: MostProbable) -> Array:
+def posterior_base(problem: AmountProblem, found: MostProbable) -> Array:
     """Covariance of the readings without the amounts, m^2, [row, row]."""
     return _base(problem, found.amounts, 0.0)
 
 
-def _chi2(problem: Many, residual: Array) -> float:
+def _chi2(problem: AmountProblem, residual: Array) -> float:
     return float(np.sum((residual / problem.sigma) ** 2))
 
 
-def _base(problem: Many, amounts: Array, trust: float) -> Array:
-    return problem.nuisances(amounts) + np.diag(problem.sigma**2 + trust**2)
+def _base(problem: AmountProblem, amounts: Array, added_noise: float) -> Array:
+    return problem.nuisances(amounts) + np.diag(problem.sigma**2 + added_noise**2)
 
 
 def _cost(half: tuple[Array, bool], residual: Array, prior: Student, amounts: Array) -> float:
@@ -151,24 +153,24 @@ def _cost(half: tuple[Array, bool], residual: Array, prior: Student, amounts: Ar
 
 
 def _iterated(
-    problem: Many, now: MostProbable, trust: float, widening: float, choose: bool
+    problem: AmountProblem, now: MostProbable, added_noise: float, widening: float, choose: bool
 ) -> tuple[MostProbable, float]:
-    """One step with noise `trust` added; settled where it was smaller than the noise."""
-    slopes, base = problem.slopes(now.amounts), _base(problem, now.amounts, trust)
+    """Return one step with added noise; converged if the step is smaller than the noise."""
+    slopes, base = problem.slopes(now.amounts), _base(problem, now.amounts, added_noise)
     target = now.residual + slopes.times(now.amounts)
     if choose:
         unit = slopes.kernel(np.ones(len(now.amounts)))
         now = replace(now, prior=replace(now.prior, width=best_scale(unit, base, target)))
     wanted, half = now.amounts, cho_factor(base)
     best = _linear(slopes, base, half, target, len(wanted))
-    for _ in range(HALVES if np.isfinite(now.prior.freedom) else 1):  # along one linear model
+    for _ in range(MAX_HALVINGS if np.isfinite(now.prior.freedom) else 1):  # along one linear model
         wide = replace(now.prior, width=now.prior.width * widening)
         wanted = best(wide.precision(wanted))
         widening = max(1.0, widening / NARROWING)
     wide = replace(now.prior, width=now.prior.width * widening)
     step = np.clip(wanted, -problem.largest, problem.largest) - now.amounts
     before = _cost(half, now.residual, wide, now.amounts)
-    for _ in range(HALVES):
+    for _ in range(MAX_HALVINGS):
         try:
             residual = problem.residual(now.amounts + step)
             if _cost(half, residual, wide, now.amounts + step) <= before:
@@ -178,19 +180,19 @@ def _iterated(
         step = step / 2
     else:
         chi2 = (*now.chi2, now.chi2[-1])
-        return replace(now, chi2=chi2, settled=widening == 1.0), widening
-    least = float(np.sqrt((problem.sigma**2).min() + trust**2))
+        return replace(now, chi2=chi2, converged=widening == 1.0), widening
+    least = float(np.sqrt((problem.sigma**2).min() + added_noise**2))
     small = bool(np.abs(slopes.times(step)).max() < 0.1 * least)
     chi2 = (*now.chi2, _chi2(problem, residual))
-    settled = small and widening == 1.0
-    return MostProbable(now.amounts + step, residual, now.prior, chi2, settled), widening
+    converged = small and widening == 1.0
+    return MostProbable(now.amounts + step, residual, now.prior, chi2, converged), widening
 
 
 def _linear(
     slopes: Slopes, base: Array, half: tuple[Array, bool], target: Array, amounts: int
 ) -> Callable[[Array], Array]:
-    """The best amounts of a linear model as a function of the prior's precisions [amount], in the
-    space of amounts or of readings, whichever is the smaller."""
+    """Best amounts of a linear model as a function of the prior's precisions [amount], in the space
+    of amounts or of readings, whichever is smaller."""
     if amounts < len(target):
         J = slopes.matrix
         weighed = cho_solve(half, J)
@@ -211,7 +213,7 @@ def _linear(
 
 
 def best_scale(kernel: Array, base: Array, target: Array) -> float:
-    """The factor s of greatest evidence, target ~ N(0, s^2 kernel + base)."""
+    """Factor s of the largest evidence, target ~ N(0, s^2 kernel + base)."""
     half = np.linalg.cholesky(base)
     inner = np.linalg.solve(half, np.linalg.solve(half, kernel).T)
     values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
@@ -221,6 +223,6 @@ def best_scale(kernel: Array, base: Array, target: Array) -> float:
     return float(SCALES[int(evidence.argmax())])
 
 
-def best_of(problem: Many, found: Sequence[MostProbable]) -> MostProbable:
-    """The one of least cost."""
+def best_of(problem: AmountProblem, found: Sequence[MostProbable]) -> MostProbable:
+    """Return the fit of least cost."""
     return min(found, key=lambda one: cost(problem, one))

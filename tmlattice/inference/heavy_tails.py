@@ -1,11 +1,10 @@
 """Posterior moments when any member of a group may be the faulty one.
 
-A Gaussian prior with the scale that sound members have excludes a faulty member, whatever the data
-say. Here each member's prior is a mixture of Gaussians (`Group.mixture`), and the posterior's means
-and covariance are found by expectation propagation (Minka, UAI 2001; for sparse linear models
-Seeger, JMLR 9 (2008) 759): each member's prior is replaced by a Gaussian whose product with all the
-rest has the mean and the variance that the mixture gives. If the data cannot distinguish between
-two members, either may be faulty, and both have errors that say so.
+A Gaussian prior at the scale of sound members excludes a faulty member, whatever the data. Here
+each member's prior is a mixture of Gaussians (`Group.mixture`), and the posterior's moments are
+found by expectation propagation (Minka, UAI 2001; for sparse linear models Seeger, JMLR 9 (2008)
+759): each prior is replaced by a Gaussian whose product with the rest has the mean and variance of
+the exact product. If the data cannot distinguish two members, both have large errors.
 """
 
 from collections.abc import Sequence
@@ -24,25 +23,23 @@ Array = NDArray[np.float64]
 SWEEPS = 100
 """Sweeps at most."""
 DAMPING, LARGEST = 0.3, 0.5
-"""Share of each update that is applied, of a precision in its logarithm, and the largest step of
-that: all members are updated at once, and two that stand for each other would oscillate."""
-CLEAR = 1e3
-"""Times what the narrowest component of a prior says of its member, from which on the data alone
-count."""
-SETTLED = 1e-2
-"""Largest change of a mean, in standard deviations, or of the logarithm of a variance in a sweep
-after which none is made."""
+"""Share of each update that is applied, and the largest change of a log precision: all members are
+updated at once, and two that compensate each other would oscillate."""
+DATA_ALONE = 1e3
+"""Information over that of the narrowest prior component above which the prior is ignored."""
+CONVERGED = 1e-2
+"""Largest change in a sweep, of a mean in standard deviations or of a log variance, at the end."""
 
 
 class Moments(NamedTuple):
-    """Of the base parameters: mean, [parameter], and covariance, [parameter, parameter]."""
+    """Mean, [parameter], and covariance, [parameter, parameter], of the base parameters."""
 
     mean: Array
     covariance: Array
 
 
 class _Mixtures:
-    """The priors of all members, padded to one number of components, [member, component]."""
+    """Priors of all members, padded to one number of components, [member, component]."""
 
     def __init__(self, groups: Sequence[Group]) -> None:
         each = [group.mixture() for group in groups]
@@ -59,7 +56,7 @@ class _Mixtures:
         self.variance = np.sum(np.exp(self.log_chance) * self.square, axis=1)
 
     def some(self, members: NDArray[np.bool_]) -> "_Mixtures":
-        """Those of some members."""
+        """Return the priors of some members."""
         made = copy(self)
         made.log_chance, made.square = self.log_chance[members], self.square[members]
         return made
@@ -78,23 +75,23 @@ class _Mixtures:
 
 
 def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
-    """Return mean and covariance of the base parameters under the heavy-tailed priors.
+    """Mean and covariance of the base parameters under heavy-tailed priors.
 
     Args:
         normal: at `start`.
-        groups: the priors, with the scales that they have learnt.
-        start: the base parameters where the residual was taken, [parameter].
+        groups: priors with their scales.
+        start: base parameters of the residual, [parameter].
     """
     basis = np.concatenate([group.basis for group in groups], axis=1)
     priors = _Mixtures(groups)
-    unit = np.sqrt(priors.variance)  # so that the matrix is well scaled
+    unit = np.sqrt(priors.variance)  # scales the matrix
     A = (basis * unit).T @ normal.matrix @ (basis * unit)
     A[np.diag_indices(len(A))] *= 1 + ROUNDING
     b = unit * (basis.T @ (normal.vector + normal.matrix @ start))
     priors.square /= priors.variance[:, None]
     precision, pull = np.ones(len(A)), np.zeros(len(A))
     rest = 1 / np.diag(_gaussian(A, b, precision, pull)[1]) - 1
-    open_ = rest * priors.square.min(axis=1) < CLEAR  # of the others no prior says anything
+    open_ = rest * priors.square.min(axis=1) < DATA_ALONE  # the prior matters for these alone
     if open_.any():
         follow = np.linalg.solve(
             A[np.ix_(~open_, ~open_)] + np.eye(int((~open_).sum())), A[np.ix_(~open_, open_)]
@@ -109,7 +106,7 @@ def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
 
 
 def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
-    """Precisions and pulls of the Gaussians in place of the priors."""
+    """Precisions and shifts of the Gaussians in place of the priors."""
     precision, pull = np.ones(len(A)), np.zeros(len(A))
     for _ in range(SWEEPS):
         mean, covariance = _gaussian(A, b, precision, pull)
@@ -117,13 +114,13 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
         rest = np.maximum(1 / variance - precision, 0.0)
         others = mean / variance - pull
         center, spread = priors.times(rest, others)
-        wanted = np.maximum(1 / spread - rest, 1.0)  # no wider than the prior itself
+        wanted = np.maximum(1 / spread - rest, 1.0)  # no wider than the prior
         drawn = center * (rest + wanted) - others
         changed = max(
             np.abs((center - mean) / np.sqrt(variance)).max(),
             np.abs(np.log((wanted + rest) * variance)).max(),
         )
-        if changed < SETTLED:
+        if changed < CONVERGED:
             break
         step = DAMPING * np.log(wanted / precision)
         precision = precision * np.exp(np.clip(step, -LARGEST, LARGEST))
@@ -132,7 +129,7 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
 
 
 def _gaussian(A: Array, b: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Mean and covariance with Gaussian priors of these precisions and pulls."""
+    """Mean and covariance with Gaussian priors of these precisions and shifts."""
     factor = cho_factor(A + np.diag(precision), lower=True, check_finite=False)
     covariance = cho_solve(factor, np.eye(len(A)), check_finite=False)
     return covariance @ (b + pull), (covariance + covariance.T) / 2

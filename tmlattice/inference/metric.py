@@ -1,7 +1,7 @@
-"""Products of signatures with data and with one another, nuisances projected out.
+"""Products of signatures with data and with each other, nuisances projected out.
 
-A scan needs no signature itself, only its square and its products with data. A kind of measurement
-says what the signatures are (`rows`), and may know quicker ways for some of them (`quick`).
+A scan needs only the squares of signatures and their products with data. A kind of measurement
+gives the signatures (`rows`), and may have faster ways for some of them (`quick`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,16 +15,16 @@ from tmlattice.inference.whitening import Projection
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Hypothesis = tuple[str, str | None]
-"""An effect and the place where it might sit."""
+"""An effect and its place."""
 
 
 @dataclass(frozen=True)
 class Products:
-    """Of signatures [hypothesis] with themselves and with rows of data.
+    """Products of signatures [hypothesis] with themselves and with rows of data.
 
     Attributes:
         whole: square, [hypothesis].
-        inside: the part of it along the launches' directions, [hypothesis].
+        inside: its part along the nuisances' directions, [hypothesis].
         inner: with the data, [hypothesis, data].
     """
 
@@ -34,22 +34,22 @@ class Products:
 
     @classmethod
     def empty(cls, hypotheses: int, data: int) -> "Products":
-        """All zero."""
+        """Return zeros."""
         return cls(np.zeros(hypotheses), np.zeros(hypotheses), np.zeros((hypotheses, data)))
 
     def put(self, at: Indices, whole: Array, inside: Array | float, inner: Array) -> None:
-        """Those of some hypotheses."""
+        """Set the products of some hypotheses."""
         self.whole[at], self.inside[at], self.inner[at] = whole, inside, inner
 
 
 class Metric:
-    """Products about one point; this one makes every signature.
+    """Products at one point; this class forms every signature.
 
     Args:
         projection: of the nuisances.
 
     Attributes:
-        chunk: hypotheses at a time: the memory of a scan does not grow with their number.
+        chunk: hypotheses at a time, which bounds the memory of a scan.
     """
 
     chunk = 512
@@ -58,16 +58,16 @@ class Metric:
         self.projection = projection
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
-        """Whitened signatures, d rows / d amount ** power, [hypothesis, row]; of what is discrete
-        the change when it is there."""
+        """Whitened signatures, d rows / d amount ** power, [hypothesis, row]; of a discrete effect
+        its change of the rows."""
         raise NotImplementedError
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in what needs no signature; returns which of the hypotheses these are."""
+        """Put in products that need no signature; return the indices of their hypotheses."""
         return np.zeros(0, dtype=np.intp)
 
     def products(self, hypotheses: Sequence[Hypothesis], data: Array) -> Products:
-        """Of every hypothesis with itself and with data, [data, row], nuisances projected out."""
+        """Return products of each hypothesis with itself and with data [data, row]."""
         found = Products.empty(len(hypotheses), len(data))
         rest = np.ones(len(hypotheses), dtype=bool)
         rest[self.quick(hypotheses, data, found)] = False
@@ -80,10 +80,10 @@ class Metric:
         return found
 
     def pieces(self, hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[Indices, Array]]:
-        """Every signature, some rows of all hypotheses at a time; here all rows at once.
+        """Yield every signature, some rows of all hypotheses at a time; here all rows at once.
 
         Yields:
-            Which rows, [row], and the signatures there, [hypothesis, row].
+            Indices of rows, [row], and the signatures there, [hypothesis, row].
         """
         some = [
             self.rows(hypotheses[start : start + self.chunk])
@@ -94,7 +94,7 @@ class Metric:
             yield np.arange(rows.shape[1]), rows
 
     def free_kicks(self, places: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
-        """Information of a free kick at places, and its product with data.
+        """Information of free kicks at places, and their product with data.
 
         Returns:
             [place, block, p, p] and [place, block, p]; parameters of different blocks are
@@ -103,5 +103,5 @@ class Metric:
         raise NotImplementedError
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """The same for all readings of a monitor, [monitor, ...]."""
+        """Information of all readings of each monitor, and their product with data."""
         raise NotImplementedError

@@ -1,7 +1,7 @@
 """Causes, free kicks and nuisances fitted together through the full nonlinear model.
 
-Gauss and Newton on amounts; the nuisances are eliminated by projection, a step that makes things
-worse is halved. The evidence of a set of causes weighs its misfit against what it assumes.
+Gauss-Newton on amounts; nuisances are eliminated by projection, and a step that raises the cost is
+shortened. The evidence of a set of causes weighs its misfit against its prior.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,36 +18,35 @@ from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
 
-SHRINK = (1.0, 0.5, 0.25, 0.0625)
-"""Shares of a step that are tried, until one makes things better."""
+STEP_SHARES = (1.0, 0.5, 0.25, 0.0625)
+"""Shares of a step, tried in turn until the cost falls."""
 
-UNSEEN = 1e-12
-"""Information about an amount below which these readings do not see it: its error would be a
-million, in any unit."""
+MIN_INFORMATION = 1e-12
+"""Information about an amount below which the readings do not determine it: an error of a million,
+in any unit."""
 
 
 class Outcome(StrEnum):
-    """How a fit ended; all but the first are told to whoever reads the result."""
+    """How a fit ended; every outcome but the first is reported."""
 
     CONVERGED = "converged"
-    STEPS = "the fit ran out of steps while it still gained: allow more"
+    STEPS = "the fit ran out of steps while it still improved: allow more"
     STUCK = "no step along the slopes helped: the model is too curved here, or its slopes are wrong"
-    GIVEN_UP = "given up: its rivals explain far more"
-    SINGULAR = "the amounts cannot be told apart by these readings"
-    LOST = "the model has no answer there"
+    GIVEN_UP = "given up: alternatives explain far more"
+    SINGULAR = "these readings cannot distinguish the amounts"
+    LOST = "the model has no solution there"
 
 
 @dataclass(frozen=True)
 class Slope:
-    """d rows / d amount of one cause, [row], and where it was taken: at which amount, and with
-    which orbit."""
+    """d rows / d amount of one cause, [row], with the amount and the orbit where it was taken."""
 
     row: Array
     amount: float
     orbit: Array
 
-    def holds(self, amount: float, orbit: Array, same: float) -> bool:
-        """Whether amount and orbit are still the same within a share."""
+    def valid_at(self, amount: float, orbit: Array, same: float) -> bool:
+        """Whether amount and orbit are the same within a share."""
         if abs(amount - self.amount) > same * abs(amount):
             return False
         if orbit is self.orbit:
@@ -61,7 +60,7 @@ NO_SLOPES: Slopes = {}
 
 @dataclass(frozen=True)
 class Fit:
-    """Causes with their best amounts, and what they leave.
+    """Causes with their best amounts, and the residual.
 
     Attributes:
         point: the model there.
@@ -80,17 +79,17 @@ class Fit:
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """With their amounts."""
+        """Causes with their amounts."""
         return self.point.causes
 
     @property
     def kicks(self) -> Kicks:
-        """Free ones, by place."""
+        """Free kicks, by place."""
         return self.point.kicks
 
     @property
     def nuisances(self) -> Array:
-        """As fitted."""
+        """Fitted nuisances."""
         return self.point.nuisances
 
     @property
@@ -100,23 +99,23 @@ class Fit:
 
     @property
     def projection(self) -> Projection:
-        """Of the nuisances."""
+        """Projection of the nuisances."""
         assert self.point.projection is not None, self.point.lost
         return self.point.projection
 
     @property
     def clean(self) -> Array:
-        """What is left, nuisances projected out, [row]."""
+        """Residual with nuisances projected out, [row]."""
         return self.projection.out(self.residual)
 
     @property
     def chi2(self) -> float:
-        """Residual squared, the rows of what is known of the nuisances included."""
+        """Chi-square, the prior rows of the nuisances included."""
         return self.point.chi2
 
     @property
     def good(self) -> bool:
-        """Whether amounts, errors and evidence mean something."""
+        """Whether amounts, errors and evidence are valid."""
         return self.outcome in (Outcome.CONVERGED, Outcome.STEPS, Outcome.STUCK)
 
 
@@ -131,20 +130,20 @@ def fit(
     hopeless: float = -np.inf,
     slopes: Slopes = NO_SLOPES,
 ) -> Fit:
-    """The best amounts of these causes, the best free kicks, and the best nuisances.
+    """Fit the amounts of causes, free kicks and nuisances.
 
     Args:
         problem: model and data.
-        causes: with first guesses of their amounts; discrete ones are taken as they are.
+        causes: with first guesses of their amounts; discrete ones stay.
         nuisances: first guess.
-        kicks: free ones by place, with first guesses.
+        kicks: free kicks by place, with first guesses.
         steps: at most.
-        tolerance: of chi-square, at which no further step is made.
-        hopeless: give up where the evidence stays far below this after two steps.
-        slopes: of an earlier fit of the same problem: those that still hold are not taken again.
+        tolerance: of chi-square, below which the fit ends.
+        hopeless: evidence; far below it the fit is given up after two steps.
+        slopes: of an earlier fit of the same problem, reused where they are valid.
     """
     point = problem.at(causes, nuisances, kicks)
-    if point.lost:  # a first guess that the model cannot follow: start small
+    if point.lost:  # the model has no solution at the first guess: start closer to zero
         small = [
             c if find(c.effect).discrete else replace(c, amount=0.1 * c.amount) for c in causes
         ]
@@ -155,29 +154,29 @@ def fit(
     slopes, rows = _with_slopes(problem, point, slopes)
     now = _cost(problem, point)
     for step in range(steps):
-        change, moved, promised = _step(problem, point, rows)
+        change, moved, expected_fall = _step(problem, point, rows)
         best = _best_move(problem, point, change, moved, now)
         if best is None:
-            outcome = Outcome.CONVERGED if promised < max(0.1, tolerance) else Outcome.STUCK
+            outcome = Outcome.CONVERGED if expected_fall < max(0.1, tolerance) else Outcome.STUCK
             break
         fell, point = now - _cost(problem, best), best
         now -= fell
-        if fell < tolerance and promised < tolerance:
+        if fell < tolerance and expected_fall < tolerance:
             outcome = Outcome.CONVERGED
             break
         slopes, rows = _with_slopes(problem, point, slopes)
-        if step == 1 and -0.5 * now < hopeless - 100 - 0.5 * promised:
+        if step == 1 and -0.5 * now < hopeless - 100 - 0.5 * expected_fall:
             outcome = Outcome.GIVEN_UP
             break
     return _finished(problem, point, slopes, rows, outcome)
 
 
-SETTLING = 3
-"""Steps of Newton for nuisances alone: they are all but linear."""
+NUISANCE_STEPS = 3
+"""Newton steps for nuisances alone: they are nearly linear."""
 
 
-def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
-    """The point of causes that stay as they are, at the best nuisances.
+def fit_nuisances(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
+    """Return the point of fixed causes at the best nuisances.
 
     Args:
         problem: model and data.
@@ -185,7 +184,7 @@ def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Poin
         nuisances: first guess.
     """
     point = problem.at(causes, nuisances)
-    for _ in range(SETTLING):
+    for _ in range(NUISANCE_STEPS):
         if point.projection is None:
             break
         change = point.projection.coordinates(point.residual)
@@ -196,7 +195,7 @@ def settled(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Poin
 
 
 def _cost(problem: Problem, point: Point) -> float:
-    """Chi-square, and what the prior adds to it where it pulls."""
+    """Chi-square plus the prior's penalty, if it has one."""
     if point.lost:
         return np.inf
     if problem.amounts.tails is None:
@@ -209,14 +208,14 @@ def _continuous(point: Point) -> list[int]:
 
 
 def _with_slopes(problem: Problem, point: Point, known: Slopes) -> tuple[Slopes, Array]:
-    """Slopes that hold at a point; and d rows / d parameters: amounts, then each place's kicks."""
+    """Slopes at a point; and d rows / d parameters: amounts, then the kicks of each place."""
     rows = []
     slopes: dict[Hypothesis, Slope] = {}
     for i in _continuous(point):
         cause = point.causes[i]
         place = (cause.effect, cause.element)
         slope = known.get(place)
-        if slope is None or not slope.holds(cause.amount, point.orbit, problem.judgement.same):
+        if slope is None or not slope.valid_at(cause.amount, point.orbit, problem.judgement.same):
             slope = Slope(problem.slope(point, i), cause.amount, point.orbit)
         slopes[place] = slope
         rows.append(slope.row[None])
@@ -224,8 +223,8 @@ def _with_slopes(problem: Problem, point: Point, known: Slopes) -> tuple[Slopes,
     return slopes, np.concatenate(rows) if rows else np.zeros((0, len(point.residual)))
 
 
-def _pulls(problem: Problem, point: Point, count: int) -> tuple[Array, Array]:
-    """Precision of the prior of each parameter, and its amount; none of free kicks."""
+def _prior_terms(problem: Problem, point: Point, count: int) -> tuple[Array, Array]:
+    """Prior precision of each parameter, and its amount; zero for free kicks."""
     precision, amount = np.zeros((2, count))
     for row, i in enumerate(_continuous(point)):
         precision[row] = problem.amounts.precision(point.causes[i])
@@ -234,34 +233,34 @@ def _pulls(problem: Problem, point: Point, count: int) -> tuple[Array, Array]:
 
 
 def _step(problem: Problem, point: Point, rows: Array) -> tuple[Array, Array, float]:
-    """Changes of parameters and nuisances, and how far the cost should fall."""
+    """Changes of parameters and nuisances, and the expected fall of the cost."""
     assert point.projection is not None
     clean = point.projection.out(point.residual)
     change = np.zeros(len(rows))
-    promised = point.chi2 - float(clean @ clean)
+    expected_fall = point.chi2 - float(clean @ clean)
     if len(rows):
         own = point.projection.out(rows)
-        precision, amount = _pulls(problem, point, len(rows))
+        precision, amount = _prior_terms(problem, point, len(rows))
         size = np.sqrt(np.einsum("kr,kr->k", own, own) + precision)
         scale = np.where(size > 0, size, 1.0)
         unit = own / scale[:, None]
         gram = unit @ unit.T + np.diag(precision / scale**2 + 1e-10)
         inner = unit @ clean - precision * amount / scale
         solved = np.linalg.solve(gram, inner)
-        promised += float(inner @ solved)
+        expected_fall += float(inner @ solved)
         change = solved / np.where(size > 0, size, np.inf)
     left = point.residual - change @ rows
-    return change, point.projection.coordinates(left), promised
+    return change, point.projection.coordinates(left), expected_fall
 
 
 def _best_move(
     problem: Problem, point: Point, change: Array, moved: Array, now: float
 ) -> Point | None:
-    """The point after the largest share of a step that makes things better."""
-    for shrink in SHRINK:
+    """Point after the largest share of a step that lowers the cost."""
+    for shrink in STEP_SHARES:
         trial = _moved(problem, point, shrink * change, shrink * moved)
         cost = _cost(problem, trial)
-        if trial.lost:  # nothing to go on from, even where the start is worth no more
+        if trial.lost:  # no start for the next step
             continue
         if cost < now or (shrink == 1.0 and cost <= now + 1e-6):
             return trial
@@ -281,7 +280,7 @@ def _moved(problem: Problem, point: Point, change: Array, moved: Array) -> Point
 
 
 def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outcome: Outcome) -> Fit:
-    """Errors and evidence at the best amounts."""
+    """Add errors and evidence at the best amounts."""
     assert point.projection is not None
     named = _continuous(point)
     covariance = np.zeros((len(point.causes), len(point.causes)))
@@ -293,8 +292,8 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
         log_evidence += problem.prior((cause.effect, cause.element))
         log_evidence += problem.amounts.log_density(cause)
     if named:
-        full = gram + np.diag(_pulls(problem, point, len(rows))[0])
-        if (np.diagonal(full)[: len(named)] < UNSEEN).any():
+        full = gram + np.diag(_prior_terms(problem, point, len(rows))[0])
+        if (np.diagonal(full)[: len(named)] < MIN_INFORMATION).any():
             return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
         size = np.sqrt(np.maximum(np.diagonal(full), 1e-300))
         scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))

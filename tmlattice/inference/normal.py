@@ -1,10 +1,8 @@
 """Linear least squares with Gaussian priors for one pair of planes of an orbit response.
 
-Three kinds of parameter meet in one residual d [column, monitor]: what scales all readings of a
-monitor (gain, or the other plane's share), what scales a column (corrector calibration, or roll),
-and what changes the ring. Their normal equations are dense only in the last.
-
-Parameters have priors in groups, see `inference.priors.Group`.
+A residual d [column, monitor] has three kinds of parameters: scales of a monitor's readings (gain,
+or the other plane's share), scales of a column (corrector calibration, or roll), and errors of the
+ring. Only the last make the normal equations dense. See `inference.priors.Group` for the priors.
 """
 
 from collections.abc import Sequence
@@ -30,7 +28,7 @@ ROUNDING = 1e-11
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations; parameters: monitor and plane, then column, then error of the ring.
+    """Normal equations; parameters: monitor and plane, then column, then ring error.
 
     Attributes:
         matrix: J^T W J, [parameter, parameter].
@@ -50,7 +48,7 @@ def normal_equations(
     by_ring: Array | Sequence[Slopes],
     taken: Array | None = None,
 ) -> Normal:
-    """Sums over all readings.
+    """Return the normal equations from sums over all readings.
 
     Args:
         residual: measured less model, m, [column, monitor]; weight 0 where missing.
@@ -60,8 +58,8 @@ def normal_equations(
         by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
         by_ring: d reading / d error, [error, column, monitor], or those of each family; may be
             empty.
-        taken: from the weights by what the readings of a column have in common, L of
-            `inference.common.common`, [column, monitor, pattern]; None: they have nothing.
+        taken: L of `inference.common.common`, the readings' common modes, [column, monitor,
+            pattern]; None: no common modes.
     """
     columns, monitors = residual.shape
     ring = (Slopes(np.asarray(by_ring)),) if isinstance(by_ring, np.ndarray) else tuple(by_ring)
@@ -115,14 +113,14 @@ def shared_by(
 
 @dataclass(frozen=True)
 class Posterior:
-    """What the residual is explained by.
+    """Posterior of a linear fit.
 
     Attributes:
         values: of the base parameters, [parameter].
-        groups: with the scales that they have learnt.
+        groups: with their estimated scales.
         basis: of all groups, [parameter, p].
-        prior: rms of their parameters that the values are solved with, [p].
-        factor: lower triangle L of the normal equations in these units, L L^T, [p, p].
+        prior: prior rms of the groups' parameters, [p].
+        factor: lower triangle L of the normal equations in units of the priors, L L^T, [p, p].
     """
 
     values: Array
@@ -133,28 +131,28 @@ class Posterior:
 
     @property
     def occam(self) -> float:
-        """Log of the share of the priors that the data leave, 0 where they say nothing."""
+        """Occam factor: log volume of the posterior over that of the prior, 0 without data."""
         return -float(np.log(np.diag(self.factor)).sum())
 
     @cached_property
     def spread(self) -> Array:
-        """Of the base parameters: basis times prior rms, [parameter, p]."""
+        """Basis times prior rms, [parameter, p]."""
         return np.asarray(self.basis.toarray() * self.prior)
 
     @cached_property
     def covariance(self) -> Array:
-        """Of the groups' parameters, in units of their priors, [p, p]."""
+        """Covariance of the groups' parameters, in units of their priors, [p, p]."""
         lower = dpotri(self.factor, lower=1)[0]
         return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
     @property
     def sigma(self) -> Array:
-        """Posterior errors of the base parameters, [parameter]."""
+        """Posterior standard deviations of the base parameters, [parameter]."""
         square = ((self.spread @ self.covariance) * self.spread).sum(axis=1)
         return np.asarray(np.sqrt(np.maximum(square, 0)))
 
     def solved(self, vector: Array) -> Array:
-        """Values with another right side of the normal equations, [parameter]."""
+        """Values for another right-hand side of the normal equations, [parameter]."""
         right = self.prior * (self.basis.T @ vector)
         return np.asarray(self.basis @ (self.prior * cho_solve((self.factor, True), right)))
 
@@ -163,38 +161,37 @@ def solve(
     normal: Normal,
     groups: Sequence[Group],
     start: Array | None = None,
-    trust: Array | None = None,
+    step_bound: Array | None = None,
     rounds: int = 2,
 ) -> Posterior:
-    """One step of Gauss and Newton: the most probable parameters, and the groups' scales.
+    """Return the posterior after one Gauss-Newton step, and the groups' scales.
 
     Args:
         normal: at `start`.
-        groups: the priors, about zero; every base parameter that may move is in one of them.
-        start: the base parameters where the residual was taken; None: zero.
-        trust: rms by which each may move away from `start`; None: freely. It shortens the step and
-            not the result: a fixed point does not know it.
-        rounds: of EM; 0: the priors stay as they are.
+        groups: zero-mean priors; every free base parameter is in one of them.
+        start: base parameters of the residual; None: zero.
+        step_bound: rms of the step of each; None: unbounded. It does not change the fixed point.
+        rounds: of EM; 0: the priors stay.
     """
     known = np.zeros(len(normal.vector)) if start is None else start
     groups = tuple(groups)
-    basis = csr_array(np.concatenate([g.basis for g in groups], axis=1))  # a few numbers a column
+    basis = csr_array(np.concatenate([g.basis for g in groups], axis=1))  # sparse
     edges = np.cumsum([g.basis.shape[1] for g in groups])[:-1]
-    base = normal.matrix if trust is None else normal.matrix + np.diag(trust**-2)
+    base = normal.matrix if step_bound is None else normal.matrix + np.diag(step_bound**-2)
     A = basis.T @ (basis.T @ base).T
     b = basis.T @ (normal.vector + base @ known)
     for turn in range(max(rounds, 1)):
         prior = np.concatenate([g.scale for g in groups])
-        # in units of the priors, so that the matrix is well scaled
+        # in units of the priors: well scaled
         scaled = A * prior
         scaled *= prior[:, None]
-        # above the rounding of sums over all readings
+        # damping above the rounding of sums over all readings
         scaled[np.diag_indices(len(A))] += 1 + ROUNDING * np.diag(scaled)
         factor = lower_factor(scaled)
         found = prior * cho_solve((factor, True), prior * b)
         if turn < rounds:
             half = inverse_of_lower(factor)
-            left = np.einsum("ij,ij->j", half, half)  # the diagonal of the covariance
+            left = np.einsum("ij,ij->j", half, half)  # diagonal of the covariance
             parts = np.split(found**2, edges), np.split(left, edges)
             groups = tuple(g.learn(own, left) for g, own, left in zip(groups, *parts, strict=True))
     return Posterior(basis @ found, groups, basis, prior, factor)

@@ -1,24 +1,24 @@
-"""What could be done next without a name: a free kick, a monitor set aside, a reading left out."""
+"""Next steps of a search without an effect of the catalogue: free kick, BPM or reading rejected."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from tmlattice.inference.alternatives import Alternative, Detection
 from tmlattice.inference.problem import Point, Problem
-from tmlattice.inference.rivals import Detection, Rival
 from tmlattice.inference.scan import FreeScan, free_threshold, look_elsewhere
 
-AMONG = 10
-"""Readings for each one that is wrong for once: of a few, such as two tunes, none is."""
+READINGS_PER_OUTLIER = 10
+"""Readings per rejected one, at least: of a few readings, such as two tunes, none is rejected."""
 
 Reading = tuple[int, ...]
-"""Where it stands among the problem's readings."""
+"""Index among the problem's readings."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """What could be done next: by how much the log evidence grows, and how it was seen."""
+    """Next step of a search: its gain in log evidence, and its significance."""
 
     kind: str
     name: str
@@ -26,7 +26,7 @@ class Option:
     detection: Detection
     where: int = -1
     reading: Reading = ()
-    rivals: tuple[Rival, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
 
 
 def unnamed(
@@ -36,14 +36,14 @@ def unnamed(
     names: Sequence[str],
     taken: Mapping[int, Detection],
 ) -> list[Option]:
-    """Something without a name at the place where it explains most, if that is clear.
+    """Free kick or rejected BPM that explains most, if significant.
 
     Args:
         problem: model and data.
         kind: "kick" or "monitor".
         free: the scan of all places.
         names: of the places.
-        taken: places that have one already.
+        taken: places that have one.
     """
     rate = problem.judgement.rate(kind)
     place = int(free.gain.argmax())
@@ -60,16 +60,16 @@ def unnamed(
     return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
 
 
-def spike(problem: Problem, point: Point, already: int) -> list[Option]:
-    """The reading that is least explained, left out, if that is clear.
+def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
+    """Rejection of the reading with the largest residual, if significant.
 
     Args:
         problem: model and data.
-        point: the model at what was found.
-        already: readings that were left out.
+        point: the model of the fit.
+        already: number of rejected readings.
     """
     judge = problem.judgement
-    if int(problem.valid.sum()) < AMONG * (already + 1):
+    if int(problem.valid.sum()) < READINGS_PER_OUTLIER * (already + 1):
         return []
     clean, size = problem.left(point)
     statistic = np.where(size > 1e-3, clean**2 / np.maximum(size, 1e-3), 0.0)
@@ -79,6 +79,6 @@ def spike(problem: Problem, point: Point, already: int) -> list[Option]:
     seen = Detection(value, free_threshold(rate, 1, count), look_elsewhere(value, 1, count))
     if not seen.p_value < rate:
         return []
-    # an amount even over its logarithm, as for every other cause
-    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.spike
+    # a log-uniform amount, as for every other cause
+    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.outlier_prior
     return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]

@@ -1,9 +1,9 @@
-"""What readings leave known of small errors, from sums over their rows: no signature is held whole.
+"""Posterior of distributed errors from sums over rows, without storing signatures.
 
-With signatures S (rms times slope, errors x rows) and what is left r, the likeliest errors are
-(1 + S S^T)^-1 S r, and their covariance is (1 + S S^T)^-1. Both need S S^T and S r alone, which
-are added up some rows at a time: memory goes as the square of the errors, whatever the number of
-readings. `among` holds all signatures, because a search among small errors whitens rows by them.
+With signatures S (rms times slope, errors x rows) and residual r, the most probable errors are
+(1 + S S^T)^-1 S r, and their covariance is (1 + S S^T)^-1. S S^T and S r are summed some rows at a
+time: memory grows as the square of the errors, whatever the number of readings. `distributed` keeps
+all signatures, since its search whitens rows by them.
 """
 
 from collections.abc import Mapping
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 
 from tmlattice.effects import find
-from tmlattice.inference.among import (
-    LEAST,
-    ROUNDS,
-    Known,
-    chains,
+from tmlattice.inference.distributed import (
+    LINEARISATIONS,
+    MIN_SHARE,
+    DistributedErrors,
+    chain_factors,
+    components_of_rows,
     families_of,
-    kept,
-    near,
-    sizes_of,
+    linearise,
+    sampled_rows,
 )
 from tmlattice.inference.problem import Point, Problem
 
@@ -32,47 +32,47 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Posterior:
-    """Small errors as these readings leave them.
+    """Distributed errors given these readings.
 
     Attributes:
-        before: what was known, with the sizes as learnt.
-        amounts: the likeliest, [error].
-        felt: which errors the readings feel.
-        spread: S S^T of these, in the coordinates of `Known.mixed`, [felt, felt].
-        errors: relative error of each size by effect, where they were learnt.
+        before: the prior, with its estimated scales.
+        amounts: most probable amounts, [error].
+        visible: errors with a signature.
+        spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
+        errors: relative error of each estimated scale, by effect.
     """
 
-    before: Known = field(repr=False)
+    before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
-    felt: NDArray[np.int64] = field(repr=False)
+    visible: NDArray[np.int64] = field(repr=False)
     spread: Array = field(repr=False)
     errors: Mapping[str, float]
 
     @property
     def sizes(self) -> dict[str, float]:
-        """rms by effect."""
+        """Estimated rms by effect."""
         own = zip(self.before.hypotheses, self.before.rms.tolist(), strict=True)
         return {name: rms for (name, _), rms in own}
 
     @cached_property
-    def known(self) -> Known:
-        """What is known now."""
+    def known(self) -> DistributedErrors:
+        """Posterior distribution."""
         values, vectors = eigh(
-            self.spread, subset_by_value=(LEAST / (1 - LEAST), np.inf), check_finite=False
+            self.spread, subset_by_value=(MIN_SHARE / (1 - MIN_SHARE), np.inf), check_finite=False
         )
         seen = np.zeros((len(values), len(self.amounts)))
-        seen[:, self.felt] = vectors.T
-        return self.before.since(self.amounts, values / (1 + values), seen)
+        seen[:, self.visible] = vectors.T
+        return self.before.updated(self.amounts, values / (1 + values), seen)
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Of d rows / d amount over all rows, nuisances projected out.
+    """Sums of d rows / d amount over all rows, nuisances projected out.
 
     Attributes:
-        gram: with one another, [error, error].
-        inner: with what is left of the readings, [error].
-        some: themselves in a few rows, nuisances not projected out, [error, row].
+        gram: with each other, [error, error].
+        inner: with the residual, [error].
+        some: slopes in a few rows, nuisances not projected out, [error, row].
     """
 
     gram: Array
@@ -81,76 +81,86 @@ class Sums:
 
 
 def posterior(
-    problem: Problem, known: Known, *, learn: bool = True, about: Array | None = None
+    problem: Problem,
+    known: DistributedErrors,
+    *,
+    learn: bool = True,
+    linearised_at: Array | None = None,
 ) -> Posterior:
-    """What is known of small errors since these readings, linear about the likeliest amounts.
+    """Return the posterior of distributed errors, linearised at the most probable amounts.
 
     Args:
         problem: of the design.
-        known: beforehand; where sizes are learnt they start there.
-        learn: the sizes are learnt; else they are as known.
-        about: amounts from which on it is linear at first, [error]; None: those that are known.
+        known: prior, with initial scales.
+        learn: estimate the scales; else they stay.
+        linearised_at: first point of linearisation, [error]; None: the prior's mean.
 
     Raises:
-        UnstableRingError: the likeliest small errors leave no stored beam.
+        UnstableRingError: no beam is stored with the most probable errors.
     """
     names, belongs = families_of(known)
-    amounts = stored = known.amounts if about is None else about
+    amounts = stored = known.amounts if linearised_at is None else linearised_at
     nuisances, errors = problem.first, dict[str, float]()
-    for _ in range(ROUNDS):
-        inner, point, amounts = near(problem, known, amounts, stored, (), nuisances)
+    for _ in range(LINEARISATIONS):
+        inner, point, amounts = linearise(problem, known, amounts, stored, (), nuisances)
         assert point.projection is not None
         stored, nuisances = amounts, point.nuisances
-        keep = kept(len(point.residual))
-        sums = summed(inner, point, known, amounts, keep)
+        keep = sampled_rows(len(point.residual))
+        sums = sums_at(inner, point, known, amounts, keep)
         beyond = amounts - known.amounts
         if learn:
-            found = sizes_of(
+            found = components_of_rows(
                 point.residual[keep] + beyond @ sums.some, point.projection.matrix()[keep],
-                known.mixed(known.rms[:, None] * sums.some), belongs,
+                known.correlated(known.rms[:, None] * sums.some), belongs,
             )  # fmt: skip
             errors = dict(zip(names, found.error.tolist(), strict=True))
             known = replace(known, rms=known.rms * found.scale[belongs])
-        spread = known.mixed(known.mixed(known.rms[:, None] * sums.gram * known.rms).T)
-        felt = np.flatnonzero(np.diag(spread) > 0)
-        spread = spread[np.ix_(felt, felt)]
-        pull = known.mixed(known.rms * (sums.inner + sums.gram @ beyond))
+        spread = known.correlated(known.correlated(known.rms[:, None] * sums.gram * known.rms).T)
+        visible = np.flatnonzero(np.diag(spread) > 0)
+        spread = spread[np.ix_(visible, visible)]
+        pull = known.correlated(known.rms * (sums.inner + sums.gram @ beyond))
         likeliest = np.zeros(len(pull))
-        factor = cho_factor(spread + np.eye(len(felt)), overwrite_a=True, check_finite=False)
-        likeliest[felt] = cho_solve(factor, pull[felt], check_finite=False)
-        own = zip(known.hypotheses, known.amounts + known.rms * known.mixed(likeliest), strict=True)
-        amounts = np.array([find(name).some_left(amount) for (name, _), amount in own])
-    return Posterior(known, amounts, felt, spread, errors)
+        factor = cho_factor(spread + np.eye(len(visible)), overwrite_a=True, check_finite=False)
+        likeliest[visible] = cho_solve(factor, pull[visible], check_finite=False)
+        own = zip(
+            known.hypotheses, known.amounts + known.rms * known.correlated(likeliest), strict=True
+        )
+        amounts = np.array([find(name).floored(amount) for (name, _), amount in own])
+    return Posterior(known, amounts, visible, spread, errors)
 
 
-def summed(
-    problem: Problem, point: Point, known: Known, amounts: Array, keep: NDArray[np.int64]
+def sums_at(
+    problem: Problem,
+    point: Point,
+    known: DistributedErrors,
+    amounts: Array,
+    keep: NDArray[np.int64],
 ) -> Sums:
-    """The sums about a point.
+    """Return the sums at a point.
 
     Args:
-        problem: with the small errors in it.
+        problem: with the distributed errors in it.
         point: of nuisances alone.
-        known: which errors.
-        amounts: of those that are in the problem, [error].
-        keep: the few rows.
+        known: the errors.
+        amounts: amounts of the errors in the problem, [error].
+        keep: rows for `Sums.some`.
     """
     assert point.projection is not None
     clean = point.projection.out(point.residual)
     directions = np.linalg.qr(point.projection.matrix())[0]
-    slope = chains(known, amounts)
+    slope = chain_factors(known, amounts)
     count = len(slope)
     gram, inner = np.zeros((count, count)), np.zeros(count)
     along, some = np.zeros((count, directions.shape[1])), np.zeros((count, len(keep)))
     column = np.full(len(clean), -1)
     column[keep] = np.arange(len(keep))
     for rows, signatures in problem.everywhere().metric(point).pieces(known.hypotheses):
-        felt = np.flatnonzero(signatures.any(axis=1))  # errors of other monitors are not
-        own = slope[felt, None] * signatures[felt]
-        gram[np.ix_(felt, felt)] += own @ own.T
-        inner[felt] += own @ clean[rows]
-        along[felt] += own @ directions[rows]
+        visible = np.flatnonzero(signatures.any(axis=1))
+        own = slope[visible, None] * signatures[visible]
+        gram[np.ix_(visible, visible)] += own @ own.T
+        inner[visible] += own @ clean[rows]
+        along[visible] += own @ directions[rows]
         here = column[rows]
-        some[np.ix_(felt, here[here >= 0])] = own[:, here >= 0]
+        some[np.ix_(visible, here[here >= 0])] = own[:, here >= 0]
     gram -= along @ along.T
     return Sums(gram, inner, some)

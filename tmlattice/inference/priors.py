@@ -1,12 +1,10 @@
-"""How likely amounts are before the data: one distribution, whose tails are a number.
+"""Priors of amounts: one distribution whose degrees of freedom set its tails.
 
-A fault has an amount of its own (`AmountPrior`); small errors come in groups (`Group`): each has
-its own scale, which follows the evidence (EM), and may be shared: an error of a family beside the
-errors of its members.
+A fault has an amount of its own (`AmountPrior`). Distributed errors come in groups (`Group`), each
+with a scale that follows the evidence (EM); a family may have an error in common with its members.
 
-The degree of freedom says how heavy they are: infinite is Gauss, 4 forgives a few large ones, 1 is
-Cauchy, and 0 the limit in which every power of ten is as likely, so that the cost of an amount is
-that of its relative error, whatever the effect.
+The tails: infinite degrees of freedom are Gauss, 4 admits a few large errors, 1 is Cauchy, and 0 is
+the log-uniform limit, in which the cost of an amount is that of its relative error.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Student:
-    """Student's distribution about zero.
+    """Student's distribution with zero mean.
 
     Attributes:
         width: in the unit of the amounts.
@@ -34,15 +32,14 @@ class Student:
     freedom: float
 
     def penalty(self, amounts: ArrayLike) -> Array:
-        """- log density less that at zero."""
+        """Negative log density less that at zero."""
         squares = np.square(np.asarray(amounts, dtype=float) / self.width)
         if np.isinf(self.freedom):
             return np.asarray(0.5 * squares)
         return np.asarray((self.freedom + 1) / 2 * np.log1p(squares / self.freedom))
 
     def precision(self, amounts: ArrayLike) -> Array:
-        """Of the Gaussian that touches the distribution from below at the amounts: its pull towards
-        zero is this times the amount."""
+        """Precision of the Gaussian that touches the density from below at these amounts."""
         squares = np.square(np.asarray(amounts, dtype=float))
         if np.isinf(self.freedom):
             return np.full(squares.shape, self.width**-2.0)
@@ -60,13 +57,13 @@ class Student:
 
 @dataclass(frozen=True)
 class AmountPrior:
-    """Of the amount of one fault.
+    """Prior of the amount of one fault.
 
     Attributes:
-        tails: its distribution; None: no degree of freedom, even in log |amount|, over `decades` up
-            to the largest fault, thin beyond it.
+        tails: its distribution; None: log-uniform in |amount| over `decades` up to the largest
+            fault, thin beyond it.
         decades: powers of ten.
-        bound: no larger amount is possible.
+        bound: largest possible amount.
     """
 
     tails: Student | None = None
@@ -74,7 +71,7 @@ class AmountPrior:
     bound: float = np.inf
 
     def log_density(self, cause: Cause) -> float:
-        """Of the amount; 0 for what is there or not."""
+        """Log density of the amount; 0 for a discrete effect."""
         effect = find(cause.effect)
         if effect.discrete:
             return 0.0
@@ -88,33 +85,32 @@ class AmountPrior:
         return float(density - 8 * max(np.log(size / effect.largest), 0.0))
 
     def precision(self, cause: Cause) -> float:
-        """Its pull towards zero over the amount; a logarithm has no zero to be pulled to."""
+        """Prior precision at the amount; 0 for a log-uniform prior."""
         if self.tails is None or find(cause.effect).discrete:
             return 0.0
         return float(self.tails.precision(cause.amount))
 
 
-EVEN = AmountPrior()
-"""Even in the logarithm: of a fault that may have any size."""
+LOG_UNIFORM = AmountPrior()
+"""Log-uniform prior of a fault."""
 
 
 SMALLEST = 1e-9
-"""A prior's rms does not fall below."""
-GUESSED = 2.0
-"""rms of the logarithm of a scale about its first guess: a factor of seven."""
-BOLD = 1.5
-"""Largest step of that logarithm."""
-COMMONEST = 0.01
-"""Share of the members of a large group that are faulty: one in a hundred. Of a smaller group one
-member is."""
-DECADE = 4
-"""Scales of faulty members in a power of ten, log-uniform."""
+"""Smallest rms of a prior."""
+SCALE_SPREAD = 2.0
+"""rms of the log of a scale relative to its first guess: a factor of seven."""
+MAX_STEP = 1.5
+"""Largest step of a log scale."""
+FAULTY_SHARE = 0.01
+"""Share of faulty members in a large group; in a smaller group one member is faulty."""
+SCALES_PER_DECADE = 4
+"""Scales of faulty members per decade, log-uniform."""
 CORE = 5
-"""Scales that stand for the distribution of sound members."""
+"""Mixture components for the distribution of sound members."""
 SELECTED = 1e-3
-"""Share of the largest fault from which on a selected fault has its scale."""
-BEYOND = 3.0
-"""Times the scale of sound members from which on an amount is a fault."""
+"""Smallest scale of a selected fault, as a share of its largest amount."""
+FAULT_FROM = 3.0
+"""Smallest scale of a faulty member over that of sound members."""
 
 
 @dataclass(frozen=True)
@@ -122,15 +118,15 @@ class Group:
     """Parameters with one prior: the base parameters move by `basis` times theirs.
 
     Attributes:
-        name: for people.
+        name: for reports.
         basis: [base parameter, parameter].
-        rms: of the prior; where the search for it starts.
-        freedom: degree of freedom of Student's distribution; infinite: Gauss'.
-        fixed: the scale stays.
-        most: largest prior rms that physics allows one parameter.
-        each: prior rms of every parameter, as last found; None: `rms`.
-        first: rms that was guessed; None: `rms`.
-        guessed: rms of the logarithm of the scale about that.
+        rms: prior scale; where its estimate starts.
+        freedom: degrees of freedom of Student's distribution; infinite: Gauss.
+        fixed: the scale is not estimated.
+        most: largest possible prior rms of one parameter.
+        each: prior rms of every parameter, as last estimated; None: `rms`.
+        first: guessed rms; None: `rms`.
+        guessed: rms of the log scale relative to that guess.
         largest: largest fault of one member, in the unit of the parameters; 0: no member is faulty.
     """
 
@@ -142,12 +138,12 @@ class Group:
     most: float = np.inf
     each: Array | None = None
     first: float | None = None
-    guessed: float = GUESSED
+    guessed: float = SCALE_SPREAD
     largest: float = 0.0
 
     @property
     def guess(self) -> float:
-        """The rms that was guessed."""
+        """Guessed rms."""
         return self.rms if self.first is None else self.first
 
     @property
@@ -156,12 +152,11 @@ class Group:
         return np.full(self.basis.shape[1], self.rms) if self.each is None else self.each
 
     def mixture(self) -> tuple[Array, Array]:
-        """Prior of one member if any of them may be the faulty one, as a mixture of Gaussians.
+        """Prior of one member, any of which may be faulty, as a mixture of Gaussians.
 
-        Sound members have the group's own distribution. A faulty one has a scale that is
-        log-uniform from there up to the largest fault (West, Biometrika 74 (1987) 646, for such
-        mixtures). A group with a fixed scale and a largest fault is one selected fault: another one
-        may be there instead of it.
+        Sound members have the group's distribution. A faulty one has a log-uniform scale from there
+        up to the largest fault (West, Biometrika 74 (1987) 646, for such mixtures). A group with a
+        fixed scale and a largest fault is one selected fault, in whose place may be another.
 
         Returns:
             Probabilities and rms of the components, [component].
@@ -171,30 +166,29 @@ class Group:
             quantiles = (np.arange(CORE) + 0.5) / CORE
             core = self.rms * np.sqrt(self.freedom / chi2.ppf(quantiles, self.freedom))
         chances = np.full(len(core), 1 / len(core))
-        members, least = self.basis.shape[1], BEYOND * self.rms
-        faulty = max(1 / max(members, 1), COMMONEST)
+        members, least = self.basis.shape[1], FAULT_FROM * self.rms
+        faulty = max(1 / max(members, 1), FAULTY_SHARE)
         if self.fixed and self.largest:
-            core, least, faulty = np.full(1, SMALLEST), self.largest * SELECTED, COMMONEST
+            core, least, faulty = np.full(1, SMALLEST), self.largest * SELECTED, FAULTY_SHARE
         elif self.fixed or members < 2 or not least < self.largest:
             return chances, core
-        count = int(np.ceil(DECADE * np.log10(self.largest / least))) + 1
+        count = int(np.ceil(SCALES_PER_DECADE * np.log10(self.largest / least))) + 1
         chances = np.concatenate([(1 - faulty) * chances, np.full(count, faulty / count)])
         return chances, np.concatenate([core, np.geomspace(least, self.largest, count)])
 
     def share(self, squares: Array, rms: float) -> Array:
-        """By which a parameter of this expected square counts: 1 for Gauss, less in the tails."""
+        """Weight of a parameter with this expected square: 1 for Gauss, less in the tails."""
         return rms**2 * Student(rms, self.freedom).precision(np.sqrt(squares))
 
     def learn(self, squares: Array, left: Array) -> "Group":
-        """A scale that is likelier: a step of Fisher's scoring in its logarithm.
+        """Return the group after a Fisher-scoring step of its log scale.
 
-        EM's own step is as short as what the data say of a parameter is little: a scale that began
-        too small stays there for a hundred rounds, and everything beside it makes up for it. Where
-        the data say nothing the scale stays near its first guess.
+        EM's own step is small where the data say little of a parameter: a scale that starts too
+        small stays there for a hundred rounds. Without data the scale stays near its first guess.
 
         Args:
-            squares: of the likeliest parameters.
-            left: share of each one's prior variance that the data leave.
+            squares: of the most probable parameters.
+            left: share of each prior variance that the data leave.
         """
         if not len(squares):
             return replace(self, each=squares)
@@ -204,7 +198,7 @@ class Group:
             shown = float(np.sum(squares / now**2))
             own = float(np.log(rms / self.guess)) / self.guessed**2
             step = (shown - known - own) / (2 * known + self.guessed**-2)
-            rms = rms * float(np.exp(np.clip(step, -BOLD, BOLD)))
+            rms = rms * float(np.exp(np.clip(step, -MAX_STEP, MAX_STEP)))
             rms = min(max(rms, SMALLEST), self.most)
         each = rms / np.sqrt(self.share(squares + left * now**2, rms))
         return replace(self, rms=rms, each=np.minimum(each, self.most), first=self.guess)

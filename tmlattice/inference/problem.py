@@ -1,8 +1,8 @@
-"""A measurement as an inference sees it: rows, what moves them, and what is likely beforehand.
+"""A measurement as inference sees it: rows, their derivatives, and priors.
 
-A kind of measurement (see `observe`) is a `Problem`: at given causes it says what is left of its
-readings in units of their noise, how that depends on its own nuisances (launches, say), and what a
-little more of a cause would do. Fit, scan and search know no more of it.
+A kind of measurement (see `observe`) is a `Problem`. At given causes it gives the residual of its
+readings in units of their noise, and the derivatives by causes and by its own nuisances (launches,
+say). Fit, scan and search use nothing else.
 """
 
 from abc import ABC, abstractmethod
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.metric import Metric
-from tmlattice.inference.priors import EVEN, AmountPrior
+from tmlattice.inference.priors import LOG_UNIFORM, AmountPrior
 from tmlattice.inference.root import Root
 from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Hypothesis = tuple[str, str | None]
-"""An effect and the place where it might sit."""
+"""An effect and its place."""
 
 Kicks = Mapping[int, Array]
-"""Something without a name: its parameters, by place."""
+"""Free kicks: their parameters, by place."""
 
 NO_KICKS: Kicks = {}
 
@@ -36,12 +36,12 @@ class Point:
     """The model at some causes, free kicks and nuisances.
 
     Attributes:
-        causes, nuisances, kicks: where it is.
-        residual: what is left, whitened, with the rows of what is known of the nuisances, [row].
-        projection: of the nuisances' directions; None where the model has no answer.
-        orbit: what slopes depend on beside their amount.
-        view: the problem's own picture of the point.
-        lost: why the model has no answer, in words; empty where it has one.
+        causes, nuisances, kicks: arguments.
+        residual: whitened, with the prior rows of the nuisances, [row].
+        projection: of the nuisances' directions; None where the model has no solution.
+        orbit: what slopes depend on, except the amounts.
+        view: the problem's own data of the point.
+        lost: why the model has no solution; empty if it has one.
     """
 
     causes: tuple[Cause, ...]
@@ -55,18 +55,18 @@ class Point:
 
     @property
     def chi2(self) -> float:
-        """Of the rows; infinite where the model has no answer."""
+        """Chi-square of the rows; infinite where the model has no solution."""
         return np.inf if self.projection is None else float(self.residual @ self.residual)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem(ABC):
-    """What a search needs and does not change.
+    """Model and data of a search.
 
     Attributes:
         places: number of places of each effect, for the prior.
-        rare: hypotheses that are less likely than others of their kind, and by which factor.
-        fixed: causes that are there and are not fitted.
+        rare: hypotheses that are less probable than others of their effect, and the factor.
+        fixed: causes that are present and not fitted.
         amounts: prior of an amount.
         judgement: thresholds.
     """
@@ -74,24 +74,24 @@ class Problem(ABC):
     places: Mapping[str, float]
     rare: Mapping[Hypothesis, float] = field(default_factory=dict, repr=False)
     fixed: tuple[Cause, ...] = ()
-    amounts: AmountPrior = EVEN
+    amounts: AmountPrior = LOG_UNIFORM
     judgement: Judgement = DEFAULT
 
     def prior(self, hypothesis: Hypothesis) -> float:
-        """Log probability of one effect at one place, before the data."""
+        """Log prior probability of one effect at one place."""
         count = len(self.places) * self.places.get(hypothesis[0], 1)
         odds = self.rare.get(hypothesis, 1.0)
         return float(np.log((1 - self.judgement.unknown) * odds / count))
 
     def unknown_prior(self, places: int) -> float:
-        """The same for something unknown at one of so many places."""
+        """Log prior probability of an unknown fault at one of `places`."""
         return float(np.log(self.judgement.unknown / 2 / places))
 
     # --- the model ------------------------------------------------------------------------------
     @property
     @abstractmethod
     def first(self) -> Array:
-        """A first guess of the nuisances."""
+        """First guess of the nuisances."""
 
     @property
     def free(self) -> int:
@@ -100,38 +100,38 @@ class Problem(ABC):
 
     @property
     def freedom(self) -> int:
-        """Readings, and what is known of nuisances, less the nuisances."""
+        """Degrees of freedom: readings and prior rows less nuisances."""
         return int(self.valid.sum()) - self.free
 
     @property
     def alone(self) -> bool:
-        """Whether what is sought acts on all readings: there is no reference among them."""
+        """Whether the causes sought act on all readings, so that none is a reference."""
         return True
 
     def reference(self, nuisances: Array) -> "tuple[Problem | None, Array]":
-        """Return the part without what is sought, and its nuisances; None: there is none."""
+        """Return the reference part and its nuisances; None: there is no reference."""
         return None, nuisances
 
     @property
     def log_scale(self) -> float:
-        """Log density of the rows at their peak, over that of the readings' noise alone."""
+        """Log density of the rows at their peak, relative to the readings' noise alone."""
         return 0.0
 
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """Whether the kind knows what such a cause would do: of another one it reads nothing."""
+        """Whether the model has this cause; its signature is zero otherwise."""
         return True
 
     def everywhere(self) -> "Problem":
-        """The same with causes that act in all of its measurements, those of a reference too."""
+        """Return the problem with causes that act in all measurements, references included."""
         return self
 
-    def standing(self, causes: Sequence[Cause]) -> Self:
-        """The same with further fixed causes: the kind may put them into its model once for all."""
+    def with_fixed(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem with further fixed causes; a kind may build them into its model."""
         return replace(self, fixed=(*self.fixed, *causes))
 
     @abstractmethod
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
-        """The model there."""
+        """Return the model's point."""
 
     @abstractmethod
     def slope(self, point: Point, cause: int) -> Array:
@@ -139,19 +139,19 @@ class Problem(ABC):
 
     @abstractmethod
     def moved(self, nuisances: Array, change: Array) -> Array:
-        """Nuisances moved by the projection's coordinates."""
+        """Return the nuisances moved by the projection's coordinates."""
 
     @abstractmethod
     def metric(self, point: Point) -> Metric:
-        """Products of signatures about a point."""
+        """Return products of signatures at a point."""
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
-        """Degrees of freedom with which the variance of readings along a hypothesis is known;
-        infinite where nothing of it was learnt from them."""
+        """Degrees of freedom of the variance of readings along a hypothesis; infinite if it was
+        not estimated from them."""
         return np.inf
 
     def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
-        """Return the products among distributed errors, if the kind has a fast way to form them.
+        """Return the products given distributed errors, if the kind has a fast way to form them.
 
         Args:
             point: of this problem.
@@ -162,56 +162,55 @@ class Problem(ABC):
 
     @abstractmethod
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Those that sit between the same monitors."""
+        """Return hypotheses between the same monitors."""
 
     # --- what has no name -----------------------------------------------------------------------
     @property
     def kick_places(self) -> Sequence[str]:
-        """Names of where a free kick may sit; empty where the kind knows none: a stored beam closes
-        on itself, and several measurements have no kick in common."""
+        """Places of free kicks; empty where a kind has none, as for a stored beam."""
         return ()
 
     def kick_rows(self, point: Point, place: int) -> Array:
         """d rows / d parameters of a free kick, [parameter, row]."""
-        raise NotImplementedError("this kind of measurement knows no free kick")
+        raise NotImplementedError("this kind of measurement has no free kick")
 
     @property
     @abstractmethod
     def monitors(self) -> Sequence[str]:
-        """Names of whose readings may be set aside."""
+        """Monitors whose readings may be rejected."""
 
     # --- readings -------------------------------------------------------------------------------
     @property
     @abstractmethod
     def valid(self) -> Flags:
-        """Which readings there are, of the kind's own shape."""
+        """Valid readings, of the kind's own shape."""
 
     @abstractmethod
     def owner(self) -> NDArray[np.int64]:
-        """The monitor of each reading, of the shape of `valid`."""
+        """Monitor of each reading, of the shape of `valid`."""
 
     @abstractmethod
     def as_rows(self, readings: Array) -> Array:
-        """Readings, or changes of them, [..., *shape of `valid`], as whitened rows [..., row]."""
+        """Whitened rows [..., row] of readings or their changes [..., *shape of `valid`]."""
 
     def noise_rows(self) -> list[Flags]:
-        """Return which rows share a noise that may be a guess, [row] each; empty: it is known."""
+        """Return the rows of each noise that may be a guess, [row] each; empty: noise is known."""
         return []
 
     def noisier(self, factors: Array) -> Self:
-        """Return the same problem with the noise of each such part multiplied."""
+        """Return the problem with the noise of each such part multiplied."""
         return self
 
     def disagreement(self, point: Point) -> float:
         """Return the median misfit between neighbouring monitors in units of the noise; 0 where the
-        kind cannot tell."""
+        kind has no estimate."""
         return 0.0
 
     @abstractmethod
     def left(self, point: Point) -> tuple[Array, Array]:
-        """What is left of each reading in its noise, nuisances out; and its own variance there
-        (1, but for what the nuisances take), both of the shape of `valid`."""
+        """Residual of each reading over its noise, nuisances projected out, and its variance, both
+        of the shape of `valid`."""
 
     @abstractmethod
     def without(self, dropped: Flags) -> "Problem":
-        """The same with these readings missing."""
+        """Return the problem without some readings."""

@@ -1,7 +1,7 @@
-"""The inverse root of a covariance 1 + S^T S, by which rows among small errors become white.
+"""Inverse root of a covariance 1 + S^T S, which whitens rows with distributed errors.
 
-Two roots are in use, each where it is cheaper: the Cholesky factor (rows x rows), or, where errors
-are fewer than rows, the symmetric root in the space of the errors: with S S^T = U L U^T
+The cheaper of two roots is used: the Cholesky factor (rows x rows), or, if errors are fewer than
+rows, the symmetric root in the space of the errors: with S S^T = U L U^T
 
     (1 + S^T S)^(-1/2) = 1 + V ((1 + L)^(-1/2) - 1) V^T,   V = S^T U L^(-1/2),
 
@@ -18,12 +18,12 @@ from scipy.linalg.lapack import dtrtri
 
 Array = NDArray[np.float64]
 
-FELT = 1e-12
-"""Of the largest variance: what is smaller is rounding, and changes nothing."""
+ROUNDING = 1e-12
+"""Share of the largest variance below which a variance is rounding."""
 
 
 class Root(ABC):
-    """W with W^T W = (1 + S^T S)^-1."""
+    """Matrix W with W^T W = (1 + S^T S)^-1."""
 
     @abstractmethod
     def white(self, rows: Array) -> Array:
@@ -85,10 +85,10 @@ class _Symmetric(Root):
 
 
 def inverse_root(spread: Array) -> Root:
-    """Of the rows' covariance.
+    """Return the inverse root of the rows' covariance.
 
     Args:
-        spread: S, [error, row]: what errors of size 1 make of the rows.
+        spread: S, [error, row], signatures of errors of size 1.
     """
     errors, rows = spread.shape
     if errors >= rows:
@@ -116,6 +116,6 @@ def directions_of(spread: Array) -> tuple[Array, Array]:
         values, vectors = eigh(spread.T @ spread, overwrite_a=True, check_finite=False)
         return np.maximum(values, 0.0), vectors.T
     values, vectors = eigh(spread @ spread.T, overwrite_a=True, check_finite=False)
-    felt = values > FELT * values.max(initial=1e-300)
-    values = values[felt]
-    return values, (vectors[:, felt] / np.sqrt(values)).T @ spread
+    kept = values > ROUNDING * values.max(initial=1e-300)
+    values = values[kept]
+    return values, (vectors[:, kept] / np.sqrt(values)).T @ spread

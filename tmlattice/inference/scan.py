@@ -1,9 +1,9 @@
-"""The scan: how much better the data are explained by each hypothesis, alone and linearly.
+"""The scan: improvement of the fit by each hypothesis, alone and linearly.
 
-Three families stand beside each other: effects of the catalogue, one amount each; a free kick per
-shot at each layer ("something is here", without a name); and a monitor whose readings are all free.
-The threshold is for the whole scan: the largest statistic of pure noise is simulated, and its tail
-is that of a number of independent hypotheses, which is fitted.
+Three families are scanned: effects of the catalogue, one amount each; a free kick per shot at each
+layer, of unknown cause; and a monitor whose readings are all free. The threshold is for the whole
+scan: the largest statistic of pure noise is simulated, and the tail of a number of independent
+hypotheses is fitted to it.
 """
 
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ from tmlattice.inference.metric import Hypothesis, Metric
 Array = NDArray[np.float64]
 
 DRAWS = 64
-"""Of pure noise, for the threshold: its effective number is known to 12 %."""
+"""Simulations of pure noise for the threshold: the effective number is known to 12 %."""
 
-BLIND = 1e-9
-"""A signature of which launches leave less than this share (of its square) cannot be seen."""
+MIN_VISIBLE = 1e-9
+"""Share of a signature's square that launches must leave, at least."""
 
-FAR = 100.0
-"""What would not be seen at this many times its largest fault is not there to be seen."""
+MAX_FAULTS = 100.0
+"""Largest faults that a hypothesis must need for one standard deviation, at most."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Scan:
 
     Attributes:
         hypotheses: (effect, place).
-        statistic: fall of chi-square by one amount, [hypothesis]; 0 for what cannot be seen.
+        statistic: fall of chi-square by one amount, [hypothesis]; 0 if invisible.
         amount: best amount ** power of the linear model, [hypothesis].
-        information: 1 / its variance, [hypothesis]; 0 for what cannot be seen.
-        effective: number of independent hypotheses that pure noise sees.
+        information: 1 / its variance, [hypothesis]; 0 if invisible.
+        effective: number of independent hypotheses in pure noise.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -48,37 +48,37 @@ class Scan:
     effective: float
 
     def p_value(self, statistic: float) -> float:
-        """Chance that pure noise reaches this anywhere in the scan."""
+        """Probability that pure noise reaches a statistic anywhere in the scan."""
         return look_elsewhere(statistic, 1, self.effective)
 
     @property
     def chance(self) -> float:
-        """That pure noise reaches what is seen most of."""
+        """P-value of the largest statistic."""
         return self.p_value(float(self.statistic.max(initial=0.0)))
 
     def threshold(self, rate: float) -> float:
-        """The statistic that pure noise reaches in this share of data sets."""
+        """Statistic that pure noise reaches at this rate."""
         return free_threshold(rate, 1, self.effective)
 
 
 def look_elsewhere(statistic: float, freedom: int, effective: float) -> float:
-    """Chance that the largest of `effective` chi-squares of so many degrees reaches this."""
+    """Probability that the largest of `effective` chi-squares reaches a statistic."""
     return float(-np.expm1(effective * _log_below(statistic, freedom)))
 
 
 def _log_below(statistic: float | Array, freedom: int) -> Array:
-    """Log of the chance that one chi-square stays below; a finite number where it cannot."""
+    """Log probability that one chi-square stays below; always finite."""
     tail = np.minimum(chi2.sf(statistic, freedom), 1 - np.finfo(float).epsneg)
     return np.asarray(np.log1p(-tail))
 
 
 def free_threshold(rate: float, freedom: int, effective: float) -> float:
-    """The chi-square of so many degrees that the largest of `effective` reaches at this rate."""
+    """Chi-square that the largest of `effective` reaches at this rate."""
     return float(chi2.isf(-np.expm1(np.log1p(-rate) / effective), freedom))
 
 
 def effective_number(largest: Array, freedom: int) -> float:
-    """How many independent chi-squares have maxima like these [draw]: maximum likelihood.
+    """Number of independent chi-squares with maxima like these [draw], by maximum likelihood.
 
     The exponent N of F(t)^N has the estimate -draws / sum log F(t).
     """
@@ -93,13 +93,13 @@ def scan(
     effective: float | None = None,
     seed: int = 0,
 ) -> Scan:
-    """Every hypothesis against the residual of the model as it stands.
+    """Scan every hypothesis against the residual.
 
     Args:
-        metric: of the data about the model's trajectories.
+        metric: products at the model's trajectories.
         hypotheses: see `Model.hypotheses`.
         residual: whitened rows, launches fitted.
-        effective: number of independent hypotheses where it is known already; else simulated.
+        effective: number of independent hypotheses; None: simulated.
         seed: of the simulation.
     """
     if not len(hypotheses):
@@ -112,8 +112,10 @@ def scan(
     data = np.concatenate([metric.projection.out(residual)[None], draws])
     sums = metric.products(hypotheses, data)
     norm = sums.whole - sums.inside
-    reach = np.array([FAR * find(name).largest ** find(name).power for name, _ in hypotheses])
-    seen = (norm > BLIND * sums.whole) & (norm * reach**2 > 1.0)
+    reach = np.array(
+        [MAX_FAULTS * find(name).largest ** find(name).power for name, _ in hypotheses]
+    )
+    seen = (norm > MIN_VISIBLE * sums.whole) & (norm * reach**2 > 1.0)
     safe = np.where(seen, norm, 1.0)
     squares = np.where(seen[:, None], sums.inner**2 / safe[:, None], 0.0)
     if effective is None:
@@ -129,11 +131,11 @@ def scan(
 
 @dataclass(frozen=True)
 class FreeScan:
-    """The same for what has no name: free kicks at places, or free readings of monitors.
+    """Statistics of free kicks at places, or of free readings of monitors.
 
     Attributes:
         places: layers, or monitors, [place].
-        gain: by how much the log evidence grows, [place].
+        gain: in log evidence, [place].
         statistic: fall of chi-square, [place].
         freedom: number of parameters, [place].
         amounts: best values, [place, parameter], zero where there is none.
@@ -148,15 +150,15 @@ class FreeScan:
 
 _NOTHING = np.zeros(0)
 NO_SCAN = FreeScan(np.zeros(0, np.int64), _NOTHING, _NOTHING, np.zeros(0, np.int64), _NOTHING)
-"""Of no places at all."""
+"""Scan of no places."""
 
 
 _RATIOS = np.logspace(-1, 8, 46)
-"""Prior variance of a free amount over that of its best measured direction: even in its log."""
+"""Prior variance of a free amount over that of its best measured direction: log-uniform."""
 
 
 def evidence_of_scale(values: Array, information: Array) -> Array:
-    """Log evidence of independent amounts with one common unknown rms, [place].
+    """Log evidence of independent amounts with a common unknown rms, [place].
 
     Args:
         values: best amounts in units of their own error, [place, parameter].
@@ -173,7 +175,7 @@ def _free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan
     """Statistics of groups of parameters.
 
     Args:
-        places: their names, [place].
+        places: [place].
         gram: information, [place, block, p, p]; parameters of different blocks are independent.
         inner: signatures times residual, [place, block, p].
     """
@@ -195,12 +197,12 @@ def _free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan
 
 
 def scan_kicks(metric: Metric, layers: Sequence[int], residual: Array) -> FreeScan:
-    """A free kick (px, py) in every active shot, in the middle of each of these layers' magnets."""
+    """Scan a free kick (px, py) in every active shot, in the middle of each layer's magnet."""
     places = np.asarray(layers)
     return _free_scan(places, *metric.free_kicks(places, metric.projection.out(residual)))
 
 
 def scan_monitors(metric: Metric, residual: Array) -> FreeScan:
-    """All readings of a monitor free, in every active shot and turn."""
+    """Scan monitors with free readings in every active shot and turn."""
     gram, inner = metric.free_monitors(metric.projection.out(residual))
     return _free_scan(np.arange(len(gram)), gram, inner)

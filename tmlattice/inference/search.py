@@ -1,9 +1,9 @@
-"""Which causes explain the data: one after another, each choice open to revision.
+"""Stepwise search for the causes that explain the data, with every choice revised.
 
-A step scans every hypothesis, stops where nothing is above the threshold, refits the leading
-hypotheses through the nonlinear model, and takes the one with the largest evidence: an effect of
-the catalogue, or something without a name at a place, or a monitor that is set aside. After each
-step every earlier choice is held against its rivals again, with all the others in place.
+A step scans every hypothesis, ends below the threshold, refits the leading hypotheses through the
+nonlinear model, and takes the one with the largest evidence: an effect of the catalogue, a free
+kick at a place, or a rejected BPM. After each step every earlier choice is compared with its
+alternatives, together with all the others.
 
 >>> found = explain(Search(problem, hypotheses), fit(problem, (), launches))
 """
@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.inference import chi2
+from tmlattice.inference.alternatives import Alternative, Detection, alternatives, linear_evidence
 from tmlattice.inference.newton import Fit, Outcome, fit
-from tmlattice.inference.options import Option, Reading, spike, unnamed
+from tmlattice.inference.options import Option, Reading, outlier, unnamed
 from tmlattice.inference.problem import Hypothesis, Problem
-from tmlattice.inference.rivals import Detection, Rival, linear_evidence, rivals
 from tmlattice.inference.scan import (
     NO_SCAN,
     FreeScan,
@@ -37,86 +37,86 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched, and by which rules.
+    """What is searched, and the rules.
 
     Attributes:
-        problem: model and data, nothing left out.
-        hypotheses: what may be the cause.
+        problem: model and all data.
+        hypotheses: candidate causes.
         most: findings at most.
-        unnamed: whether free kicks, monitors set aside and single readings may explain something.
-        by_evidence: evidence alone says whether a first cause is there, not the rate of false
-            alarms: for a caller that asks for the likeliest explanation, whatever it is.
-        names_first: what has a name goes before a free kick. Else that is tried where a free kick
-            took what a name nearly explains, and the evidence decides.
-        enough: chi-square at which nothing is left to be explained, and no further look is taken.
-        granted: hypotheses of which it is decided already that something is there.
-        keep: whether a cause may only give way to a better one, not to none.
+        unnamed: whether free kicks, rejected BPMs and rejected readings may explain something.
+        by_marginal_likelihood: the marginal likelihood alone decides on a first cause, not the
+            false-alarm rate: for the most probable explanation, significant or not.
+        labelled_first: effects of the catalogue go before a free kick. Else that is tried if a free
+            kick was preferred to an effect that nearly explains it, and the evidence decides.
+        enough: chi-square below which the search ends.
+        established: hypotheses whose presence is known.
+        keep: a cause may be replaced, not removed.
         seed: of the threshold's simulation.
-        progress: told what was found.
+        progress: called with the name of each finding.
     """
 
     problem: Problem
     hypotheses: Sequence[Hypothesis]
     most: int = 8
     unnamed: bool = True
-    by_evidence: bool = False
-    names_first: bool = False
+    by_marginal_likelihood: bool = False
+    labelled_first: bool = False
     enough: float = -np.inf
-    granted: frozenset[Hypothesis] = frozenset()
+    established: frozenset[Hypothesis] = frozenset()
     keep: bool = False
     seed: int = 0
     progress: Callable[[str], None] = lambda _: None
 
 
 @dataclass(frozen=True)
-class Named:
-    """A cause with a name: how it was seen, and what was held against it, itself the first."""
+class Identified:
+    """Significance of a cause of the catalogue, and its alternatives, itself the first."""
 
     detection: Detection
-    rivals: tuple[Rival, ...]
+    alternatives: tuple[Alternative, ...]
 
 
 @dataclass(frozen=True)
 class State:
-    """What is explained so far.
+    """Present explanation.
 
     Attributes:
-        problem: without what was left out.
-        fit: all named causes, free kicks and nuisances together.
+        problem: without rejected readings.
+        fit: all causes, free kicks and nuisances together.
         named: of each cause of the fit, in their order.
-        kicks: how each free kick was seen, by place.
-        monitors: those set aside because no named cause explains them.
-        spikes: single readings left out.
-        dropped: all readings left out, of the problem's shape.
-        effective: number of independent hypotheses that pure noise sees; None: not known yet.
-        passed_over: whether a free kick took what a name nearly explains.
+        kicks: significance of each free kick, by place.
+        monitors: rejected BPMs, which no cause of the catalogue explains.
+        outliers: rejected single readings.
+        dropped: all rejected readings, of the problem's shape.
+        effective: number of independent hypotheses in pure noise; None: not yet simulated.
+        kick_preferred: whether a free kick was preferred to an effect that nearly explains it.
     """
 
     problem: Problem
     fit: Fit
     dropped: Flags
-    named: tuple[Named, ...] = ()
+    named: tuple[Identified, ...] = ()
     kicks: Mapping[int, Detection] = field(default_factory=dict)
     monitors: Mapping[int, Detection] = field(default_factory=dict)
-    spikes: tuple[Reading, ...] = ()
+    outliers: tuple[Reading, ...] = ()
     effective: float | None = None
-    passed_over: bool = False
+    kick_preferred: bool = False
 
     @property
     def count(self) -> int:
-        """Findings: causes with a name, free kicks, and monitors set aside."""
+        """Number of causes, free kicks and rejected BPMs."""
         return len(self.named) + len(self.kicks) + len(self.monitors)
 
     @property
     def names(self) -> frozenset[object]:
-        """Of causes and places of kicks."""
+        """Causes and places of kicks."""
         causes = ((c.effect, c.element) for c in self.fit.causes)
         return frozenset([*causes, *self.fit.kicks])
 
     @property
     def choices(self) -> object:
-        """All of them, what was left out too."""
-        return self.names, frozenset(self.monitors), frozenset(self.spikes)
+        """Causes, kicks and rejected readings."""
+        return self.names, frozenset(self.monitors), frozenset(self.outliers)
 
 
 AnyState = TypeVar("AnyState", bound=State)
@@ -124,14 +124,14 @@ AnyState = TypeVar("AnyState", bound=State)
 
 @dataclass(frozen=True)
 class Explanation(State):
-    """What was found, and the scans that saw it.
+    """Final explanation with its scans.
 
     Attributes:
-        before: the nuisances alone.
-        first, first_kicks: the scans of the nuisances alone, which saw the first finding.
-        scan, left: the last ones, of what is left.
-        full: whether the search ended because no more findings were allowed.
-        beyond: one cause more, refitted and not taken.
+        before: fit of the nuisances alone.
+        first, first_kicks: scans of that fit.
+        scan, left: scans of the final residual.
+        full: whether the search ended at the largest number of findings.
+        beyond: one cause more, refitted and not accepted.
     """
 
     before: Fit = None  # type: ignore[assignment]
@@ -140,12 +140,12 @@ class Explanation(State):
     scan: Scan = None  # type: ignore[assignment]
     left: FreeScan = NO_SCAN
     full: bool = False
-    beyond: tuple[Rival, ...] = ()
+    beyond: tuple[Alternative, ...] = ()
 
 
 @dataclass(frozen=True)
-class Look:
-    """One look at what is left: all scans about a state."""
+class Scans:
+    """All scans of a state's residual."""
 
     named: Scan
     kicks: FreeScan
@@ -153,43 +153,43 @@ class Look:
 
 
 def explain(search: Search, before: Fit, so_far: Explanation | None = None) -> Explanation:
-    """Search for the causes of what the nuisances leave unexplained.
+    """Search for the causes of the residual of a fit.
 
     Args:
         search: what is searched.
-        before: the nuisances alone.
-        so_far: a search for fewer that goes on; None: a new one.
+        before: fit of the nuisances alone.
+        so_far: a search for fewer findings, to be continued; None: a new one.
     """
     found = _run(search, before, so_far)
-    if not (found.passed_over and found.kicks):
+    if not (found.kick_preferred and found.kicks):
         return found
     few = min(search.most, found.count + 1)
-    other = _run(replace(search, names_first=True, most=few), before)
+    other = _run(replace(search, labelled_first=True, most=few), before)
     return other if _weighed(search, other, found) > _weighed(search, found, other) else found
 
 
 def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Explanation:
-    first: Look | None = None
+    first: Scans | None = None
     if so_far is None:
         state = State(search.problem, before, np.zeros(search.problem.valid.shape, dtype=bool))
     else:
         state = State(**{own.name: getattr(so_far, own.name) for own in fields(State)})
-        first = Look(so_far.first, so_far.first_kicks, NO_SCAN)
+        first = Scans(so_far.first, so_far.first_kicks, NO_SCAN)
     seen: set[frozenset[object]] = set()
-    been: set[object] = set()
-    pending = False  # choices were added or readings left out since all were held against rivals
+    visited: set[object] = set()
+    pending = False  # choices changed since all were compared with their alternatives
     while True:
-        state, look = _look(search, state)
-        first = first or look
+        state, scans = _scan_all(search, state)
+        first = first or scans
         full = state.count >= search.most
-        over = full or len(state.spikes) > state.problem.judgement.spikes
-        options = [] if over else _options(search, state, look)
-        beyond = next((option.rivals for option in options if option.kind == "named"), ())
-        # the rate of false alarms says whether anything is there; evidence what more
-        told = () if seen or search.by_evidence else ("named",)
+        over = full or len(state.outliers) > state.problem.judgement.most_outliers
+        options = [] if over else _options(search, state, scans)
+        beyond = next((option.alternatives for option in options if option.kind == "named"), ())
+        # the false-alarm rate decides on a first finding, the evidence on further ones
+        told = () if seen or search.by_marginal_likelihood else ("named",)
         options = [option for option in options if option.gain > 0 or option.kind in told]
         seen.add(state.names)
-        been.add(state.choices)
+        visited.add(state.choices)
         if not options and not pending:
             break
         if not options:
@@ -198,40 +198,42 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         best, state = _choice(search, state, options)
         log.info("%d findings, next %s, log evidence +%.1f", state.count, best.name, best.gain)
         search.progress(best.name)
-        there, state = state, _taken(search, state, best, look)
-        if state.fit.point.lost:  # the model has no answer there
+        there, state = state, _taken(search, state, best, scans)
+        if state.fit.point.lost:  # the model has no solution there
             state = there
             break
         pending = pending or state.count > 1
         if state.count > 1 and best.kind != "reading":
-            state = revised(search, state, doubted=True)
+            state = revised(search, state, quick=True)
         if state.fit.chi2 <= search.enough:
             break
-        if state.choices in been or (best.kind in ("named", "kick") and state.names in seen):
-            break  # what was added went again
+        if state.choices in visited or (best.kind in ("named", "kick") and state.names in seen):
+            break  # the last choice was reverted
     if pending:
         state = revised(search, state)
     return Explanation(
         **vars(state), before=before, first=first.named, first_kicks=first.kicks,
-        scan=look.named, left=look.kicks, full=full, beyond=beyond,
+        scan=scans.named, left=scans.kicks, full=full, beyond=beyond,
     )  # fmt: skip
 
 
 def _weighed(search: Search, one: State, other: State) -> float:
-    """Log evidence of an explanation on the readings that both keep."""
+    """Log evidence of an explanation on the readings that neither rejects."""
     return on_readings(search.problem.without(one.dropped | other.dropped), one)[0]
 
 
 def on_readings(problem: Problem, state: State) -> tuple[float, Fit]:
-    """Log evidence of what is explained, refitted on the readings of a problem; and that fit.
+    """Log evidence of an explanation refitted on a problem's readings; and that fit.
 
     Args:
-        problem: with the readings that two explanations are compared on.
+        problem: with the readings on which explanations are compared.
         state: one of them.
     """
     refitted = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
     aside = problem.unknown_prior(len(problem.monitors)) * len(state.monitors)
-    return refitted.log_evidence + aside + problem.judgement.spike * len(state.spikes), refitted
+    return refitted.log_evidence + aside + problem.judgement.outlier_prior * len(
+        state.outliers
+    ), refitted
 
 
 # --- looking ----
@@ -245,7 +247,7 @@ def _scan(search: Search, state: State) -> Scan:
     )
 
 
-def _look(search: Search, state: State) -> tuple[State, Look]:
+def _scan_all(search: Search, state: State) -> tuple[State, Scans]:
     problem, residual = state.problem, state.fit.residual
     about = problem.metric(state.fit.point)
     named = scan(about, search.hypotheses, residual, effective=state.effective, seed=search.seed)
@@ -254,119 +256,127 @@ def _look(search: Search, state: State) -> tuple[State, Look]:
         kicks = scan_kicks(about, range(len(problem.kick_places)), residual)
     if search.unnamed:
         monitors = scan_monitors(about, residual)
-    return replace(state, effective=named.effective), Look(named, kicks, monitors)
+    return replace(state, effective=named.effective), Scans(named, kicks, monitors)
 
 
-def _options(search: Search, state: State, look: Look) -> list[Option]:
-    """What could be done next."""
+def _options(search: Search, state: State, scans: Scans) -> list[Option]:
+    """Possible next steps."""
     problem = state.problem
     judge = problem.judgement
     options = []
-    statistic = float(look.named.statistic.max(initial=0.0))
+    statistic = float(scans.named.statistic.max(initial=0.0))
     rate = judge.rate("named")
-    detection = Detection(statistic, look.named.threshold(rate), look.named.p_value(statistic))
-    top = look.named.hypotheses[int(look.named.statistic.argmax())] if statistic > 0 else None
-    if top is not None and top not in search.granted and detection.p_value < rate:
+    detection = Detection(statistic, scans.named.threshold(rate), scans.named.p_value(statistic))
+    top = scans.named.hypotheses[int(scans.named.statistic.argmax())] if statistic > 0 else None
+    if top is not None and top not in search.established and detection.p_value < rate:
         freedom = problem.certainty(state.fit.point, top)
         detection = Detection(
             statistic,
             chi2.estimated(detection.threshold, freedom),
-            look.named.p_value(chi2.known(statistic, freedom)),
+            scans.named.p_value(chi2.known(statistic, freedom)),
         )
-    if detection.p_value < rate or (search.by_evidence and statistic > 0):
-        tried = rivals(problem, state.fit, look.named, search.hypotheses)
-        if tried and (search.by_evidence or tried[0].fit.chi2 < state.fit.chi2):
+    if detection.p_value < rate or (search.by_marginal_likelihood and statistic > 0):
+        tried = alternatives(problem, state.fit, scans.named, search.hypotheses)
+        if tried and (search.by_marginal_likelihood or tried[0].fit.chi2 < state.fit.chi2):
             gain = tried[0].fit.log_evidence - state.fit.log_evidence
             name = " ".join(str(word) for word in tried[0].hypothesis if word)
-            options.append(Option("named", name, gain, detection, rivals=tried))
+            options.append(Option("named", name, gain, detection, alternatives=tried))
     for kind, free, names, taken in (
-        ("kick", look.kicks, problem.kick_places, state.kicks),
-        ("monitor", look.monitors, problem.monitors, state.monitors),
+        ("kick", scans.kicks, problem.kick_places, state.kicks),
+        ("monitor", scans.monitors, problem.monitors, state.monitors),
     ):
         if len(free.places):
             options += unnamed(problem, kind, free, names, taken)
     if search.unnamed:
-        options += spike(problem, state.fit.point, len(state.spikes))
+        options += outlier(problem, state.fit.point, len(state.outliers))
     if state.fit.outcome is Outcome.STUCK:
-        options = [_refitted(search, state, option, look) for option in options]
+        options = [_refitted(search, state, option, scans) for option in options]
     return options
 
 
-def _refitted(search: Search, state: State, option: Option, look: Look) -> Option:
-    """With what it takes of chi-square in fact: about a fit that is stuck a scan says little."""
+def _refitted(search: Search, state: State, option: Option, scans: Scans) -> Option:
+    """Correct the gain by the actual fall of chi-square: a scan of a stuck fit is unreliable."""
     if option.kind == "named":
         return option
-    fell = state.fit.chi2 - _taken(search, state, option, look).fit.chi2
+    fell = state.fit.chi2 - _taken(search, state, option, scans).fit.chi2
     return replace(option, gain=option.gain + 0.5 * (fell - option.detection.statistic))
 
 
 def _choice(search: Search, state: State, options: Sequence[Option]) -> tuple[Option, State]:
-    """The one that explains most; or the cause with a name, where names come first."""
+    """Take the step that explains most; or the cause of the catalogue, where these go first."""
     best = max(options, key=lambda option: option.gain)
     named = [option for option in options if option.kind == "named"]
     if named and best.kind == "kick":
-        if search.names_first:
+        if search.labelled_first:
             return named[0], state
         nearly = named[0].gain > state.problem.judgement.nearly * best.gain
-        state = replace(state, passed_over=state.passed_over or nearly)
+        state = replace(state, kick_preferred=state.kick_preferred or nearly)
     return best, state
 
 
 # --- taking ----
-def _taken(search: Search, state: State, option: Option, look: Look) -> State:
+def _taken(search: Search, state: State, option: Option, scans: Scans) -> State:
     if option.kind == "named":
-        named = (*state.named, Named(option.detection, option.rivals))
-        return replace(state, fit=option.rivals[0].fit, named=named)
+        named = (*state.named, Identified(option.detection, option.alternatives))
+        return replace(state, fit=option.alternatives[0].fit, named=named)
     if option.kind == "kick":
-        place = int(np.flatnonzero(look.kicks.places == option.where)[0])
-        kicks = {**state.fit.kicks, option.where: look.kicks.amounts[place]}
+        place = int(np.flatnonzero(scans.kicks.places == option.where)[0])
+        kicks = {**state.fit.kicks, option.where: scans.kicks.amounts[place]}
         found = fit(state.problem, state.fit.causes, state.fit.nuisances, kicks)
         return replace(state, fit=found, kicks={**state.kicks, option.where: option.detection})
     dropped = state.dropped.copy()
     if option.kind == "reading":
         dropped[option.reading] = True
-        return _again(search, replace(state, spikes=(*state.spikes, option.reading)), dropped)
+        return _without(
+            search,
+            replace(state, outliers=(*state.outliers, option.reading)),
+            dropped,
+        )
     dropped |= state.problem.owner() == option.where
     aside = {**state.monitors, option.where: option.detection}
-    return _again(search, replace(state, monitors=aside), dropped)
+    return _without(search, replace(state, monitors=aside), dropped)
 
 
-def _again(search: Search, state: AnyState, dropped: Flags) -> AnyState:
-    """The same causes on the readings that are left."""
+def _without(search: Search, state: AnyState, dropped: Flags) -> AnyState:
+    """Fit the same causes without some readings."""
     problem = search.problem.without(dropped)
     found = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
     return replace(state, problem=problem, fit=found, dropped=dropped)
 
 
 # --- revising ----
-def revised(search: Search, state: AnyState, doubted: bool = False) -> AnyState:
-    """Every choice held against its rivals, all the others in place, until none changes.
+def revised(search: Search, state: AnyState, quick: bool = False) -> AnyState:
+    """Compare every choice with its alternatives, given all others, until none changes.
 
     Args:
         search: what is searched; its problem has all readings.
-        state: what is explained so far.
-        doubted: once, only causes that a scan puts behind others, and kicks against few rivals:
-            all of eight after each choice would take most of the time.
+        state: present explanation.
+        quick: once, and only causes that are not the leader of a scan, and kicks against three
+            alternatives: all of eight after each choice would take most of the time.
     """
-    for _ in range(1 if doubted else 3):
+    for _ in range(1 if quick else 3):
         names = state.names
         for monitor in list(state.monitors):
             state = _monitor_revised(search, state, monitor)
         for place in list(state.fit.kicks):
-            state = _kick_revised(search, state, place, 3 if doubted else 8)
+            state = _kick_revised(search, state, place, 3 if quick else 8)
         for cause in state.fit.causes:
-            state = _cause_revised(search, state, (cause.effect, cause.element), doubted)
+            state = _cause_revised(search, state, (cause.effect, cause.element), quick)
         if names == state.names:
             break
     return state
 
 
 def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
-    """A monitor that was set aside comes back where a named cause, or none, does as well."""
+    """Restore a rejected BPM if a cause of the catalogue, or none, explains it as well."""
     own = state.problem.owner() == monitor
     others = {m: seen for m, seen in state.monitors.items() if m != monitor}
-    spikes = tuple(spike for spike in state.spikes if not own[spike])
-    back = replace(_again(search, state, state.dropped & ~own), monitors=others, spikes=spikes)
+    outliers = tuple(outlier for outlier in state.outliers if not own[outlier])
+    back = replace(
+        _without(search, state, state.dropped & ~own),
+        monitors=others,
+        outliers=outliers,
+    )
     if back.fit.point.lost:
         return state
     about = back.problem.metric(back.fit.point)
@@ -376,15 +386,15 @@ def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
         alone += 0.5 * (back.fit.chi2 - state.fit.chi2 - float(free.statistic[monitor]))
     if alone <= 0:
         return back
-    tried = rivals(back.problem, back.fit, _scan(search, back), search.hypotheses, 8)
+    tried = alternatives(back.problem, back.fit, _scan(search, back), search.hypotheses, 8)
     if tried and tried[0].fit.log_evidence - back.fit.log_evidence > alone:
-        named = (*back.named, Named(state.monitors[monitor], tried))
+        named = (*back.named, Identified(state.monitors[monitor], tried))
         return replace(back, fit=tried[0].fit, named=named)
     return state
 
 
 def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> AnyState:
-    """A free kick gives way to a named cause, or to none, where that explains more."""
+    """Replace a free kick by a cause of the catalogue, or by none, if that explains more."""
     now = state.fit
     kicks = {k: v for k, v in now.kicks.items() if k != place}
     seen = {k: v for k, v in state.kicks.items() if k != place}
@@ -394,17 +404,17 @@ def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> An
         return state
     if alone.log_evidence > now.log_evidence:
         return without
-    tried = rivals(state.problem, alone, _scan(search, without), search.hypotheses, count)
+    tried = alternatives(state.problem, alone, _scan(search, without), search.hypotheses, count)
     if tried and tried[0].fit.log_evidence > now.log_evidence:
-        named = (*state.named, Named(state.kicks[place], tried))
+        named = (*state.named, Identified(state.kicks[place], tried))
         return replace(without, fit=tried[0].fit, named=named)
     return state
 
 
 def _cause_revised(
-    search: Search, state: AnyState, hypothesis: Hypothesis, doubted: bool
+    search: Search, state: AnyState, hypothesis: Hypothesis, quick: bool
 ) -> AnyState:
-    """A named cause gives way to a better one, or to none; its rivals are weighed anew."""
+    """Replace a cause by a better one, or by none; its alternatives are refitted."""
     now = state.fit
     own = [i for i, c in enumerate(now.causes) if (c.effect, c.element) == hypothesis]
     if not own:
@@ -419,15 +429,15 @@ def _cause_revised(
     if not search.keep and alone.log_evidence > now.log_evidence:
         return without
     about = _scan(search, without)
-    if doubted:
+    if quick:
         leader = about.hypotheses[int(linear_evidence(state.problem, about).argmax())]
         if leader == hypothesis:
             return state
-    tried = rivals(state.problem, alone, about, search.hypotheses, 12)
+    tried = alternatives(state.problem, alone, about, search.hypotheses, 12)
     if hypothesis not in [rival.hypothesis for rival in tried]:
         order = (*rest, now.causes[k])
         kept = fit(state.problem, order, now.nuisances, now.kicks, slopes=now.slopes)
-        found = [*tried, Rival(hypothesis, kept)]
+        found = [*tried, Alternative(hypothesis, kept)]
         tried = tuple(sorted(found, key=lambda rival: -rival.fit.log_evidence))
-    named = (*named, Named(state.named[k].detection, tried))
+    named = (*named, Identified(state.named[k].detection, tried))
     return replace(without, fit=tried[0].fit, named=named)

@@ -1,4 +1,4 @@
-"""What readings do for errors of the ring: large, so that they are read once and never copied.
+"""Derivatives of readings by errors of the ring: large arrays, read once and never copied.
 
 >>> ring = (Slopes(gradients, None), Slopes(edges, now))
 >>> sums = weighed_sums(ring, residual, weight, plane, by_monitor, by_column)
@@ -17,47 +17,46 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 AT_ONCE = 2048
-"""Readings that are weighed at once: enough for the products of matrices, few for the memory."""
+"""Readings weighed at a time: enough for matrix products, within the cache."""
 
 
 class Slopes(NamedTuple):
-    """Of one family of errors.
+    """Derivatives by one family of errors.
 
     Attributes:
-        rows: d reading / d error as they were taken, [error, column, monitor].
-        now: what they are to be multiplied by since, [column, monitor]; None: nothing.
+        rows: d reading / d error as computed, [error, column, monitor].
+        now: factor since then, [column, monitor]; None: 1.
     """
 
     rows: Array
     now: Array | None = None
 
     def times(self, readings: Array) -> Array:
-        """Readings [..., column, monitor] times what each error does for them, summed, [error,
-        ...]."""
+        """Readings [..., column, monitor] times the derivatives, summed, [error, ...]."""
         own = readings if self.now is None else self.now * readings
         flat = self.rows.reshape(len(self.rows), -1)
         summed = flat @ own.reshape(-1, flat.shape[1]).T
         return np.asarray(summed.reshape(len(self.rows), *readings.shape[:-2]))
 
     def of(self, column: int, monitor: Indices) -> Array:
-        """Of some readings of a column, [error, reading]."""
+        """Derivatives of some readings of a column, [error, reading]."""
         own = self.rows[:, column, monitor]
         return np.asarray(own if self.now is None else own * self.now[column, monitor])
 
     def through(self, patterns: Array) -> Array:
-        """Sums over the monitors of slopes times [column, monitor, pattern], [error, column,
+        """Derivatives times [column, monitor, pattern], summed over monitors, [error, column,
         pattern]."""
         own = patterns if self.now is None else self.now[:, :, None] * patterns
         return np.asarray((self.rows.transpose(1, 0, 2) @ own).transpose(1, 0, 2))
 
 
 class Sums(NamedTuple):
-    """Of all errors of all families, one after another.
+    """Sums over readings, for the errors of all families in turn.
 
     Attributes:
-        square: J^T W J; its upper triangle alone is meant, [error, error].
-        monitors: with the monitors' own slopes, [error, plane, monitor].
-        columns: with the columns' own, [error, column].
+        square: J^T W J, the upper triangle, [error, error].
+        monitors: with the monitors' derivatives, [error, plane, monitor].
+        columns: with the columns' derivatives, [error, column].
         vector: J^T W residual, [error].
     """
 
@@ -68,7 +67,7 @@ class Sums(NamedTuple):
 
 
 def whole(ring: Sequence[Slopes], shape: tuple[int, ...]) -> Array:
-    """All of them in one array, [error, column, monitor]: as large as they are."""
+    """Return all derivatives in one array, [error, column, monitor]."""
     parts = [own.rows if own.now is None else own.rows * own.now for own in ring]
     return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, *shape)), *parts])
 
@@ -81,9 +80,9 @@ def weighed_sums(
     by_monitor: Array,
     by_column: Array,
 ) -> Sums:
-    """Sums over all readings; see `normal.normal_equations` for the arguments.
+    """Return sums over all readings; see `normal.normal_equations` for the arguments.
 
-    `residual` is finite here. Beside the rows themselves this needs memory for `AT_ONCE` readings.
+    `residual` is finite here. Memory beyond the derivatives is that of `AT_ONCE` readings.
     """
     columns, monitors = residual.shape
     ends = np.cumsum([0, *(len(own.rows) for own in ring)])
@@ -116,16 +115,16 @@ def weighed_sums(
     return out._replace(square=square)
 
 
-# The sum over readings (`reassoc`) may follow the vector unit's order.
+# `reassoc`: the sum may follow the vector unit's order.
 @jit_sums
 def _weigh(rows, root, by_monitor, by_column, plane, weighed, monitors, columns):  # type: ignore[no-untyped-def]
-    """One pass over the slopes of one family; `monitors` is added to.
+    """Sum over the derivatives of one family in one pass; adds to `monitors`.
 
     Args:
         rows: [error, column, monitor].
-        root, by_monitor, by_column: what slopes are multiplied by, [column, monitor].
+        root, by_monitor, by_column: factors of the derivatives, [column, monitor].
         plane: [column].
-        weighed, monitors, columns: the results, see `Sums`; weighed is root times rows.
+        weighed, monitors, columns: results, see `Sums`; weighed is root times rows.
     """
     for i in range(rows.shape[0]):
         for c in range(rows.shape[1]):

@@ -1,4 +1,4 @@
-"""Triangular factors by LAPACK, without the copies and checks that cost as much as small ones do.
+"""Triangular factors by LAPACK without copies and checks, which dominate for small matrices.
 
 >>> factor = lower_factor(matrix)
 >>> covariances = np.einsum("ij,ij->j", half := inverse_of_lower(factor), half)  # the diagonal
@@ -13,15 +13,15 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 
 Array = NDArray[np.float64]
 
-SMALL = 96
-"""Rows up to which LAPACK inverts a triangle as fast as products of blocks do."""
+MAX_LAPACK = 96
+"""Largest number of rows for which LAPACK's inversion is as fast as products of blocks."""
 
 
 def lower_factor(matrix: Array) -> Array:
-    """L of L L^T, [n, n]; the matrix is symmetric, and is lost.
+    """L of L L^T, [n, n]; the symmetric matrix is overwritten.
 
     Raises:
-        LinAlgError: it is not positive.
+        LinAlgError: the matrix is not positive definite.
     """
     factor, wrong = dpotrf(matrix.T, lower=1, overwrite_a=1)
     if wrong:
@@ -30,9 +30,9 @@ def lower_factor(matrix: Array) -> Array:
 
 
 def inverse_of_lower(factor: Array) -> Array:
-    """L^-1, [n, n]: nearly all of it is products of blocks, at twice the pace of LAPACK's own."""
+    """L^-1, [n, n], mostly by products of blocks, twice as fast as LAPACK's inversion."""
     n = len(factor)
-    if n <= SMALL:
+    if n <= MAX_LAPACK:
         return np.asarray(dtrtri(factor, lower=1)[0])
     half = n // 2
     first, second = inverse_of_lower(factor[:half, :half]), inverse_of_lower(factor[half:, half:])

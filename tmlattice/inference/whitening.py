@@ -1,9 +1,9 @@
-"""Readings in units of their noise, with everything taken out that a launch can explain.
+"""Readings in units of their noise, with the launches projected out.
 
-The noise of a reading is its own, and, where it is asked for, a dense background of small errors
-that is the same in all shots: C = sigma^2 + sum_h tau_h^2 s_h s_h^T. Launches are nuisance
-parameters: their directions are projected out of data and signatures alike. What is known of a
-launch stands in further rows: rows are [shot, 2 readings + 5 coordinates], flattened.
+Noise is independent, and, if asked for, correlated by distributed errors that are the same in all
+shots: C = sigma^2 + sum_h tau_h^2 s_h s_h^T. Launches are nuisance parameters: their directions are
+projected out of data and signatures. Prior knowledge of a launch adds rows: [shot, 2 readings + 5
+coordinates], flattened.
 """
 
 from copy import copy
@@ -19,18 +19,18 @@ from tmlattice.inference.root import inverse_root
 Array = NDArray[np.float64]
 
 EXACT = 1e-12
-"""m, rad or relative: stands for a launch coordinate that is known exactly."""
+"""m, rad or relative: rms of a launch coordinate that is known exactly."""
 
-UNSEEN = 1e-13
-"""Share of a direction below which it is rounding: no row sees it, beside those before it."""
+ROUNDING = 1e-13
+"""Share of a direction below which it is rounding, given the directions before it."""
 
 
 class Readings(Protocol):
-    """What whitening needs of data: see `observe.data.Data`, which has it."""
+    """Data of a whitening, see `observe.data.Data`."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Which readings there are, [shot, reading, 2]."""
+        """Valid readings, [shot, reading, 2]."""
 
     @property
     def sigma(self) -> Array:
@@ -38,23 +38,23 @@ class Readings(Protocol):
 
     @property
     def launches(self) -> Array:
-        """Nominal, [shot, 5]."""
+        """Nominal launches, [shot, 5]."""
 
     @property
     def launch_sigma(self) -> Array:
-        """rms of these; inf where unknown, 0 where exact, [shot, 5]."""
+        """rms of the launches; inf: unknown, 0: exact, [shot, 5]."""
 
 
 class Whitening:
-    """Divides by the noise, or solves with its Cholesky factor.
+    """Division by the noise, or by the Cholesky factor of its covariance.
 
     Args:
-        data: readings and their noise, launches and what is known of them.
-        background: tau_h s_h of every background error, [error, shot, reading, 2], m, or None.
+        data: readings and their noise, launches and their priors.
+        background: tau_h s_h of every distributed error, [error, shot, reading, 2], m, or None.
 
     Attributes:
-        columns: the coordinates of the launch that are free.
-        rows: number of rows of a whitened vector.
+        columns: free coordinates of the launch.
+        rows: length of a whitened vector.
     """
 
     def __init__(self, data: Readings, background: Array | None = None) -> None:
@@ -66,10 +66,10 @@ class Whitening:
         self._prior[:, (data.launch_sigma == 0).all(axis=0)] = 0.0
         self._nominal = data.launches
         self.rows = self.shots * (self.weight[0].size + 5)
-        self._inverse: Array | None = None  # of the Cholesky factor: products beat solutions
+        self._inverse: Array | None = None  # of the Cholesky factor: faster than solving
         if background is not None and len(background):
             B = (self.weight * background).reshape(len(background), -1)
-            # correctors that nobody sets, say, do nothing
+            # without rows of zeros
             self._inverse = inverse_root(B[B.any(axis=1)]).matrix
 
     def correlated(self, root: Array) -> "Whitening":
@@ -103,8 +103,8 @@ class Whitening:
         return np.asarray(self.precision - along @ along.T)
 
     def back(self, rows: Array) -> Array:
-        """Whitened rows [..., shot, reading * 2], such that a product with them is one with the
-        whitened signature: [..., shot, reading, 2], 1 / m."""
+        """Adjoint of `signature`: whitened rows [..., shot, reading * 2] as [..., shot, reading,
+        2], 1 / m."""
         flat = rows.reshape(*rows.shape[:-2], -1)
         if self._inverse is not None:
             flat = flat @ self._inverse
@@ -158,7 +158,7 @@ class Whitening:
 
 
 class Projection:
-    """The launches' directions among whitened rows.
+    """Directions of the launches among whitened rows.
 
     Args:
         directions: d rows / d launch coordinates by block, see `Whitening.launch`.
@@ -168,22 +168,21 @@ class Projection:
         self.Q, self._R = np.linalg.qr(directions)
         self._seen = np.abs(np.diagonal(self._R, axis1=1, axis2=2))  # [block, column]
         size = np.linalg.norm(directions, axis=1)
-        if (self._seen <= UNSEEN * size).any():  # else a direction of Q would be any direction
+        if (self._seen <= ROUNDING * size).any():  # QR would give an arbitrary direction
             scale = np.where(size > 0, size, 1.0)[:, None]
             U, s, V = np.linalg.svd(directions / scale, full_matrices=False)
-            kept = s > UNSEEN * max(directions.shape[1:])
+            kept = s > ROUNDING * max(directions.shape[1:])
             self.Q = U * kept[:, None]
             self._R = (s * kept)[..., None] * V * scale
             self._seen = np.where(kept, s, 1.0) * scale[:, 0]
 
     @property
     def log_volume(self) -> float:
-        """Of the launches' covariance: log of the square root of its determinant, but for the
-        directions that no row sees."""
+        """Log root of the determinant of the launches' covariance, without invisible directions."""
         return -float(np.log(np.maximum(self._seen, 1e-300)).sum())
 
     def out(self, rows: Array) -> Array:
-        """Rows [..., row] less what launches explain, the same shape."""
+        """Return rows [..., row] less the part that launches explain."""
         if not self.Q.shape[2]:
             return rows.copy()
         blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
@@ -194,16 +193,16 @@ class Projection:
         return kept.reshape(rows.shape)
 
     def matrix(self) -> Array:
-        """The directions themselves, all blocks, [row, coordinate]."""
+        """Directions of all blocks, [row, coordinate]."""
         return np.asarray(block_diag(*(Q @ R for Q, R in zip(self.Q, self._R, strict=True))))
 
     def covariance(self) -> Array:
-        """Of the launch coordinates, by block, [block, column, column]; 0 for what is not seen."""
+        """Covariance of the launch coordinates, [block, column, column]; 0 where invisible."""
         inverse = np.linalg.pinv(self._R)
         return np.asarray(inverse @ np.swapaxes(inverse, 1, 2))
 
     def inside(self, rows: Array) -> Array:
-        """The square of what launches explain of rows [..., row], [...]."""
+        """Square of the part of rows [..., row] that launches explain, [...]."""
         if not self.Q.shape[2]:
             return np.zeros(rows.shape[:-1])
         blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
@@ -214,7 +213,7 @@ class Projection:
         return total.reshape(rows.shape[:-1])
 
     def coordinates(self, rows: Array) -> Array:
-        """The launch coordinates that explain rows [row] best: changes, one after another."""
+        """Changes of the launch coordinates that explain rows [row] best, one after another."""
         blocks = rows.reshape(len(self.Q), -1)
         inside = np.einsum("bri,br->bi", self.Q, blocks)
         return np.concatenate(

@@ -98,8 +98,9 @@ def need_monitors(ring: Ring) -> None:
         names = dict.fromkeys(e.family for e in ring.elements if e.kind == "marker")
         mend = f", such as '{next(iter(names))}'" if names else ""
         raise LatticeError(
-            f"'{ring.name}' has no monitor; say which of its elements are monitors with --monitors "
-            f"'BPM*' (in Python: monitors='BPM*'): names of markers or drifts{mend}"
+            f"'{ring.name}' has no monitor; say which of its elements are: [lattice] monitors = "
+            f"['BPM*'] in tmlattice.toml (in Python: monitors='BPM*'), names of markers or "
+            f"drifts{mend}"
         )
 
 

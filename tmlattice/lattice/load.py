@@ -1,10 +1,12 @@
-"""One door to all lattice files: the suffix says which reader it is."""
+"""One function for all lattices: files by their suffix, other packages' objects by their class."""
 
+import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice import stored
@@ -15,6 +17,8 @@ from tmlattice.lattice.ring import PARTICLES, Ring
 AT_SUFFIXES = (".mat", ".m", ".repr")
 MADX_SUFFIXES = (".seq", ".madx", ".lte")
 TFS_SUFFIXES = (".tfs", ".twiss", ".dat", ".outx")
+SUFFIXES = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES, *TFS_SUFFIXES)
+"""Of lattice files."""
 
 
 def _builtin_folder() -> Path:
@@ -29,33 +33,35 @@ def builtin_lattices() -> list[str]:
 
 
 def load_ring(
-    name_or_path: str | Path,
+    lattice: str | os.PathLike[str] | Any,
     sequence: str | None = None,
     energy: float | None = None,
     monitors: str | Sequence[str] | None = None,
     correctors: str | Sequence[str] | None = None,
     particle: str | None = None,
 ) -> Ring:
-    """The ring of a built-in lattice or of a lattice file.
+    """Return the ring of a built-in lattice, a lattice file or an object of another package.
 
-    Names that stand more than once are numbered in beam order. What the maps cannot model is
+    Names that occur more than once are numbered in beam order. What the maps cannot model is
     warned of (an octupole is a drift at second order). Each reader says what it takes over:
     `read_ocelot`, `read_at`, `read_madx`, `read_xsuite`, `read_tfs`, `read_json`.
 
     Args:
-        name_or_path: "petra3", or a path: OCELOT (`.py`; it is code, and is run), AT (`.mat`,
+        lattice: "petra3", or a path: OCELOT (`.py`; it is code, and is run), AT (`.mat`,
             `.m`, `.repr`, `.json`), MAD-X (`.seq`, `.madx`, or a TWISS table: `.tfs`, `.twiss`,
-            `.dat`), elegant (`.lte`), Xsuite (`.json`) or the package's own JSON.
-        sequence: which one the file's variables, keys or sequences is the ring.
-        energy: GeV; else what the file states.
+            `.dat`), elegant (`.lte`), Xsuite (`.json`) or the package's own JSON; an open file of
+            these; an `at.Lattice`, `xtrack.Line`, `xtrack.Environment`, `cpymad.madx.Madx` with a
+            used sequence, OCELOT `MagneticLattice` or list of OCELOT elements; or a `Ring`.
+        sequence: which of the variables, keys, lines or sequences is the ring.
+        energy: GeV; else what the lattice states.
         monitors, correctors: patterns of names, such as "BPM*", of elements that are monitors or
             correctors although the file does not say so: see `marked`.
         particle: "electron" or "proton"; else what the file states, an electron where it is silent.
 
     Raises:
-        LatticeError: no such file, it cannot be read, or it holds no ring.
+        LatticeError: no such file or class of objects, it cannot be read, or it holds no ring.
     """
-    ring = marked(_loaded(name_or_path, sequence, energy), monitors, correctors)
+    ring = marked(_loaded(lattice, sequence, energy), monitors, correctors)
     if particle is None:
         return ring
     if particle not in PARTICLES:
@@ -71,22 +77,40 @@ def contents(ring: Ring) -> tuple[object, ...]:
     return (ring.energy, ring.mass, elements)
 
 
-def _loaded(name_or_path: str | Path, sequence: str | None, energy: float | None) -> Ring:
-    path = _find(str(name_or_path))
-    name = str(name_or_path)
+def _loaded(lattice: Any, sequence: str | None, energy: float | None) -> Ring:
+    if isinstance(lattice, Ring):
+        return lattice if energy is None else replace(lattice, energy=energy)
+    if not isinstance(lattice, str | os.PathLike):
+        from tmlattice.lattice.objects import named_file, reader_of
+
+        if hasattr(lattice, "read"):
+            with named_file(lattice) as path:
+                return _of_file(path, str(lattice.name), sequence, energy)
+        name, read = reader_of(lattice)
+        return _checked(Path(name), lambda: read(sequence, energy))[0]
+    return _of_file(_find(os.fspath(lattice)), os.fspath(lattice), sequence, energy)
+
+
+def _of_file(path: Path, name: str, sequence: str | None, energy: float | None) -> Ring:
     key = stored.key_of(path, sequence, energy)
     kept = stored.load(key, name) if key else None
     if kept is not None:
         return kept
-    with warnings.catch_warnings(record=True) as told, reading(path):
-        warnings.simplefilter("always")
-        ring = _read(path, name, sequence, energy)
-        check_ring(ring)
-    for w in told:
-        warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
-    if key and not told:  # what is told is told every time
+    ring, warned = _checked(path, lambda: _read(path, name, sequence, energy))
+    if key and not warned:  # what is warned of is warned of every time
         stored.save(key, ring)
     return ring
+
+
+def _checked(where: Path, read: Callable[[], Ring]) -> tuple[Ring, bool]:
+    """A ring that was read and checked, and whether there were warnings."""
+    with warnings.catch_warnings(record=True) as caught, reading(where):
+        warnings.simplefilter("always")
+        ring = read()
+        check_ring(ring)
+    for w in caught:
+        warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
+    return ring, bool(caught)
 
 
 def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> Ring:
@@ -126,8 +150,7 @@ def _find(name: str) -> Path:
     if name.casefold() in builtin:
         return _builtin_folder() / f"{name.casefold()}.py"
     path = Path(name)
-    known = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES, *TFS_SUFFIXES)
-    if path.suffix.lower() in known and path.is_file():
+    if path.suffix.lower() in SUFFIXES and path.is_file():
         return path
     if path.is_file():
         raise LatticeError(

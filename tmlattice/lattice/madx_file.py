@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.errors import LatticeError, first_of, plain
+from tmlattice.errors import LatticeError, first_of, plain, unknown_name
 from tmlattice.input_files import content_of
 from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_out
 from tmlattice.lattice.madx_beam import Beam
@@ -193,6 +193,112 @@ def read_madx(
         return ring_of_parts(parts, name, energy, beam.mass, beam.charge, reader.report)
     except LatticeError as error:
         raise LatticeError(f"'{path}' cannot be read as MAD-X: {error}") from error
+
+
+def ring_of_madx(madx: Any, sequence: str | None = None, energy: float | None = None) -> Ring:
+    """Return the ring of a sequence in the memory of `cpymad.madx.Madx`, with its errors.
+
+    Args:
+        madx: with a sequence that was used (`madx.use(...)`); nothing is run in it.
+        sequence: of its sequences; else the one that was used last.
+        energy: GeV; else that of the sequence's beam.
+
+    Raises:
+        LatticeError: no sequence that was used, or an element or an error that is not modelled.
+
+    Warns:
+        Of what the model lacks, reading errors of monitors among it.
+    """
+    known = list(madx.sequence)
+    if sequence is not None and sequence.casefold() not in known:
+        raise unknown_name("sequence of the Madx named", sequence, known)
+    active = madx.sequence[sequence] if sequence is not None else madx.sequence()
+    if active is None or not active.is_expanded:
+        name = plain(active.name if active is not None else "NAME", 60)
+        raise LatticeError(f"no sequence of the Madx is used; run madx.use('{name}') before")
+    stated = active.beam
+    beam = Beam({k: float(stated[k]) for k in ("mass", "charge", "energy", "bv")})
+    reader = _Reader(energy)
+    reader.rbarc, reader.thin_focusing = bool(madx.options.rbarc), bool(madx.options.thin_foc)
+    energy = beam.energy if energy is None else energy
+    made: dict[Any, Part] = {}
+    parts = []
+    for node in active.expanded_elements:
+        align, field = node.align_errors, node.field_errors
+        keyword, length = node.base_type.name, float(node.length)
+        kicks = float(node.chkick), float(node.cvkick)
+        errors = (str(align), str(field), kicks)
+        key = (length,) if keyword == "drift" else (node.name, length, *errors)
+        if key not in made:
+            given = {"kick": 0.0, **{k: _evaluated(v) for k, v in node.items()}}
+            usual = {k: _evaluated(v) for k, v in node.base_type.items()}
+            own = {k: v for k, v in given.items() if k != "at" and v != usual.get(k)}
+            name = "drift" if keyword == "drift" else node.name
+            definition = _Definition(name, keyword, own, "of the Madx")
+            part = reader._new_part(definition, length, beam, float(active.length))
+            made[key] = _with_errors_of(part, align, field, kicks, reader.report)
+        parts.append(made[key])
+    return ring_of_parts(parts, active.name, energy, beam.mass, beam.charge, reader.report)
+
+
+_IN_TWISS: dict[str, dict[str, Sequence[int]]] = {
+    "sbend": {"knl": (0, 1, 2)},
+    **{k: {"knl": (n,), "ksl": (n,)} for n, k in ((1, "quadrupole"), (2, "sextupole"),
+                                                  (3, "octupole"))},
+    "multipole": {"knl": range(20), "ksl": range(20)},
+}  # fmt: skip
+"""Orders of field errors of which MAD-X's TWISS (5.09) takes account."""
+
+
+def _evaluated(value: Any) -> Any:
+    """A number or a text as it is, a list as a tuple."""
+    return tuple(value) if not isinstance(value, str) and hasattr(value, "__len__") else value
+
+
+def _with_errors_of(
+    part: Part, align: Any, field: Any, kicks: tuple[float, float], report: Report
+) -> Part:
+    """A part with what EALIGN, EFCOMP and CORRECT have given its node in MAD-X.
+
+    Raises:
+        LatticeError: errors that are not modelled.
+    """
+    values = dict(part.values)
+    named = f"{part.keyword.upper()} '{plain(part.name, 60)}'"
+    moved = {} if align is None else {k: v for k, v in align._asdict().items() if v}
+    if part.keyword in ("monitor", "hmonitor", "vmonitor"):
+        if moved:
+            report.left_out("errors of EALIGN of the monitor", part.name)
+        moved = {}
+    for key, amount in moved.items():
+        if key not in SHIFTS or key not in MODELLED.get(part.keyword, ()):
+            raise LatticeError(f"{key.upper()} of EALIGN of {named} is not modelled; set it to 0")
+        values[key] = part.number(key) + amount
+    for key, errors in () if field is None else (("knl", field.dkn), ("ksl", field.dks)):
+        amounts = np.array(errors, dtype=float)
+        acting = np.zeros_like(amounts)
+        orders = _IN_TWISS.get(part.keyword, {}).get(key, ())
+        acting[list(orders)] = amounts[list(orders)]
+        if (acting != amounts).any():
+            report.left_out("errors of EFCOMP without effect in MAD-X's TWISS", part.name)
+        if not acting.any():
+            continue
+        own = part.list(key)
+        values[key] = np.pad(own, (0, max(0, len(acting) - len(own))))
+        values[key][: len(acting)] += acting
+        if part.keyword == "multipole":  # the design's bend stays
+            if part.list("ksl")[:1].any():
+                raise LatticeError(f"EFCOMP of {named}, which bends vertically, is not modelled")
+            values.setdefault("angle", float(part.list("knl")[:1].sum()))
+    if any(kicks):
+        alone = part.number("kick")
+        plane = {"hkicker": "hkick", "vkicker": "vkick"}.get(part.keyword)
+        if alone and plane:
+            values.pop("kick")
+            values[plane] = alone
+        for key, amount in zip(("hkick", "vkick"), kicks, strict=True):
+            values[key] = float(values.get(key, 0.0)) + amount
+    return replace(part, values=values)
 
 
 class _Stop(Exception):

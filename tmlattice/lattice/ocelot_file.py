@@ -8,7 +8,7 @@ import importlib.util
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 from tmlattice.errors import LatticeError, unknown_name
 from tmlattice.lattice.places import place_elements, source_kind
 from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.source import copied
 
 SEQUENCES = ("ring", "cell", "lattice")
 """Variables that may hold the sequence, in the order in which they are looked for."""
@@ -50,16 +51,33 @@ def read_ocelot(
 
     Source: the naming rule is the measurement format's, version 1 (docs/coordinates.md, "Names").
     """
-    module = _run_as_module(path)
-    variables = vars(module)
-    chosen = _sequence(path, variables, sequence)
-    places = list(_flatten(chosen))
+    variables = vars(_run_as_module(path))
+    return ring_of_elements(_sequence(path, variables, sequence), path, name, energy, variables)
+
+
+def ring_of_elements(
+    sequence: Any,
+    path: Path,
+    name: str,
+    energy: float | None = None,
+    variables: Mapping[str, Any] = {},
+) -> Ring:
+    """The ring of a list of OCELOT elements or of a `MagneticLattice`; see `read_ocelot`.
+
+    Args:
+        sequence: elements, nested lists of them, or a MagneticLattice.
+        path: of its file, or the object's name, for messages.
+        name: of the ring.
+        energy: GeV; else that of the variables.
+        variables: of the file: names of elements and the energy.
+    """
+    places = list(_flatten(sequence))
     if not places:
         raise LatticeError(f"the sequence of '{path}' is empty; name another with sequence=")
     return Ring(
         name=name,
         elements=_name_places(places, variables),
-        energy=_energy(path, variables, chosen) if energy is None else energy,
+        energy=_energy(path, variables) if energy is None else energy,
     )
 
 
@@ -132,9 +150,14 @@ def _flatten(sequence: Any) -> Iterator[Any]:
 
 
 def _mend(source: Any) -> Any:
-    """The element; a copy of a matrix element that was born without a longitudinal block; a thin
-    bend in the place of a multipole that bends the design orbit."""
+    """The element; a copy of a matrix element that was born without a longitudinal block, or of a
+    displaced one without its offset; a thin bend in the place of a multipole that bends the design
+    orbit."""
     from tmlattice.lattice.ocelot import elements
+
+    if _displaced(source):
+        source = copied(source)
+        source.dx = source.dy = 0.0
 
     if isinstance(source, elements.Matrix) and source.r[4, 4] == 0 and source.r[5, 5] == 0:
         source = copy.deepcopy(source)
@@ -155,7 +178,7 @@ def _thin_bend(source: Any) -> Any:
     return CombinedMultipole(angle=angle, k1=k1, k2=k2, tilt=source.tilt, eid=source.id)
 
 
-def _name_places(places: list[Any], variables: dict[str, Any]) -> tuple[Element, ...]:
+def _name_places(places: list[Any], variables: Mapping[str, Any]) -> tuple[Element, ...]:
     by_object: dict[int, str] = {}
     for variable in sorted(variables, reverse=True):  # so that the lowest-sorting one stays
         by_object[id(variables[variable])] = variable
@@ -166,10 +189,22 @@ def _name_places(places: list[Any], variables: dict[str, Any]) -> tuple[Element,
         for source in places
     ]
     mended = {id(source): _mend(source) for source in {id(p): p for p in places}.values()}
-    return place_elements(families, [mended[id(source)] for source in places])
+    elements = place_elements(families, [mended[id(source)] for source in places])
+    return tuple(
+        e.with_errors(dx=float(source.dx), dy=float(source.dy)) if _displaced(source) else e
+        for e, source in zip(elements, places, strict=True)
+    )
 
 
-def _energy(path: Path, variables: dict[str, Any], sequence: Any) -> float:
+def _displaced(source: Any) -> bool:
+    """Whether an element has its field beside the axis; in `Element` that is one of its errors."""
+    return bool(source.dx or source.dy) and type(source).__name__ in _WITH_OFFSET
+
+
+_WITH_OFFSET = ("Quadrupole", "Sextupole", "Octupole", "SBend", "RBend", "Bend", "Solenoid")
+
+
+def _energy(path: Path, variables: Mapping[str, Any]) -> float:
     for name in ("energy", "Energy", "ENERGY", "E0", "beam_energy"):
         if isinstance(variables.get(name), int | float):
             return float(variables[name])

@@ -1,38 +1,110 @@
-"""A ring with errors as a ring of plain elements, for formats that know none.
+"""A ring with errors as a ring of plain elements, and what writers of other formats share.
 
 What a magnet's errors do is written into what every format has: a roll is a tilt, a kick of a
 corrector its angle, thin gradients in a quadrupole its k1 and tilt, in a matrix element its matrix.
-What has no place there is told.
+A format that has more (misalignments, field errors) names what it holds; the rest is stated.
 """
 
+import cmath
 import copy
+import re
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.errors import first_of
 from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring
 
 Array = NDArray[np.float64]
 
 _TURNS = ("quadrupole", "sextupole", "octupole")
+_NO_FIELD = ("drift", "monitor", "cavity", "hcorrector", "vcorrector")
+"""Kinds that are the same wherever their axis is."""
+STRAIGHT = frozenset({"Quadrupole", "Sextupole", "Octupole", "CombinedMultipole", "Multipole"})
+BENDS = frozenset({"SBend", "RBend", "Bend"})
+"""OCELOT's classes, as a writer finds them in an element's source."""
+FIELDS = ("kick_x", "kick_y", "k1l", "k1sl")
+"""Errors that are dipole and quadrupole fields."""
+
+Holds = Callable[[Element], Collection[str]]
+"""The errors of an element that a format has a place for."""
 
 
 NAMED = 4
 """Elements that a sentence names."""
 
 
-def plain(ring: Ring) -> tuple[Ring, tuple[str, ...]]:
-    """The ring without errors that acts most like it, and what it lacks, a sentence each."""
+def plain(ring: Ring, holds: Holds = lambda element: ()) -> tuple[Ring, tuple[str, ...]]:
+    """The ring that acts most like it without errors but those that a format holds, and what it
+    lacks, a sentence each.
+
+    Args:
+        ring: with its errors.
+        holds: which of an element's errors the writer writes itself.
+    """
     changed: dict[int, Element] = {}
     told: dict[str, list[str]] = {}
     for place, element in enumerate(ring.elements):
         if element.errors != NO_ERRORS:
-            changed[place], lacks = _plain(element)
+            changed[place], lacks = _plain(element, holds(element))
             for what in lacks:
                 told.setdefault(what, []).append(element.name)
     return ring.with_elements(changed), tuple(w.replace("{}", _some(n)) for w, n in told.items())
+
+
+def error_fields(element: Element) -> tuple[complex, complex]:
+    """Dipole and quadrupole fields among an element's errors: integrated k_n + i k_ns, in the axes
+    of its tilt."""
+    e = element.errors
+    dipole, gradient = complex(-e.kick_x, e.kick_y), complex(e.k1l, e.k1sl)
+    turn = cmath.exp(1j * element.tilt)
+    return dipole * turn, gradient * turn**2
+
+
+def definitions(
+    elements: Sequence[Element], texts: Sequence[str], reserved: Collection[str] = ()
+) -> tuple[dict[str, str], list[str], list[str]]:
+    """Definitions by name, the name of each element's, and what differs from the ring's names.
+
+    A definition is named for its family. Members of a family that differ have names of their own,
+    `qd..12` for `qd::12`.
+
+    Args:
+        elements: in beam order.
+        texts: what each is in the format.
+        reserved: words that are no names.
+    """
+    kinds: dict[str, dict[str, int]] = {}
+    for element, text in zip(elements, texts, strict=True):
+        known = kinds.setdefault(element.family.casefold(), {})
+        known.setdefault(text, len(known))
+    made: dict[str, str] = {}
+    line = []
+    several = set()
+    for element, text in zip(elements, texts, strict=True):
+        family = element.family.casefold()
+        name = _name(family, reserved)
+        if len(kinds[family]) > 1 and element.kind == "drift":
+            name += f"..{kinds[family][text]}"
+        elif len(kinds[family]) > 1:
+            name = _name(element.name.casefold().replace("::", ".."), reserved)
+            several.add(family)
+        while made.setdefault(name, text) != text:  # names that differ in odd characters
+            name += "_"
+        line.append(name)
+    if not several:
+        return made, line, []
+    some = first_of(sorted(several), NAMED)
+    return made, line, [f"members of {some} differ, and have names of their own: NAME..k for "
+                        "NAME::k"]  # fmt: skip
+
+
+def _name(family: str, reserved: Collection[str]) -> str:
+    name = re.sub(r"[^a-z0-9_.]", "_", family)
+    return f"e_{name}" if name in reserved or not name[:1].isalpha() else name
 
 
 def _some(names: list[str]) -> str:
@@ -40,8 +112,9 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _plain(element: Element) -> tuple[Element, list[str]]:
-    """The element without errors, and sentences about what that lacks, its name as {}."""
+def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]:
+    """The element without errors but those that are held, and sentences about what that lacks, its
+    name as {}."""
     errors = element.errors
     left: dict[str, Any] = {
         name: value for name, value in vars(errors).items() if value != getattr(NO_ERRORS, name)
@@ -52,19 +125,29 @@ def _plain(element: Element) -> tuple[Element, list[str]]:
         bare = _corrector(bare, errors)
         for name in ("kick_x", "kick_y", "roll"):
             left.pop(name, None)
+    if element.kind in _NO_FIELD:
+        for name in ("dx", "dy"):
+            left.pop(name, None)
     if element.kind == "quadrupole" and element.length and (errors.k1l or errors.k1sl):
         bare = _quadrupole(bare, errors)
         told.append("thin gradients in the middle of {} are written as fields of their bodies")
         for name in ("k1l", "k1sl"):
             left.pop(name, None)
-    if element.kind in _TURNS and "roll" in left:
-        bare = bare.changed(tilt=bare.tilt + left.pop("roll"))
+    if element.kind in _TURNS and "roll" in left and "roll" not in held:
+        roll = left.pop("roll")
+        bare = bare.changed(tilt=bare.tilt + roll)
+        own = replace(NO_ERRORS, **{name: left.pop(name) for name in FIELDS if name in left})
+        kick = complex(own.kick_x, own.kick_y) * cmath.exp(1j * roll)
+        gradient = complex(own.k1l, own.k1sl) * cmath.exp(-2j * roll)
+        turned = (kick.real, kick.imag, gradient.real, gradient.imag)
+        left |= {name: v for name, v in zip(FIELDS, turned, strict=True) if v}
     if type(bare.source).__name__ in ("Matrix", "Marker"):
         bare = _matrix(bare, errors)
         for name in ("k1l", "k1sl", "entrance_k1l", "entrance", "middle"):
             left.pop(name, None)
+    kept = {name: left.pop(name) for name in [*left] if name in held}
     told += [f"{name} of {{}} cannot be written; the package's own JSON holds it" for name in left]
-    return bare, told
+    return replace(bare, errors=replace(NO_ERRORS, **kept)), told
 
 
 def _quadrupole(element: Element, errors: Errors) -> Element:

@@ -3,8 +3,9 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -229,6 +230,17 @@ class Ring(Speaks):
         "Draw its betas and its magnets: a matplotlib Figure; span=(from, to) in m for a part.",
     )
 
+    to_at = Method("tmlattice.lattice.write", "to_at", "Return it as an `at.Lattice`.")
+    to_ocelot = Method(
+        "tmlattice.lattice.write", "to_ocelot", "Return it as OCELOT's `MagneticLattice`."
+    )
+    to_xtrack = Method("tmlattice.lattice.write", "to_xtrack", "Return it as an `xtrack.Line`.")
+    to_madx = Method("tmlattice.lattice.write", "to_madx", "Return it as the text of a sequence.")
+    to_dataframe = Method(
+        "tmlattice.lattice.write", "to_dataframe", "Return a pandas DataFrame, a row an element."
+    )
+    twiss = Method("tmlattice.optics", "twiss", "Return its optical functions: a `Twiss`.")
+
     def _told(self) -> tuple[str, dict[str, str]]:
         correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in self.elements)
         return last_part(self.name), {
@@ -311,8 +323,43 @@ class Ring(Speaks):
         except KeyError:
             raise unknown_name("element", name, (e.name for e in self.elements)) from None
 
-    def __getitem__(self, name: str) -> Element:
-        return self.elements[self.index(name)]
+    def __getitem__(self, name: str | int) -> Element:
+        """The element of a name (case does not matter) or a place in `elements`; of a pattern with
+        *, ? or [...], such as "qd*", the list of all elements whose name or family matches (typed
+        as one element, which is what nearly every name means).
+
+        Raises:
+            UnknownNameError: with the nearest names.
+            IndexError: a place behind the last.
+        """
+        if not isinstance(name, str):
+            return self.elements[name]
+        if name.strip().casefold() in self._index or not any(c in name for c in "*?["):
+            return self.elements[self.index(name)]
+        low = name.strip().casefold()
+        found = [
+            e for e in self.elements
+            if fnmatchcase(e.name.casefold(), low) or fnmatchcase(e.family.casefold(), low)
+        ]  # fmt: skip
+        if not found:
+            raise unknown_name("element like", name, dict.fromkeys(e.family for e in self.elements))
+        return found  # type: ignore[return-value]
+
+    def __contains__(self, name: object) -> bool:
+        """Whether it has an element of this name."""
+        return isinstance(name, str) and name.strip().casefold() in self._index
+
+    def __iter__(self) -> Iterator[Element]:
+        """Its elements in beam order."""
+        return iter(self.elements)
+
+    def __len__(self) -> int:
+        """Number of elements."""
+        return len(self.elements)
+
+    def __bool__(self) -> bool:
+        """True, as of all objects: a ring is there, however many elements it has."""
+        return True
 
     @cached_property
     def slices(self) -> dict[int, tuple[int, ...]]:

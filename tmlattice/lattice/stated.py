@@ -141,6 +141,14 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
     return None
 
 
+def slip(ring: Ring) -> float:
+    """How much later a particle of more energy comes round, per turn's length: above transition it
+    is positive."""
+    matrix = _turn(_maps(ring), np.zeros(6))
+    dispersion = np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 5])
+    return float(matrix[4, :4] @ dispersion + matrix[4, 5]) / ring.length
+
+
 def curvatures(ring: Ring, stated: Stated) -> list[float]:
     """Curvatures (1/m) with which thin bends, all of one radius, give the tunes that are stated.
 

@@ -1,28 +1,36 @@
-"""One door to all lattice files that are written: the suffix says which format it is.
+"""Rings in the formats of other packages: files by their suffix, and objects.
 
->>> told = write_ring(ring, "as_found.at.json")         # what the file does not hold
+>>> lacks = write_ring(ring, "estimated.at.json")       # what the file does not hold
+>>> lattice = ring.to_at()                              # warns of what AT does not hold
 """
 
+import warnings
 from collections.abc import Callable
+from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, MissingPackageError
 from tmlattice.files import output_file
 from tmlattice.lattice.json_file import save_ring
-from tmlattice.lattice.plain import plain
+from tmlattice.lattice.plain import Holds, plain
 from tmlattice.lattice.ring import Ring
 
 Writer = Callable[[Ring, Path], tuple[str, ...]]
 
-SUFFIXES = ".json (the package's own), .at.json (AT), .madx or .seq (MAD-X), .py (OCELOT)"
+SUFFIXES = (
+    ".json (the package's own), .at.json (AT), .xsuite.json (Xsuite), .madx or .seq (MAD-X), .py "
+    "(OCELOT)"
+)
 
 
 def write_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
     """Write a ring in the format that the suffix names, whole or not at all.
 
     `.json` is the package's own file, and holds everything. `.at.json` is AT's (`at.load_lattice`),
-    `.madx` and `.seq` are MAD-X, `.py` is OCELOT, which is code. Those have no place for every
-    error of a magnet: see `plain`.
+    `.xsuite.json` is Xsuite's (`xtrack.Line.from_json`), `.madx` and `.seq` are MAD-X, `.py` is
+    OCELOT, which is code. Those have no place for every error of a magnet: see `plain`.
 
     Args:
         ring: from any reader, with its changes and errors.
@@ -37,13 +45,13 @@ def write_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
     """
     path = Path(path)
     name = path.name.lower()
-    if name.endswith(".json") and not name.endswith(".at.json"):
+    if name.endswith(".json") and not name.endswith((".at.json", ".xsuite.json")):
         save_ring(ring, path)
         return ()
-    write = _writer(path)
-    bare, told = plain(ring)
+    holds, write = _writer(path)
+    bare, lacks = plain(ring, holds)
     with output_file(path) as temporary:
-        return (*told, *write(bare, temporary))
+        return (*lacks, *write(bare, temporary))
 
 
 def knows(path: str | Path) -> bool:
@@ -51,18 +59,109 @@ def knows(path: str | Path) -> bool:
     return Path(path).name.lower().endswith((".json", ".madx", ".seq", ".py"))
 
 
-def _writer(path: Path) -> Writer:
+def _writer(path: Path) -> tuple[Holds, Writer]:
+    """The errors that a format holds, and its writer."""
     name = path.name.lower()
     if name.endswith(".at.json"):
-        from tmlattice.lattice.write_at import write_at
+        from tmlattice.lattice import write_at
 
-        return write_at
+        return write_at.holds, write_at.write_at
+    if name.endswith(".xsuite.json"):
+        from tmlattice.lattice import write_xsuite
+
+        return write_xsuite.holds, write_xsuite.write_xsuite
     if name.endswith((".madx", ".seq")):
-        from tmlattice.lattice.write_madx import write_madx
+        from tmlattice.lattice import write_madx
 
-        return write_madx
+        return write_madx.holds, write_madx.write_madx
     if name.endswith(".py"):
-        from tmlattice.lattice.write_ocelot import write_ocelot
+        from tmlattice.lattice import write_ocelot
 
-        return write_ocelot
+        return write_ocelot.holds, write_ocelot.write_ocelot
     raise LatticeError(f"'{path}' names no format; end it in {SUFFIXES}")
+
+
+def to_at(ring: Ring) -> Any:
+    """Return the ring as an `at.Lattice`, cavities switched off; its errors as AT has them (T1, T2,
+    R1, R2, PolynomA, PolynomB). Elements are named for their families.
+
+    Warns:
+        Once, of all that AT does not hold.
+    """
+    from tmlattice.lattice.write_at import at_lattice, holds
+
+    return _object(ring, "AT", holds, at_lattice)
+
+
+def to_ocelot(ring: Ring) -> Any:
+    """Return the ring as OCELOT's `MagneticLattice` of second-order maps, with elements of its own.
+    It holds no energy: give it `ring.energy` where it asks (GeV).
+
+    Warns:
+        Once, of all that OCELOT does not hold.
+    """
+    from tmlattice.lattice.write_ocelot import holds, magnetic_lattice
+
+    return _object(ring, "OCELOT", holds, magnetic_lattice)
+
+
+def to_xtrack(ring: Ring) -> Any:
+    """Return the ring as an `xtrack.Line` with its reference particle; monitors and correctors are
+    those of its steering.
+
+    Raises:
+        MissingPackageError: xtrack is not installed.
+
+    Warns:
+        Once, of all that Xsuite does not hold.
+    """
+    try:
+        xtrack = import_module("xtrack")
+    except ImportError as error:
+        raise MissingPackageError(
+            "to_xtrack needs the package 'xtrack', which is not installed: `pip install xsuite` "
+            "brings it; write_ring(ring, 'ring.xsuite.json') does without"
+        ) from error
+    from tmlattice.lattice.write_xsuite import holds, line_of
+
+    content = _object(ring, "Xsuite", holds, line_of)
+    return xtrack.Line.from_dict(content, with_progress=False)
+
+
+def to_madx(ring: Ring) -> str:
+    """Return the text of a MAD-X file with the ring as its sequence `ring`, for `madx.input(...)`.
+
+    Warns:
+        Once, of all that MAD-X does not hold.
+    """
+    from tmlattice.lattice.write_madx import holds, madx_text
+
+    return str(_object(ring, "MAD-X", holds, madx_text))
+
+
+def to_dataframe(ring: Ring) -> Any:
+    """Return a pandas DataFrame with a row for each element in beam order, by name.
+
+    Columns: family, kind, s (of the middle) and length in m, k1 (1/m2), k2 (1/m3), angle and tilt
+    (rad), and the errors beyond them, in the units of `Errors`: dx, dy, ds, roll, kick_x, kick_y,
+    k1l, k1sl, entrance_k1l, loss.
+    """
+    pandas = import_module("pandas")
+
+    columns = ("family", "kind", "s", "length", "k1", "k2", "angle", "tilt")
+    rows = [
+        {**{name: getattr(e, name) for name in columns},
+         **{k: v for k, v in asdict(e.errors).items() if not isinstance(v, tuple)}}
+        for e in ring.elements
+    ]  # fmt: skip
+    return pandas.DataFrame(rows, index=pandas.Index([e.name for e in ring.elements], name="name"))
+
+
+def _object(
+    ring: Ring, package: str, holds: Holds, make: Callable[[Ring], tuple[Any, tuple[str, ...]]]
+) -> Any:
+    bare, lacks = plain(ring, holds)
+    made, more = make(bare)
+    if lacks or more:
+        warnings.warn(f"'{ring.name}' in {package}: {'; '.join((*lacks, *more))}", stacklevel=3)
+    return made

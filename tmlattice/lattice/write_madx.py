@@ -1,9 +1,9 @@
-"""Writing MAD-X: a line of elements, the names those of their families.
+"""Writing MAD-X: a sequence of elements, the names those of their families.
 
 AT's saver of this language leaves out tilts, gaps and matrices, so this is one of our own.
 """
 
-import re
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import first_of
+from tmlattice.lattice.plain import BENDS, STRAIGHT, definitions
 from tmlattice.lattice.ring import PROTON_GEV, Element, Ring
 from tmlattice.lattice.write_at import first_order, kicks, second_order
 
@@ -23,60 +24,64 @@ KEYWORDS = (
 """Words that MAD-X has a meaning for, or that the file itself uses."""
 
 
-def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
-    """Write plain elements; what it lacks.
+SHIFTS = ("dx", "dy", "ds")
+ROUNDING = 1e-6
+"""m; MAD-X takes overlaps of this size for the rounding of positions, but no element of negative
+length."""
 
-    A definition is named for its family. Members of a family that differ have names of their own,
-    `qd..12` for `qd::12`.
+
+def holds(element: Element) -> tuple[str, ...]:
+    """Errors for which MAD-X has a place: DX, DY, DS, and in bends K0 and DPSI."""
+    cls = type(element.source).__name__
+    if cls in BENDS:
+        upright = element.length and element.angle and not element.tilt
+        return (*SHIFTS, "kick_x", "kick_y") if upright else SHIFTS
+    return SHIFTS if cls in STRAIGHT else ()
+
+
+def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
+    """Write plain elements; what it lacks. See `madx_text`."""
+    text, told = madx_text(ring)
+    path.write_text(text, encoding="utf-8")
+    return told
+
+
+def madx_text(ring: Ring) -> tuple[str, tuple[str, ...]]:
+    """A sequence of plain elements, and what it lacks.
 
     Args:
-        ring: of `plain`.
-        path: to write to.
+        ring: of `plain`, with the errors that MAD-X `holds`.
     """
     left_out: Counter[str] = Counter()
-    texts = [_definition(element, ring.map_energy, left_out) for element in ring.elements]
-    kinds: dict[str, dict[str, int]] = {}
-    for element, text in zip(ring.elements, texts, strict=True):
-        known = kinds.setdefault(element.family.casefold(), {})
-        known.setdefault(text, len(known))
-    definitions: dict[str, str] = {}
-    line = []
-    several = set()
-    for element, text in zip(ring.elements, texts, strict=True):
-        family = element.family.casefold()
-        name = _name(family)
-        if len(kinds[family]) > 1 and element.kind == "drift":
-            name += f"..{kinds[family][text]}"
-        elif len(kinds[family]) > 1:
-            name = _name(element.name.casefold().replace("::", ".."))
-            several.add(family)
-        while definitions.setdefault(name, text) != text:  # names that differ in odd characters
-            name += "_"
-        line.append(name)
+    elements = [e for e in ring.elements if not (e.kind == "drift" and e.length <= 0)]
+    texts = [_definition(e, ring.map_energy, left_out) + _misaligned(e) for e in elements]
+    made, line, names = definitions(elements, texts, KEYWORDS)
+    back = [e.name for e in ring.elements if e.length < -ROUNDING]
+    if back:
+        left_out[f"MAD-X takes no sequence that goes back, as this one at {first_of(back)}"] += 1
     told = [f"{what} ({count} elements)" for what, count in left_out.items()]
-    if several:
-        some = first_of(sorted(several), 4)
-        told.append(f"members of {some} differ, and have names of their own: NAME..k for NAME::k")
     particle = "ELECTRON" if ring.radiates else "PROTON"
     if not ring.radiates and abs(ring.mass / PROTON_GEV - 1) > 1e-6:
         particle = f"ION, MASS={_number(ring.mass)}, CHARGE=1"
     content = [
         f"! {Path(ring.name).name}, by tmlattice",
         f"BEAM, PARTICLE={particle}, ENERGY={_number(ring.energy)};",
-        *(f"{name}: {text};" for name, text in definitions.items()),
-        "ring: LINE=(",
-        *(f"  {', '.join(line[i : i + 8])}," for i in range(0, len(line) - 8, 8)),
-        f"  {', '.join(line[(len(line) - 1) // 8 * 8 :])});",
+        *(f"{name}: {text};" for name, text in made.items()),
+        f"ring: SEQUENCE, L={_number(ring.length)}, REFER=ENTRY;",
+        *(
+            f"  {name}, AT={_number(element.s - element.length / 2)};"
+            for name, element in zip(line, elements, strict=True)
+        ),
+        "ENDSEQUENCE;",
         "USE, SEQUENCE=ring;",
         "",
     ]
-    path.write_text("\n".join(content), encoding="utf-8")
-    return tuple(told)
+    return "\n".join(content), (*told, *names)
 
 
-def _name(family: str) -> str:
-    name = re.sub(r"[^a-z0-9_.]", "_", family)
-    return f"e_{name}" if name in KEYWORDS or not name[:1].isalpha() else name
+def _misaligned(element: Element) -> str:
+    given = ((name, getattr(element.errors, name)) for name in SHIFTS)
+    return "".join(f", {name.upper()}={_number(amount)}" for name, amount in given if amount)
 
 
 def _number(value: float) -> str:
@@ -171,6 +176,14 @@ def _bend(element: Element, left_out: Counter[str]) -> str:
         text += f", FINTX={_number(source.fintx)}"
     if element.tilt:
         left_out["tilts of bends turn their design plane"] += 1
+    kick_x, kick_y = element.errors.kick_x, element.errors.kick_y
+    if kick_y:  # K0S has no effect in MAD-X's TWISS
+        roll = -kick_y / math.sin(element.angle)
+        text += f", DPSI={_number(roll)}"
+        kick_x -= roll**2 * math.sin(element.angle) / 2
+        left_out["vertical kicks of bends are written as their rolls"] += 1
+    if kick_x:
+        text += f", K0={_number((element.angle - kick_x) / element.length)}"
     return text
 
 

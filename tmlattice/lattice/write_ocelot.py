@@ -1,23 +1,85 @@
-"""Writing OCELOT: a Python file with its elements and their sequence, the numbers bit for bit.
+"""OCELOT's elements of a ring, and a Python file of them, the numbers bit for bit.
 
 OCELOT's own writer renames elements and states no energy, so this is one of our own.
 """
 
 import json
 import re
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from tmlattice.lattice.json_file import described
 from tmlattice.lattice.places import source_kind
-from tmlattice.lattice.ring import Ring
+from tmlattice.lattice.plain import BENDS
+from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
+from tmlattice.lattice.source import copied
+
+
+def holds(element: Element) -> tuple[str, ...]:
+    """Errors for which OCELOT has a place. Of tilted elements its maps turn all but the offset."""
+    cls = type(element.source).__name__
+    upright = not (element.tilt or element.errors.roll)
+    known = cls in BENDS | {"Quadrupole", "Sextupole", "Octupole"}
+    return ("dx", "dy") if known and upright else ()
+
+
+def displaced(ring: Ring) -> Ring:
+    """The ring with the offsets of its elements in their sources."""
+    moved = {
+        place: replace(
+            element.changed(dx=element.errors.dx, dy=element.errors.dy), errors=NO_ERRORS
+        )
+        for place, element in enumerate(ring.elements)
+        if element.errors != NO_ERRORS
+    }
+    return ring.with_elements(moved)
+
+
+def magnetic_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
+    """OCELOT's `MagneticLattice` with elements of its own, and what it lacks.
+
+    Args:
+        ring: of `plain`, with the errors that OCELOT `holds`.
+    """
+    from tmlattice.lattice.ocelot import SecondTM, elements
+
+    lattices = import_module("ocelot.cpbd.magnetic_lattice")  # after OCELOT, without its greeting
+    sequence = []
+    off = 0
+    for element in displaced(ring).elements:
+        source = copied(element.source)
+        if element.kind == "cavity":  # it would accelerate the reference; a thin one has no map
+            off += bool(getattr(source, "v", 0.0))
+            source = elements.Drift(l=element.length) if element.length else elements.Marker()
+        source.id = element.family
+        sequence.append(source)
+    told = (f"{off} cavities are off, as drifts or markers",) if off else ()
+    lattice = lattices.MagneticLattice(tuple(sequence), method={"global": SecondTM})
+    return lattice, (*_lacks(ring), *told)
+
+
+def _lacks(ring: Ring) -> tuple[str, ...]:
+    told = []
+    if not ring.radiates:
+        told.append(
+            f"the energy of its maps is that of an electron as fast: {ring.map_energy:.9g} GeV"
+        )
+    if any(type(e.source).__name__ == "CombinedMultipole" for e in ring.elements):
+        told.append("magnets of several fields are tmlattice's own, which is imported for them")
+    # by the name that the element has there: a source that comes from the cache has none
+    other = sum(e.kind != source_kind(e.source, e.family) for e in ring.elements)
+    if other:
+        told.append(f"OCELOT's classes do not tell the kind of {other} elements")
+    return tuple(told)
 
 
 def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
-    """Write plain elements as code; it lacks nothing.
+    """Write plain elements as code; what it lacks.
 
     Args:
-        ring: of `plain`.
+        ring: of `plain`, with the errors that OCELOT `holds`.
         path: to write to.
 
     Raises:
@@ -26,7 +88,7 @@ def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
     variables: dict[str, str] = {}  # what an element is, as text -> its variable
     used: dict[str, int] = {}
     code, sequence = [], []
-    for element in ring.elements:
+    for element in displaced(ring).elements:
         content = described(element)
         key = json.dumps([element.family, content["class"], content["parameters"]], sort_keys=True)
         if key not in variables:
@@ -55,16 +117,7 @@ def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
         "",
     ]
     path.write_text("\n".join(text), encoding="utf-8")
-    told = []
-    if not ring.radiates:
-        told.append("the energy is that of an electron as fast as the ring's particles")
-    if combined:
-        told.append("magnets of several fields are tmlattice's own, which the file imports")
-    # by the name that the file has: a source that comes from the cache has none
-    other = sum(e.kind != source_kind(e.source, e.family) for e in ring.elements)
-    if other:
-        told.append(f"OCELOT's classes do not tell the kind of {other} elements")
-    return tuple(told)
+    return _lacks(ring)
 
 
 def _lines(variable: str, family: str, content: dict[str, Any]) -> list[str]:

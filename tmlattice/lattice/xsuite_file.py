@@ -9,6 +9,7 @@ import cmath
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,9 @@ MOST_KICKS = 1000
 LUMPED = 2e-5
 """1/m; by so much a magnet's focusing may differ for its gradient's being spread over its length:
 1e-5 of a tune at a beta of 10 m."""
+COARSE = 0.25
+"""|k1| l^2 of a bend above which the seven kicks that Xsuite has for it are too few: 1e-5 of its
+matrix; 2e-3 at 1.8."""
 SKEW_SHARE = 0.1
 """Weight of skew gradients there: they act on the tunes in second order."""
 ROUNDING = 1e-9
@@ -116,14 +120,23 @@ def read_xsuite(
         raise LatticeError(f"'{path}' is larger than {MOST_BYTES / 1e9:g} GB; save one line")
     content = json_of(path, LatticeError, finite=False)
     try:
-        return _ring(path, content, name, sequence, energy)
+        return ring_of_content(path, content, name, sequence, energy)
     except LatticeError as error:
         if str(error).startswith(f"'{path}'"):
             raise
         raise LatticeError(f"'{path}' cannot be read as Xsuite's JSON: {error}") from error
 
 
-def _ring(path: Path, content: Any, name: str, sequence: str | None, energy: float | None) -> Ring:
+def ring_of_content(
+    path: Path, content: Any, name: str, sequence: str | None, energy: float | None
+) -> Ring:
+    """The ring of what `xtrack.Line.to_dict` or `Environment.to_dict` returns; see `read_xsuite`.
+
+    Args:
+        path: of its file, or the object's name, for messages.
+        content: the dictionary.
+        name, sequence, energy: see `read_xsuite`.
+    """
     beside: Mapping[str, Any] = {}
     if isinstance(content.get("line"), dict):
         content, beside = content["line"], content
@@ -259,6 +272,10 @@ class _Reader:
         variables = (content.get("_var_management_data") or {}).get("var_values") or {}
         self.variables = {k: v for k, v in variables.items() if isinstance(v, int | float)}
         self._arithmetic = Arithmetic((math.sqrt, math.sin, math.cos, math.tan, math.exp))
+        self._steering = {
+            key: {str(name).partition("::")[0] for name in own or ()}
+            for key, own in (line.get("_extra_config") or {}).items() if key.startswith("steering_")
+        }  # fmt: skip
         self._made: dict[str, list[Part]] = {}
         self._length = 0.0
 
@@ -276,9 +293,33 @@ class _Reader:
                 parts.append(drifts.setdefault(way, Part("drift", "drift", {"l": way})))
                 continue
             if item not in self._made:
-                self._made[item] = self._converted(self._fields(item), item.lower())
+                own = self._converted(self._fields(item), item.lower())
+                self._made[item] = [self._steered(item, part) for part in own]
             parts += self._made[item]
         return parts
+
+    def _steered(self, name: str, part: Part) -> Part:
+        """A marker or way among the monitors of the line's steering as a monitor, a dipole field
+        among its correctors as a corrector."""
+        x, y, read_x, read_y = (
+            name in self._steering.get(f"steering_{what}", ())
+            for what in ("correctors_x", "correctors_y", "monitors_x", "monitors_y")
+        )
+        if (read_x or read_y) and part.keyword in ("marker", "drift"):
+            return replace(part, keyword="monitor")
+        if not (x or y) or part.keyword != "multipole" or part.number("angle"):
+            return part
+        knl, ksl = part.list("knl"), part.list("ksl")
+        moved = any(part.number(key) for key in ("dx", "dy", "ds", "dpsi"))
+        if knl[1:].any() or ksl[1:].any() or moved:
+            return part
+        kick_x, kick_y = -float(knl[:1].sum()), float(ksl[:1].sum())
+        values = {"l": part.number("l"), "tilt": part.number("tilt")}
+        if x and not y and not kick_y:
+            return replace(part, keyword="hkicker", values={**values, "kick": kick_x})
+        if y and not x and not kick_x:
+            return replace(part, keyword="vkicker", values={**values, "kick": kick_y})
+        return replace(part, keyword="kicker", values={**values, "hkick": kick_x, "vkick": kick_y})
 
     # --- the order of a line's elements ---------------------------------------------------------
     def _names(self, line: Mapping[str, Any], depth: int) -> list[str | float]:
@@ -601,7 +642,8 @@ class _Reader:
         exact = ["mat-kick-mat", "mat-kick-mat-exact", "expanded"]
         if rule not in ("uniform", "teapot"):
             exact += ["adaptive", "full", "0"]
-        if fields.number("num_multipole_kicks") and model not in exact:
+        coarse = not model.startswith("mat") and abs(fields.number("k1")) * _way_of(fields) ** 2
+        if (fields.number("num_multipole_kicks") and model not in exact) or coarse > COARSE:
             self.report.left_out("the finite number of kicks", name)
 
     def _straight(self, fields: _Fields, name: str, where: str) -> list[Part]:

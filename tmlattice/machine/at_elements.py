@@ -1,4 +1,4 @@
-"""AT's elements of one element of a ring: thick, symplectic, with what is wrong and what is set."""
+"""AT's elements of one element of a ring: thick, symplectic, with errors and settings."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
@@ -48,11 +48,11 @@ _TAKES: Mapping[str, frozenset[str]] = {
     "drift": _EMPTY,
     "cavity": frozenset({"middle"}),  # the RF takes the place of its first piece
 }
-"""What can be wrong with an element of each kind."""
+"""Possible errors of each kind of element."""
 
 
 def wiggler_curvature(element: Element, energy: float) -> float:
-    """Integral of 1 / rho^2 over a wiggler, 1/m, from the vertical focusing that its poles have.
+    """Integral of 1 / rho^2 over a wiggler, 1/m, from the vertical focusing of its poles.
 
     A plane wiggler focuses vertically with the mean of 1 / rho^2, so R33 = cos(sqrt(k) L).
     """
@@ -73,7 +73,7 @@ def expected_loss(ring: Ring, bends: float, wigglers: float) -> float:
 
 
 def _kick(element: Element) -> dict[str, Array]:
-    """What a matrix element adds to the coordinates behind it, as AT has it."""
+    """Kick of a matrix element behind it, in AT's coordinates."""
     kick = np.ravel(getattr(element.source, "b", np.zeros(6))).astype(float)[SWAPPED]
     return {"T2": kick} if kick.any() else {}
 
@@ -81,15 +81,15 @@ def _kick(element: Element) -> dict[str, Array]:
 def _matrix(element: Element, energy: float) -> Array:
     """The design's matrix of a matrix element or undulator in AT's coordinates, [6, 6].
 
-    An undulator focuses by (sqrt(2) pi K / (period gamma))^2 in the plane that its field's
-    direction stands for; its slippage, of the order 1 / gamma^2, is left out.
+    An undulator focuses by (sqrt(2) pi K / (period gamma))^2 in the plane of its field's direction;
+    its slippage, of the order 1 / gamma^2, is ignored.
     """
     source, length = element.source, element.length
     if hasattr(source, "r"):
         if np.any(source.t) or source.delta_e:
             raise LatticeError(
                 f"matrix '{element.name}' has a second order or an energy gain, which AT's matrix "
-                "has not; take them out of the lattice file"
+                "lacks; remove them from the lattice file"
             )
         return np.asarray(source.r, dtype=float)[np.ix_(SWAPPED, SWAPPED)]
     matrix = np.eye(6)
@@ -115,10 +115,10 @@ def _turned(wrong: Build, angle: float) -> list[float]:
 
 
 def errors_of(element: Element, energy: float) -> Build:
-    """What is wrong with an element in the ring itself; energy in GeV.
+    """Return the errors of an element in the ring itself; energy in GeV.
 
     Raises:
-        LatticeError: a rolled bend: the maps turn its design plane, and no catalogue has it.
+        LatticeError: a rolled bend: the maps roll its design plane, and no effect does.
     """
     errors = element.errors
     if element.kind == "bend" and errors.roll:
@@ -141,7 +141,7 @@ def errors_of(element: Element, energy: float) -> Build:
 
 
 def _check(element: Element, wrong: Build) -> None:
-    """Raise for what AT cannot make wrong with an element of this kind."""
+    """Raise for errors that AT cannot build in an element of this kind."""
     asked: set[str] = {*wrong.gradients, *wrong.slopes}
     asked |= {name for name, value in vars(wrong).items() if value != getattr(NOTHING, name)}
     more = sorted(asked - {"gradients", "slopes"} - _TAKES.get(element.kind, frozenset()))
@@ -152,7 +152,7 @@ def _check(element: Element, wrong: Build) -> None:
 
 
 class Builder:
-    """AT elements of one element of a ring with what is wrong with it and its settings."""
+    """AT elements of one element of a ring with its errors and settings."""
 
     def __init__(
         self, energy: float, steps: int, aperture: float, bends_radiate: bool, wigglers: float
@@ -161,17 +161,17 @@ class Builder:
         self.steps = steps
         self.aperture = aperture
         self.wigglers = wigglers
-        # The usual BndMPoleSymplectic4Pass leaves out the curvature's h x (px^2 + py^2) / 2, and
-        # its Rad twin takes the loss too late in every step (a third of the orbit is missing at
-        # 20 steps); the E2 pass has no vertical field. The exact pass has all three right.
+        # The usual BndMPoleSymplectic4Pass lacks the curvature's h x (px^2 + py^2) / 2, and its Rad
+        # twin applies the loss too late in every step (a third of the orbit is missing at 20
+        # steps); the E2 pass has no vertical field. The exact pass has all three.
         self.bend_pass = f"ExactSectorBend{'Rad' if bends_radiate else ''}Pass"
         self.walls = {"RApertures": np.array([-aperture, aperture, -aperture, aperture])}
 
     def pieces(self, element: Element, wrong: Build, setting: Mapping[str, float]) -> list[Any]:
-        """As many for every setting: settings change strengths alone.
+        """Return the pieces; their number is the same for every setting.
 
         Raises:
-            LatticeError: an element that AT cannot build, or not with this wrong with it.
+            LatticeError: an element, or an error of it, that AT cannot build.
         """
         build: Callable[..., list[Any]] | None = getattr(self, f"_{element.kind}", None)
         if build is None:
@@ -199,7 +199,7 @@ class Builder:
     def _with_middle(
         self, element: Element, wrong: Build, body: Callable[[float], list[Any]]
     ) -> list[Any]:
-        """The body, or its two halves (`body` of a share of the length) and the thin kicks."""
+        """Return the body, or its two halves (`body` of a share of the length) and thin kicks."""
         thin = self._thin(element, wrong, "middle")
         if wrong.kick_x or wrong.kick_y:
             thin.append(at.Corrector(element.name, 0.0, _turned(wrong, wrong.roll)))
@@ -231,7 +231,7 @@ class Builder:
     def _straight(
         self, element: Element, normal: list[float], wrong: Build, walls: bool
     ) -> Callable[[float], list[Any]]:
-        """A straight multipole of strengths k_n, rolled about its own centre."""
+        """Return a straight multipole of strengths k_n, rolled about its own centre."""
         more: dict[str, Any] = dict(self.walls) if walls else {}
         angle = element.tilt + wrong.roll
         if wrong.dx or wrong.dy:
@@ -249,7 +249,7 @@ class Builder:
         B, A = ([k / n for k, n in zip(f, factorial, strict=False)] for f in (normal, skew))
 
         def body(share: float) -> list[Any]:
-            if element.length == 0:  # a combined multipole's fields are integrated then
+            if element.length == 0:  # a combined multipole's fields are then integrated
                 thin = share if combined else 0.0
                 parts = [[thin * k for k in field] for field in (A, B)]
                 return [at.ThinMultipole(element.name, *parts, **more)]
@@ -298,7 +298,7 @@ class Builder:
         return [at.ThinMultipole(element.name, zero, strengths / factorials, **more)]
 
     def _solenoid(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
-        return [  # AT has the pass and no class; its K is B / (B rho), OCELOT's k half of it
+        return [  # AT has the pass but no class; its K is B / (B rho), OCELOT's k half of it
             at.Element(
                 element.name,
                 Length=element.length,
@@ -313,9 +313,9 @@ class Builder:
             raise LatticeError(f"AT cannot build '{element.name}', a thin bend or curved poles")
         roll = wrong.roll
         kick_x, kick_y = _turned(wrong, -element.tilt)
-        horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2 - kick_x  # what px loses
+        horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2 - kick_x  # minus px
         vertical = kick_y - roll * angle
-        # The body is exact in a step; only its errors, losses and gradients are spread.
+        # The body is exact in one step; only its errors, losses and gradients are distributed.
         k1 = element.k1 * (1 + setting["k1_relative"]) + wrong.k1
         steps = self.steps if k1 or element.k2 else 4
         more: dict[str, Any] = {}
@@ -376,9 +376,9 @@ class Builder:
         return [first, *middle, last]
 
     def _loss(self, element: Element) -> list[Any]:
-        """delta -> delta - u (1 + 2 delta), and px, py in proportion to the momentum.
+        """Return delta -> delta - u (1 + 2 delta), and px, py in proportion to the momentum.
 
-        AT's change of the reference momentum by 1 / (1 - u) takes the share u from px, py and
+        AT's change of the reference momentum by 1 / (1 - u) removes the share u from px, py and
         1 + delta; a matrix before it adds the second u delta.
         """
         curvature = wiggler_curvature(element, self.energy)

@@ -1,7 +1,7 @@
 """The virtual machine's beam, tracked by AT: thick, symplectic elements in six coordinates.
 
-It shares no map and no formula with the networks: a diagnosis that works on its data does not
-owe it to its own model.
+It shares no map and no formula with the networks, so that a diagnosis is tested independently of
+its own model.
 
 >>> engine = AtEngine(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)])
 >>> engine.track(launches)                              # [shot, 1, monitor, 2], m
@@ -10,8 +10,8 @@ owe it to its own model.
 Launches are OCELOT's (x, px, y, py, tau, p); AT tracks (x, px, y, py, delta, ct). The first four
 are the same: px = Px / p0, no angle. From p = dE / (p0 c) follows delta = P / p0 - 1 through
 E^2 = (P c)^2 + (m c^2)^2. tau = c t - s / beta0 and ct have the same sign, positive for a late
-particle; AT takes the speed of light for all particles: its ct is the way, beta0 c t, and what the
-velocity adds stands before the cavities and at the end, where it counts (protons).
+particle. AT takes the speed of light for all particles: its ct is the path length, beta0 c t. The
+velocity's contribution is added before the cavities and at the end, where it counts (protons).
 """
 
 import copy
@@ -42,11 +42,11 @@ from tmlattice.machine.at_elements import (
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
-"""What is set on purpose, by element: {"kick": rad}, {"k1_relative": 1}, {"k2_relative": 1},
-and {"rf": {"frequency_relative": 1}}."""
+"""Settings by element: {"kick": rad}, {"k1_relative": 1}, {"k2_relative": 1}, and
+{"rf": {"frequency_relative": 1}}."""
 
 TURNS_AT_ONCE = 2**22
-"""AT's result is cut into blocks of so many states, so that many turns fit into memory."""
+"""States of one block of AT's results, so that many turns fit into memory."""
 
 _CORRECTOR = frozenset({"hcorrector", "vcorrector"})
 SET_ON: Mapping[str, frozenset[str]] = {
@@ -59,22 +59,22 @@ SET_ON: Mapping[str, frozenset[str]] = {
 class AtEngine:
     """A ring with its causes as a line of AT elements.
 
-    Causes of the same effect on the same element add up, and to what the ring's own elements have
-    wrong (`Element.errors`). A thin kick sits on the design axis,
-    whatever the offset and roll of its magnet.
+    Causes of the same effect on the same element add up, and to the element's own errors
+    (`Element.errors`). A thin kick is on the design axis, whatever the offset and roll of its
+    magnet.
 
     Args:
         ring: the design.
-        causes: what is wrong with it; effects on readings (`monitor_*`) and on the beam
-            (`energy_offset`, `energy_spread`) are the caller's and are passed over.
-        radiation_bends, radiation_wigglers: scale of the expected energy loss, 0 none and 1 as
+        causes: errors; those on readings (`monitor_*`) and on the beam (`energy_offset`,
+            `energy_spread`) are ignored here.
+        radiation_bends, radiation_wigglers: scale of the expected energy loss, 0: none, 1: as
             expected; causes add to it.
         steps: fourth-order integration steps per magnet. With 30 the first turn of a
             PETRA-III-style ring is converged to 0.002 micrometres rms at 1 mm (0.01 with 20).
         aperture: half width in m of quadrupoles and monitors, in both planes.
         harmonic: of the RF; else that of the ring's first cavity, else the one nearest to 500 MHz.
         voltage: of the RF in V, all cavities together; else that of the ring's cavities, else
-            four times what the design loses when it radiates as expected.
+            four times the design's expected radiation loss.
 
     Attributes:
         ring: the design.
@@ -84,8 +84,7 @@ class AtEngine:
         LatticeError: an element that AT cannot build, a negative radiation loss, or an RF too
             weak for the loss.
         EffectError: an effect that cannot sit on its element.
-        UnknownNameError: an effect that does not exist, or one on an element or family that the
-            ring does not have.
+        UnknownNameError: an unknown effect, element or family.
     """
 
     def __init__(
@@ -121,8 +120,8 @@ class AtEngine:
         self._set_rf(rf)
 
     def _build(self, cavities: Sequence[int]) -> None:
-        """The line. AT's ct is the way: what the velocity of slower particles adds stands before
-        the cavities, which feel it."""
+        """Build the line. AT's ct is the path length: the velocity's contribution of slower
+        particles is added before the cavities."""
         nothing: Mapping[str, float] = {}
         way = 0.0
 
@@ -144,7 +143,7 @@ class AtEngine:
         self._line += [*velocity(), at.Marker("rf_at_the_end")]
 
     def _loss(self, kind: str) -> float:
-        """The scale of the loss in all elements of a kind."""
+        """Scale of the loss in all elements of a kind."""
         elements = self.ring.elements
         scales = {w.loss for i, w in self._wrong.items() if elements[i].kind == kind and w.loss}
         if len(scales) > 1:
@@ -159,40 +158,40 @@ class AtEngine:
         self._has_rf, self._harmonic, self._voltage = rf.own, rf.harmonic, rf.voltage
         if self.expected_loss and self.expected_loss >= rf.voltage:
             raise LatticeError(
-                f"an RF of {rf.voltage / 1e6:.3g} MV cannot make good a loss of "
+                f"an RF of {rf.voltage / 1e6:.3g} MV cannot replace a loss of "
                 f"{self.expected_loss / 1e6:.3g} MeV a turn; give voltage="
             )
 
     def track(
         self, launches: ArrayLike, turns: int = 1, settings: Sequence[Settings] | None = None
     ) -> Array:
-        """The beam at every monitor.
+        """Return the beam at every monitor.
 
         Over more than one turn the RF is on if the ring radiates, has cavities of its own, or
         its frequency is set: in the ring's cavities, else at the marker or drift named `rf`, else
-        at the end. Its phase makes good the loss on the design orbit. On one turn cavities are
+        at the end. Its phase replaces the loss on the design orbit. On one turn cavities are
         drifts. Shots with equal settings are tracked together.
 
         Args:
             launches: (x, px, y, py, tau, p) at the start of the sequence, [shot, 6].
             turns: at least 1.
-            settings: one mapping a shot, of element name to what is set: `kick` of a corrector
-                in rad (all of it: the design's kick is replaced), `k1_relative` of a quadrupole
-                or a bend, `k2_relative` of a sextupole, and under "rf" `frequency_relative`.
+            settings: of each shot, by element name: `kick` of a corrector in rad (the total: the
+                design's kick is replaced), `k1_relative` of a quadrupole or a bend, `k2_relative`
+                of a sextupole, and under "rf" `frequency_relative`.
 
         Returns:
-            (x, y) in m, [shot, turn, monitor, 2]; NaN from where a particle is lost.
+            (x, y) in m, [shot, turn, monitor, 2]; NaN once a particle is lost.
 
         Raises:
             LatticeError: a setting that its element does not have.
-            UnknownNameError: a setting for an element that the ring does not have.
+            UnknownNameError: a setting for an element that is not in the ring.
             ValueError: launches or settings of another shape, or no turn.
         """
         start = np.asarray(launches, dtype=float)
         if start.ndim != 2 or start.shape[1] != 6:
             raise ValueError(f"launches have the shape {start.shape}; it should be [shot, 6]")
         if turns < 1:
-            raise ValueError(f"{turns} turns cannot be tracked; one at least can")
+            raise ValueError(f"{turns} turns cannot be tracked; give at least one")
         if settings is not None and len(settings) != len(start):
             raise ValueError(f"{len(settings)} settings for {len(start)} shots; give one a shot")
         state = to_at(start, self.ring.energy, self.ring.mass)
@@ -205,11 +204,11 @@ class AtEngine:
         return readings
 
     def closed_orbits(self, settings: Sequence[Settings]) -> Array:
-        """The stored beam at every monitor, the RF frequency fixed or set.
+        """Return the stored beam at every monitor, the RF frequency fixed or set.
 
-        The turn lasts a harmonic number of the RF's periods, and the energy is what makes it so:
-        a corrector where the dispersion is not zero shifts it. What the ring loses is given back
-        at its end. Broyden's method starts from the unset ring's Jacobian.
+        A turn lasts a harmonic number of the RF's periods, which determines the energy: a corrector
+        at non-zero dispersion shifts it. The ring's loss is replaced at its end. Broyden's method
+        starts from the unset ring's Jacobian.
 
         Args:
             settings: one mapping an orbit, as in `track`.
@@ -219,7 +218,7 @@ class AtEngine:
 
         Raises:
             LatticeError, UnknownNameError: see `track`.
-            UnstableRingError: no closed orbit within reach.
+            UnstableRingError: no closed orbit is found.
         """
         start, solve = self._stored
         readings = np.empty((len(settings), len(self._monitors), 2))
@@ -232,12 +231,12 @@ class AtEngine:
 
     @functools.cached_property
     def _stored(self) -> tuple[Array, Array]:
-        """The unset ring's closed orbit, and its Jacobian: from it every setting's is found."""
+        """The unset ring's closed orbit, and its Jacobian, for every setting."""
         return at_orbit.stored(functools.partial(self._pass, self._line))
 
     def stored_line(self, settings: Settings) -> tuple[list[Any], list[Any], float]:
-        """The line with the settings of one shot: without RF; with it, where a beam that stays
-        feels one; and what a turn is longer than the RF's, m."""
+        """Return the line with the settings of one shot, without RF; with the RF that acts on a
+        stored beam; and the excess of a turn over the RF's, m."""
         ((_, changed, frequency),) = self._groups([settings])
         line = self._set(changed)
         with_rf = line.copy()
@@ -245,7 +244,7 @@ class AtEngine:
         return line, with_rf, -self.ring.length * frequency / (1 + frequency)
 
     def _set(self, changed: Mapping[int, Mapping[str, float]]) -> list[Any]:
-        """The line with settings, by place in the ring."""
+        """Return the line with settings, by index in the ring."""
         line = self._line.copy()
         for i, setting in changed.items():
             wrong = self._wrong.get(i, NOTHING)
@@ -253,28 +252,28 @@ class AtEngine:
         return line
 
     def _switch_on(self, line: list[Any], frequency: float) -> None:
-        """The RF, if the ring radiates, has cavities of its own, or its frequency is set."""
+        """Switch the RF on, if the ring radiates, has cavities, or its frequency is set."""
         if (self.expected_loss > 0 or self._has_rf or frequency) and self._voltage:
             for place in self._cavities:
                 line[place] = self._cavity(line[place], frequency)
 
     def _pass(self, line: list[Any], beam: Array) -> Array:
-        """Readings of the first of the states [6, shot], which move to the line's end."""
+        """Readings of the first of the states [6, shot], which are moved to the line's end."""
         return np.asarray(self.run(line, beam.T, 1, beam)[0, 0])
 
     def lattice(self) -> Any:
-        """The line as an AT lattice of its own, without RF, for AT's tools (`at.get_optics`).
+        """Return the line as an AT lattice, without RF, for AT's tools (`at.get_optics`).
 
         Exact bends round x to the rounding of their radius, 3e-14 m: derivatives need steps of
         3e-6 (`XYStep`) and 1e-3 (`DPStep`). The lattice's energy is the ring's, times the third
-        root of the scale of a loss in the bends other than 1: so AT's loss comes out scaled.
+        root of the scale of a loss in the bends other than 1: so AT's loss is scaled.
         """
         return at.Lattice(copy.deepcopy(self._line), energy=self._energy, periodicity=1)
 
     def _groups(
         self, settings: Sequence[Settings]
     ) -> Iterable[tuple[list[int], dict[int, Mapping[str, float]], float]]:
-        """(shots, settings by place in the ring, relative RF frequency) of equal shots."""
+        """(shots, settings by index in the ring, relative RF frequency) of equal shots."""
         groups: dict[Any, list[int]] = defaultdict(list)
         for shot, setting in enumerate(settings):
             groups[
@@ -297,7 +296,7 @@ class AtEngine:
     def _cavity(self, there: Any, frequency_relative: float) -> Any:
         length = getattr(there, "Length", 0.0)
         frequency = self._harmonic * SPEED_OF_LIGHT / self.ring.length * (1 + frequency_relative)
-        # Above transition a late particle has too much energy: the field falls with ct there.
+        # Above transition a late particle has too much energy: the field falls with ct.
         phase = stable_phase(self.ring, float(np.arcsin(self.expected_loss / self._voltage)))
         energy = self.ring.energy * 1e9 * self.ring.beta**2  # dP / P = dE / (beta^2 E)
         return at.RFCavity(
@@ -312,10 +311,10 @@ class AtEngine:
 
     @property
     def _energy(self) -> float:
-        """The energy that AT is told, eV.
+        """Energy given to AT, eV.
 
-        AT's loss is proportional to its cube and nothing else depends on it but the cavities,
-        whose voltage goes with it.
+        AT's loss is proportional to its cube. Nothing else depends on it but the cavities, whose
+        voltage is scaled.
         """
         scale = self._bends if self._bends > 0 else 1.0
         return self.ring.energy * 1e9 * float(np.cbrt(scale))
@@ -328,16 +327,16 @@ class AtEngine:
         beam: Array | None = None,
         first: int = 0,
     ) -> Array:
-        """Readings of the states [shot, 6], in AT's coordinates, [shot, turn, monitor, 2].
+        """Return readings of the states [shot, 6], in AT's coordinates, [shot, turn, monitor, 2].
 
-        A given `beam`, the states as AT wants them, [6, shot], is left at the line's end; `first`
-        is the number of the first turn, which the RF knows.
+        A given `beam`, the states for AT, [6, shot], is moved to the line's end; `first` is the
+        number of the first turn, for the RF.
         """
         beam = np.asfortranarray(state.T) if beam is None else beam
         readings = np.empty((len(state), turns, len(self._monitors), 2))
         block = max(TURNS_AT_ONCE // max(len(state) * len(self._monitors), 1), 1)
         for turn in range(0, turns, block):
-            seen = at.internal_lpass(  # it leaves in `beam` where the next block begins
+            seen = at.internal_lpass(  # leaves the next block's start in `beam`
                 line,
                 beam,
                 min(block, turns - turn),
@@ -346,13 +345,13 @@ class AtEngine:
                 turn=first + turn,
             )
             readings[:, turn : turn + block] = np.moveaxis(seen[[0, 2]], [0, 2, 3], [3, 2, 1])
-        # AT sets x alone of a lost particle to NaN, and that behind the wall it is lost on.
+        # AT sets x alone of a lost particle to NaN; beyond the aperture it is lost later.
         readings[~np.all(np.abs(readings) <= self._builder.aperture, axis=3)] = np.nan
         return readings
 
 
 def to_at(launches: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> Array:
-    """AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6].
+    """Return AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6].
 
     Args:
         launches: [..., 6].
@@ -377,7 +376,7 @@ def _check_setting(name: str, what: Iterable[str], known: Iterable[str]) -> None
 
 
 def _wrong(ring: Ring, causes: Iterable[Cause]) -> dict[int, Build]:
-    """What is wrong with the elements, in the ring itself and by causes, by place in the ring."""
+    """Errors of the elements, of the ring and by causes, by index in the ring."""
     causes = list(causes)
     check(ring, causes)
     amounts: dict[int, dict[str, float]] = defaultdict(dict)

@@ -1,4 +1,4 @@
-"""The closed orbit of a line that can be tracked: Broyden's method from one Jacobian."""
+"""Closed orbit of a line that is tracked: Broyden's method from one Jacobian."""
 
 from collections.abc import Callable, Sequence
 
@@ -9,20 +9,20 @@ from tmlattice.errors import UnstableRingError
 
 Array = NDArray[np.float64]
 Turn = Callable[[Array], Array]
-"""Takes states [6, shot] to the line's end, in place, and returns readings of the first of them."""
+"""Moves states [6, shot] to the line's end, in place, and returns readings of the first of them."""
 
 _NO_ORBIT = (
-    "no closed orbit: the search does not settle; the ring is at an integer resonance, or its "
+    "no closed orbit: the search does not converge; the ring is at an integer resonance, or its "
     "kicks are too large"
 )
 
 
 STEPS = np.array([3e-6, 3e-6, 3e-6, 3e-6, 1e-5, 1e-5])
-"""Of the derivatives, m and 1: bends round x to 3e-14 m."""
+"""Steps of the derivatives, m and 1: bends round x to 3e-14 m."""
 
 
 def one_turn(turn: Turn, start: Array) -> Array:
-    """The turn's matrix about a state [6], [6, 6], in AT's coordinates."""
+    """Return the turn's matrix at a state [6], [6, 6], in AT's coordinates."""
     steps = np.diag(STEPS)
     beam = np.asfortranarray(np.vstack([start + steps, start - steps]).T)
     turn(beam)
@@ -31,17 +31,16 @@ def one_turn(turn: Turn, start: Array) -> Array:
 
 
 def closed(turn: Turn, start: Array, free: Sequence[int], late: float = 0.0) -> Array:
-    """The state that returns to itself: some coordinates by Newton's method, the others given.
+    """Find the state that returns to itself: free coordinates by Newton's method, others given.
 
     Args:
         turn: of the line.
         start: near it, [6].
-        free: the coordinates that are found, and that return: (0, 1, 2, 3) at a given energy,
-            all six with the RF.
-        late: what a turn is longer than the RF's, m.
+        free: free coordinates, which return: (0, 1, 2, 3) at a given energy, all six with the RF.
+        late: excess of a turn over the RF's, m.
 
     Raises:
-        UnstableRingError: none within reach.
+        UnstableRingError: no closed orbit is found.
     """
     state, at = start.copy(), np.ix_(free, free)
     for _ in range(20):
@@ -66,7 +65,7 @@ def closed(turn: Turn, start: Array, free: Sequence[int], late: float = 0.0) -> 
 
 
 def stored(turn: Turn) -> tuple[Array, Array]:
-    """The unset ring's closed orbit [6] and what makes good a miss of the turn, [6, 6]."""
+    """Return the unset ring's closed orbit [6] and its correction for a turn's mismatch, [6, 6]."""
     start = np.zeros(6)
     for _ in range(3):
         slopes = one_turn(turn, start)[:, :5]
@@ -83,7 +82,7 @@ def stored(turn: Turn) -> tuple[Array, Array]:
 def settle(
     turn: Turn, start: Array, solve: Array, late: float, tolerance: float = 2e-12
 ) -> tuple[Array, Array]:
-    """Broyden's method from a given Jacobian: the state [6] and its readings [monitor, 2]."""
+    """Return the closed state [6] and its readings [monitor, 2], by Broyden's method."""
     state, change, before = start.copy(), np.zeros(6), np.zeros(6)
     for step in range(60):
         beam = np.array(state[:, None], order="F")
@@ -92,7 +91,7 @@ def settle(
         miss[5] -= late
         if not np.isfinite(readings).all() or not np.isfinite(miss).all():
             break
-        if step:  # Broyden: the Jacobian's inverse learns from what the last change did
+        if step:  # Broyden's update of the inverse Jacobian
             learned = solve @ (before - miss)
             weight = change @ solve
             below = weight @ (before - miss)

@@ -1,4 +1,4 @@
-"""A stored beam in AT: its turns after a kick, of one particle or of many, and its tunes."""
+"""A stored beam in AT: turns after a kick, of one particle or of many, and tunes."""
 
 import functools
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ TRANSVERSE, ALL = (0, 1, 2, 3), (0, 1, 2, 3, 4, 5)
 ENERGY = 1e-3
 """Half the step in energy of a chromaticity."""
 AT_ONCE = 2**21
-"""States that are read at once: 100 MB, whatever the number of particles and turns."""
+"""States in memory: 100 MB, whatever the number of particles and turns."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Beam:
     """Particles of a stored beam.
 
     Attributes:
-        particles: how many; 1 is the beam's middle alone, which does not decohere.
+        particles: number; 1 is the centroid alone, which does not decohere.
         emittance: of the two modes, m rad.
         spread: rms relative energy deviation.
     """
@@ -44,21 +44,21 @@ def turns_of(
     beam: Beam,
     random: np.random.Generator,
 ) -> Array:
-    """Where the middle of a stored beam is after a kick, [turn, monitor, 2], m.
+    """Return the centroid of a stored beam after a kick, [turn, monitor, 2], m.
 
-    It is stored on the closed orbit of the ring as it is, with the RF where there is one, and
-    matched to it. Lost particles no longer count; the beam is lost (NaN) with half of them.
+    It is stored on the closed orbit of the ring with its errors, and with its RF, and matched to
+    it. Lost particles no longer count; the beam is lost (NaN) with half of them.
 
     Args:
         engine: the ring.
-        kicked: what the kick changes at the start of the ring, x, px, y, py, m and rad, [4].
-        turns: how many.
+        kicked: change of x, px, y, py by the kick at the start of the ring, m and rad, [4].
+        turns: number of turns.
         settings: of the shot.
         beam: its particles.
         random: of the particles.
 
     Raises:
-        UnstableRingError: no closed orbit, or no stable motion about it.
+        UnstableRingError: no closed orbit, or no stable motion.
     """
     line, with_rf, late = engine.stored_line(settings)
     state = _orbit(engine, line, late)
@@ -82,7 +82,7 @@ def turns_of(
 
 
 def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
-    """Tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode].
+    """Return tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode].
 
     Raises:
         UnstableRingError: no closed orbit, or no tune.
@@ -99,14 +99,14 @@ def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
 
 
 def _orbit(engine: AtEngine, line: list[Any], late: float) -> Array:
-    """The stored beam's state at the start of the line, without RF, [6]."""
+    """State of the stored beam at the start of the line, without RF, [6]."""
     turn = functools.partial(_pass, engine, line)
     start, solve = at_orbit.stored(turn)
     return at_orbit.settle(turn, start, solve, late)[0] if late else start
 
 
 def _pass(engine: AtEngine, line: list[Any], beam: Array) -> Array:
-    """Readings of the first of the states [6, shot], which move to the line's end."""
+    """Readings of the first of the states [6, shot], which are moved to the line's end."""
     return np.asarray(engine.run(line, beam.T, 1, beam)[0, 0])
 
 
@@ -120,9 +120,9 @@ def _modes(matrix: Array) -> tuple[Array, Any]:
     try:
         directions, eigenvalues = at.a_matrix(matrix)
     except at.AtError:
-        raise UnstableRingError("the ring is unstable about its closed orbit: no tune") from None
+        raise UnstableRingError("the ring is unstable at its closed orbit: no tune") from None
     if np.abs(np.abs(eigenvalues) - 1).max() > 1e-2:
-        raise UnstableRingError("the ring is unstable about its closed orbit: no tune")
+        raise UnstableRingError("the ring is unstable at its closed orbit: no tune")
     return np.asarray(directions), eigenvalues
 
 
@@ -134,9 +134,9 @@ def _matched(
     beam: Beam,
     random: np.random.Generator,
 ) -> Array:
-    """Deviations of particles from the middle, Gaussian and of mean 0, [particle, 6].
+    """Deviations of particles from the centroid, Gaussian and of zero mean, [particle, 6].
 
-    With the RF they fill its bucket, without each keeps its energy, on the orbit of that energy.
+    With the RF they fill its bucket. Without it each keeps its energy, on the orbit of that energy.
     """
     matrix = at_orbit.one_turn(functools.partial(_pass, engine, line), state)
     drawn = random.standard_normal((beam.particles, 6))

@@ -1,4 +1,4 @@
-"""A machine that can be measured: a ring with causes, its monitors, their noise."""
+"""A virtual machine: a ring with causes, its monitors, and their noise."""
 
 import logging
 import pickle
@@ -29,7 +29,7 @@ CHUNK = 64
 
 
 def true_causes(ring: Ring, causes: Sequence[Cause]) -> list[dict[str, Any]]:
-    """Causes as a truth file states them: "effect", "element", "s" (m, or None), "amount"."""
+    """Return causes as in a truth file: "effect", "element", "s" (m, or None), "amount"."""
     positions = {element.name: element.s for element in ring.elements}
     return [
         {
@@ -48,7 +48,7 @@ class Engine(Protocol):
     def track(
         self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None
     ) -> Array:
-        """(x, y) at every monitor, [shot, turn, monitor, 2], from launches [shot, 6]."""
+        """Return (x, y) at every monitor, [shot, turn, monitor, 2], from launches [shot, 6]."""
 
 
 def _engine(name: str, ring: Ring, causes: Sequence[Cause], radiation: bool) -> Engine:
@@ -65,7 +65,7 @@ def _engine(name: str, ring: Ring, causes: Sequence[Cause], radiation: bool) -> 
 
 
 class Machine:
-    """A ring whose cause of trouble is known.
+    """A ring with known causes.
 
     Args:
         ring: the design.
@@ -109,7 +109,7 @@ class Machine:
     def beam(
         self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None
     ) -> Array:
-        """Where the beam's centroid is at every monitor, [shot, turn, monitor, 2], m.
+        """Return the beam's centroid at every monitor, [shot, turn, monitor, 2], m.
 
         Args:
             launches: OCELOT's six coordinates, [shot, 6].
@@ -124,7 +124,7 @@ class Machine:
         return np.asarray(np.tensordot(weights, positions, 1))
 
     def _read(self, shots: Shots, chunk: range, turns: int, seed: int) -> Array:
-        """Readings of some shots but for what frozen monitors make of them."""
+        """Return readings of some shots, without frozen monitors."""
         part = slice(chunk.start, chunk.stop)
         further = turns + self.monitors.ahead
         beam = self.beam(shots.launches[part], further, shots.settings[part])
@@ -137,10 +137,10 @@ class Machine:
     def measure(
         self, shots: Shots, turns: int = 1, seed: int = 0, jobs: int = 1
     ) -> Iterator[tuple[int, Array]]:
-        """The shots one after another: index and readings [turn, monitor, 2], m.
+        """Yield the shots one after another: index and readings [turn, monitor, 2], m.
 
-        Each shot's noise has a stream of its own: it depends neither on how many shots there are
-        nor on the number of processes.
+        Each shot's noise has its own random stream: it depends neither on the number of shots nor
+        on the number of processes.
 
         Args:
             shots: see `draw_shots`.
@@ -182,7 +182,7 @@ class Machine:
 
 
 class _Reader:
-    """Readings of some shots in another process, which makes the machine once."""
+    """Readings of shots in another process, which makes the machine once."""
 
     def __init__(self, setup: bytes) -> None:
         self._setup = setup

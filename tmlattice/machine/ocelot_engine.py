@@ -17,13 +17,13 @@ Array = NDArray[np.float64]
 
 
 class OcelotEngine:
-    """A ring with causes in it, tracked through second-order maps.
+    """A ring with causes, tracked through second-order maps.
 
-    Over many turns the RF gives back what the design orbit loses: see `beam.rf`.
+    Over many turns the RF replaces the design orbit's loss: see `beam.rf`.
 
     Args:
         ring: the design.
-        causes: those that act on readings or on the launch are the caller's.
+        causes: those on readings or on the launch are ignored here.
         radiation_bends, radiation_wigglers: scale of the expected energy loss.
         voltage, harmonic: of the RF, see `rf_of`.
 
@@ -54,7 +54,7 @@ class OcelotEngine:
         turns: int = 1,
         settings: Sequence[Settings] | None = None,
     ) -> Array:
-        """Where the beam is at every monitor.
+        """Return the beam at every monitor.
 
         Args:
             launches: OCELOT's (x, px, y, py, tau, p) at the start of the ring, [shot, 6].

@@ -31,7 +31,7 @@ RF_ORBIT = 1.3e-3
 
 @dataclass(frozen=True)
 class ResponseSimulation:
-    """What a simulated response was made from, and the response.
+    """A simulated response and its inputs.
 
     Attributes:
         measured: the response.
@@ -48,7 +48,7 @@ class ResponseSimulation:
     one_sided: bool
 
     def truth(self) -> dict[str, Any]:
-        """What was really there, for `write_truth`."""
+        """Return the true state, for `write_truth`."""
         return {
             "effects": true_causes(self.ring, self.causes),
             "launches": np.zeros((0, 5)),
@@ -78,27 +78,27 @@ def simulate_response(
     machine_seed: int | None = None,
     progress: bool = True,
 ) -> ResponseSimulation:
-    """Step the correctors of a machine with known errors one by one, and its RF.
+    """Return the response of a machine with known errors to correctors and RF, one by one.
 
     Args:
         ring: the design.
-        causes: what is wrong with it.
+        causes: its errors.
         correctors: names; None: all, in beam order.
         kick: the whole change of each corrector, rad.
-        rf_step: Hz; 0: the RF is not stepped; None: what raises the energy so that the design's
-            orbit changes by 1.3 mm rms, to two digits.
+        rf_step: Hz; 0: the RF is not stepped; None: a step that raises the energy so that the
+            design's orbit changes by 1.3 mm rms, to two digits.
         one_sided: from the corrector's own kick to `kick` more, else from half below to half above.
-        background: small random errors: effect -> rms (None: the catalogue's own), or "all".
+        background: distributed errors: effect -> rms (None: the catalogue's), or "all".
         noise: rms of one orbit change, m, one number or (x, y).
         engine: "at": closed orbits of thick symplectic elements; "ocelot": of the second-order
             maps. Neither linearises.
         seed: of the noise.
         machine_seed: of the background; else `seed`.
-        progress: show a bar where there is a terminal.
+        progress: show a bar on a terminal.
 
     Raises:
         EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
-        MeasurementError: a corrector that is none.
+        MeasurementError: an element that is not a corrector.
         LatticeError: a ring without monitors.
         TmlatticeError: another engine.
         UnstableRingError: no closed orbit.
@@ -155,8 +155,8 @@ def simulate_response(
 
 
 def rf_step_of(ring: Ring, design: ResponseModel | None = None) -> float:
-    """The step of the RF, Hz, that raises the energy so that the design's orbit changes by 1.3 mm
-    rms, to two digits; 0 where nothing does."""
+    """Return the RF step, Hz, that raises the energy so that the design's orbit changes by 1.3 mm
+    rms, to two digits; 0 without dispersion."""
     model = ResponseModel(ring) if design is None else design
     size = float(np.sqrt(np.mean(model.rf_response()[:, 0] ** 2)))
     step = np.sign(model.rf_start[5]) * RF_ORBIT * rf_of(ring).frequency(ring)
@@ -171,9 +171,9 @@ Engine = Callable[[Ring, Sequence[Cause], Sequence[Step], float], Orbits]
 def _centroids(
     ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], engine: Engine
 ) -> Orbits:
-    """Orbits of the beam's centroid: particles that differ in energy have orbits that do.
+    """Orbits of the centroid of a beam with an energy spread.
 
-    Three nodes of Gauss and Hermite; a particle's energy is that of another RF frequency.
+    Three Gauss-Hermite nodes; a particle's energy is that of another RF frequency.
     """
     weights, nodes = energies(ring, causes)
     if offset := offset_of(causes):
@@ -185,13 +185,12 @@ def _centroids(
 
 
 def spread_of(causes: Sequence[Cause]) -> float:
-    """The relative energy spread of the beam."""
+    """Relative energy spread of the beam."""
     return float(np.sqrt(sum(c.amount**2 for c in causes if c.effect == "energy_spread")))
 
 
 def energies(ring: Ring, causes: Sequence[Cause]) -> tuple[Array, Array]:
-    """Weights of the energies that stand for the beam's, and the RF frequencies (relative) that
-    a beam of each has."""
+    """Weights of the nodes of the beam's energy, and the RF frequency (relative) of each."""
     spread = spread_of(causes)
     if spread == 0:
         return np.ones(1), np.zeros(1)
@@ -203,7 +202,7 @@ def energies(ring: Ring, causes: Sequence[Cause]) -> tuple[Array, Array]:
 def _at_orbits(
     ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], frequency: float
 ) -> Orbits:
-    """The orbits below and above each step of a corrector, or of the RF (None)."""
+    """Orbits below and above each step of a corrector, or of the RF (None)."""
     engine = AtEngine(ring, causes)
 
     def setting(name: str | None, amount: float) -> Settings:
@@ -220,7 +219,7 @@ def _at_orbits(
 def _map_orbits(
     ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], frequency: float
 ) -> Orbits:
-    """The same from the second-order maps."""
+    """Orbits from the second-order maps, as `_at_orbits`."""
     wrong = apply(ring, causes)
     model = ResponseModel(wrong, frequency=frequency)
     for name, low, high in steps:

@@ -1,4 +1,4 @@
-"""What the operator asks for: the launch and the settings of every shot, drawn from a seed.
+"""Launch and settings of every shot, drawn from a seed.
 
 Launches, their jitter, settings, noise and background errors have one random stream each: the same
 seed gives the same launches with either engine, with or without a fault, and the first shots of a
@@ -22,11 +22,11 @@ from tmlattice.optics import one_turn_optics
 Array = NDArray[np.float64]
 
 LAUNCH_SIGMA = (1e-4, 2e-5, 1e-4, 2e-5, 0.0)
-"""rms of the launch's x, px, y, py, delta about what was asked for, m and rad."""
+"""rms of the launch's x, px, y, py, delta about the nominal one, m and rad."""
 
 
 def stream(seed: int, *purpose: str | int) -> np.random.Generator:
-    """The random numbers of one purpose: independent of those of any other."""
+    """Return the random numbers of one purpose, independent of those of any other."""
     words = [zlib.crc32(p.encode()) if isinstance(p, str) else p for p in purpose]
     return np.random.default_rng([seed, *words])
 
@@ -36,8 +36,8 @@ class Shots:
     """Launches and settings.
 
     Attributes:
-        nominal: what was asked for, (x, px, y, py, delta), [shot, 5].
-        launches: what the beam did, OCELOT's six coordinates, [shot, 6].
+        nominal: (x, px, y, py, delta), [shot, 5].
+        launches: of the beam, OCELOT's six coordinates, [shot, 6].
         sigma: rms of the difference, [5].
         settings: of each shot.
     """
@@ -61,11 +61,11 @@ def draw_shots(
     settings: Sequence[Settings] = (),
     seed: int = 0,
 ) -> Shots:
-    """Shots with random betatron phases in both planes.
+    """Return shots with random betatron phases in both planes.
 
     Args:
         ring: the design; the amplitude is that of its own first turn.
-        shots: how many.
+        shots: number of shots.
         amplitude: rms orbit over monitors and planes, m; both planes have the same rms on average
             over phases.
         sigma: rms of x, px, y, py, delta about the nominal launch.
@@ -76,12 +76,12 @@ def draw_shots(
     Raises:
         TmlatticeError: no shot, an amplitude that is not positive, or a sigma that is no rms.
         LatticeError: a ring without monitors.
-        BeamLostError: an amplitude that the design does not carry.
+        BeamLostError: an amplitude at which the design loses the beam.
         UnstableRingError: a design without betatron phases.
     """
     if shots < 1 or not 0 < amplitude < np.inf:
         raise TmlatticeError(
-            f"{shots} shots of {amplitude:g} m cannot be made; ask for one at least, above 0 m"
+            f"{shots} shots of {amplitude:g} m cannot be made; give at least one, above 0 m"
         )
     spread = np.asarray(sigma, dtype=float)
     if spread.shape != (5,) or not ((spread >= 0) & (spread < np.inf)).all():
@@ -94,7 +94,7 @@ def draw_shots(
     phases = stream(seed, "launches").uniform(0, 2 * np.pi, (shots, 2))
     turned = np.exp(1j * phases)[:, :, None] * modes.T  # [shot, plane, 4]
     planes = 1e-6 * np.real(turned)
-    for plane in (0, 1):  # each alone to the same rms, then both together
+    for plane in (0, 1):  # each plane to the same rms, then both together
         planes[:, plane] /= _rms(chain, planes[:, plane])[:, None]
     launch = 1e-6 * planes.sum(axis=1)
     try:
@@ -102,7 +102,7 @@ def draw_shots(
             launch *= (amplitude / _rms(chain, launch))[:, None]
     except BeamLostError as error:
         raise BeamLostError(
-            f"an orbit of {amplitude:g} m rms is lost in the design; ask for a smaller amplitude"
+            f"an orbit of {amplitude:g} m rms is lost in the design; give a smaller amplitude"
         ) from error
     nominal = np.concatenate([launch, np.zeros((shots, 1))], axis=1)
     jitter = stream(seed, "jitter").standard_normal(nominal.shape)
@@ -133,12 +133,12 @@ def _draw_settings(
 
 
 def draw_background(ring: Ring, rms: Mapping[str, float], seed: int = 0) -> list[Cause]:
-    """Random small errors: every effect at every place that can have it, Gaussian.
+    """Return random distributed errors: every effect at every possible place, Gaussian.
 
     Args:
         ring: the design.
         rms: by effect, see `background_rms`.
-        seed: each effect has a stream of its own.
+        seed: each effect has its own random stream.
     """
     causes = []
     for name, size in rms.items():

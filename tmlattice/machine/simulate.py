@@ -1,4 +1,4 @@
-"""A simulated measurement: in memory, or shot by shot into a folder."""
+"""A simulated measurement: in memory, or written shot by shot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ from tmlattice.measurement import Measurement, measurement_writer
 
 @dataclass(frozen=True)
 class Simulation:
-    """A machine and the shots that it is going to be measured with.
+    """A machine and the shots of its measurement.
 
     Attributes:
-        machine: with causes and background in it.
+        machine: with causes and background.
         shots: launches and settings.
         causes: without the background.
         background: rms by effect.
@@ -45,7 +45,7 @@ class Simulation:
     radiation: bool
 
     def measurement(self) -> Measurement:
-        """All shots at once."""
+        """Return all shots."""
         readings = [
             reading for _, reading in self.machine.measure(self.shots, self.turns, self.seed)
         ]
@@ -65,17 +65,17 @@ class Simulation:
     def write(
         self, folder: Path, jobs: int = 1, progress: bool = True, force: bool = False
     ) -> None:
-        """Shot by shot into a measurement folder; it appears when all went well.
+        """Write a measurement folder shot by shot, atomically.
 
         Args:
             folder: see the measurement format.
             jobs: processes.
-            progress: show a bar where there is a terminal.
-            force: a measurement that is there already is replaced.
+            progress: show a bar on a terminal.
+            force: replace an existing measurement.
 
         Raises:
             OutputError: it cannot be written.
-            MeasurementError: the folder holds a measurement.
+            MeasurementError: the folder contains a measurement.
         """
         ring, noise = self.machine.ring, self.machine.noise
         names = [monitor.name for monitor in ring.monitors]
@@ -89,7 +89,7 @@ class Simulation:
                 writer.add(shot, shots.nominal[shot], shots.sigma, shots.settings[shot], readings)
 
     def truth(self) -> dict[str, Any]:
-        """What was really there, for `write_truth`: effects, launches, background, seeds."""
+        """Return the true state, for `write_truth`: effects, launches, background, seeds."""
         return {
             "effects": true_causes(self.machine.ring, self.causes),
             "launches": self.shots.launches[:, [0, 1, 2, 3, 5]],
@@ -121,13 +121,13 @@ def simulate(
     seed: int = 0,
     machine_seed: int | None = None,
 ) -> Simulation:
-    """A machine with known causes, and the shots that measure it.
+    """Return a machine with known causes, and the shots that measure it.
 
     Args:
         ring: the design.
-        causes: what is wrong with it.
-        background: small random errors: effect -> rms (None: the catalogue's own), or "all".
-        shots: how many.
+        causes: its errors.
+        background: distributed errors: effect -> rms (None: the catalogue's), or "all".
+        shots: number of shots.
         turns: of each shot.
         amplitude: rms orbit over monitors and planes, m.
         noise: rms of one reading, m, one number or (x, y).
@@ -137,8 +137,7 @@ def simulate(
         kicks: rms of random settings of all correctors, rad.
         settings: of each shot.
         seed: of launches, settings and noise.
-        machine_seed: of the background; else `seed`. The same machine measured twice has the same
-            one.
+        machine_seed: of the background; else `seed`. Measurements of one machine share it.
 
     Raises:
         EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.

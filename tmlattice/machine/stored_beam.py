@@ -4,8 +4,8 @@
 >>> simulation.measured                                 # a TurnByTurn
 >>> write_truth("truth.json", **simulation.truth())
 
-AT is the machine: thick symplectic elements, the closed orbit of the ring with all its errors, the
-RF where the ring has one. Readings pass through the monitors with theirs, and through noise.
+AT is the machine: thick symplectic elements, the closed orbit of the ring with all its errors, and
+the ring's RF. Readings have the monitors' errors, and noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,15 +45,15 @@ TUNE_NOISE = (2e-5, 0.05)
 
 @dataclass(frozen=True, kw_only=True)
 class StoredSimulation:
-    """What a simulated measurement of a stored beam was made from, and the measurement.
+    """A simulated measurement of a stored beam and its inputs.
 
     Attributes:
-        measured: of the kind that was asked for.
+        measured: of the simulated kind.
         ring: the design.
-        causes: what is wrong with it, without the background.
+        causes: errors, without the background.
         background: rms by effect.
         seed, machine_seed: of the noise, of the background.
-        more: what else was chosen: kicks, particles, ...
+        more: further inputs: kicks, particles, ...
     """
 
     measured: TurnByTurn | ClosedOrbit | Dispersion | TuneReading
@@ -65,7 +65,7 @@ class StoredSimulation:
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def truth(self) -> dict[str, Any]:
-        """What was really there, for `write_truth`."""
+        """Return the true state, for `write_truth`."""
         return {
             "effects": true_causes(self.ring, self.causes),
             "launches": np.zeros((0, 5)),
@@ -81,7 +81,7 @@ class StoredSimulation:
 
 @dataclass(frozen=True)
 class _Machine:
-    """The ring with all that is wrong with it."""
+    """The ring with all its errors."""
 
     engine: AtEngine
     every: list[Cause]
@@ -89,11 +89,11 @@ class _Machine:
     made_of: dict[str, Any]
 
     def read(self, beam: Array) -> Array:
-        """What the monitors make of it, [..., monitor, 2], without noise."""
+        """Return the monitors' readings of the beam, [..., monitor, 2], without noise."""
         return self.monitors.read(beam)
 
-    def told(self) -> dict[str, Any]:
-        """What the records say of the ring."""
+    def fields(self) -> dict[str, Any]:
+        """Return the records' fields of the ring."""
         ring = self.engine.ring
         names = tuple(monitor.name for monitor in ring.monitors)
         return {"monitors": names, "lattice": ring.name, "energy": ring.energy}
@@ -146,17 +146,17 @@ def simulate_turns(
 
     Args:
         ring: the design.
-        causes: what is wrong with it.
-        shots: how many kicks.
+        causes: its errors.
+        shots: number of kicks.
         turns: read after each, from 16 to 10,000.
         amplitude: of the oscillation in the design, rms over monitors and planes, m; phases are
             random.
-        kick: else: the kick at the start of the ring, (x, y), rad, the same in each shot.
-        particles: 1 for the middle of the beam; some hundreds decohere.
+        kick: instead: the kick at the start of the ring, (x, y), rad, the same in each shot.
+        particles: 1 for the centroid; some hundreds decohere.
         emittance: of the two modes, m rad, of many particles.
         spread: rms relative energy of many particles; an effect `energy_spread` adds to it.
         radiation: bends and wigglers radiate as expected.
-        background: small random errors: effect -> rms (None: the catalogue's own), or "all".
+        background: distributed errors: effect -> rms (None: the catalogue's), or "all".
         noise: rms of one reading, m, one number or (x, y).
         settings: of each shot; () for the design's.
         seed: of kicks, particles and noise.
@@ -190,7 +190,7 @@ def simulate_turns(
             for i in range(shots)
         ]
     )
-    # before its kick the beam is on its orbit
+    # before its kick the beam is on the closed orbit
     orbit = _orbits(machine, each)[:, None] if (monitors.late < 0).any() else np.nan
     readings = machine.read(monitors.counted(readings, turns, orbit))
     frozen = machine.monitors.frozen
@@ -199,7 +199,7 @@ def simulate_turns(
         reading += sigma * stream(seed, "turns", i).standard_normal(reading.shape)  # noqa: PLW2901
     readings[:, :, frozen] = readings[0, 0, frozen]
     measured = TurnByTurn(
-        readings=readings, noise=known, settings=each if settings else (), **machine.told()
+        readings=readings, noise=known, settings=each if settings else (), **machine.fields()
     )
     more: dict[str, Any] = {"particles": particles, "radiation": radiation}
     if particles > 1:
@@ -219,10 +219,10 @@ def simulate_orbits(
     seed: int = 0,
     machine_seed: int | None = None,
 ) -> StoredSimulation:
-    """Closed orbits of a machine with known errors, as its monitors read them.
+    """Return closed orbits of a machine with known errors, as its monitors read them.
 
     Args:
-        shots: how many, of the same orbit where `settings` say no other.
+        shots: number of orbits, all the same without `settings`.
         noise: rms of one averaged reading, m, one number or (x, y).
 
     The other arguments and the errors are as in `simulate_turns`.
@@ -235,7 +235,7 @@ def simulate_orbits(
         reading += sigma * stream(seed, "orbit", i).standard_normal(reading.shape)  # noqa: PLW2901
     orbit[:, machine.monitors.frozen] = orbit[0, machine.monitors.frozen]
     measured = ClosedOrbit(
-        orbit=orbit, noise=known, settings=each if settings else (), **machine.told()
+        orbit=orbit, noise=known, settings=each if settings else (), **machine.fields()
     )
     return StoredSimulation(measured=measured, more={"radiation": radiation}, **machine.made_of)
 
@@ -251,7 +251,7 @@ def simulate_dispersion(
     seed: int = 0,
     machine_seed: int | None = None,
 ) -> StoredSimulation:
-    """Orbit changes of a machine with known errors for steps of its RF.
+    """Return orbit changes of a machine with known errors for steps of its RF.
 
     Args:
         steps: Hz; None: one step that raises the energy so that the design's orbit changes by
@@ -276,7 +276,7 @@ def simulate_dispersion(
         change[machine.monitors.frozen] = 0.0
         change += sigma * stream(seed, "dispersion", i).standard_normal(change.shape)
         made.append(RfStep(frequency, rf.harmonic, step, change))
-    measured = Dispersion(steps=tuple(made), noise=known, **machine.told())
+    measured = Dispersion(steps=tuple(made), noise=known, **machine.fields())
     return StoredSimulation(measured=measured, more={"one_sided": one_sided}, **machine.made_of)
 
 
@@ -292,10 +292,10 @@ def simulate_tunes(
     seed: int = 0,
     machine_seed: int | None = None,
 ) -> StoredSimulation:
-    """Tunes and chromaticities of a machine with known errors.
+    """Return tunes and chromaticities of a machine with known errors.
 
     Args:
-        shots: how many readings.
+        shots: number of readings.
         chromaticity: read it too.
         noise: rms of a tune, and of a chromaticity.
 
@@ -307,8 +307,8 @@ def simulate_tunes(
     values = np.array([found[repr(s)] for s in each])  # [shot, tune or chromaticity, mode]
     for i, value in enumerate(values):
         value += np.reshape(noise, (2, 1)) * stream(seed, "tunes", i).standard_normal((2, 2))  # noqa: PLW2901
-    told = machine.told()
-    told.pop("monitors")
+    fields = machine.fields()
+    fields.pop("monitors")
     errors = [np.full((shots, 2), rms) if rms > 0 else None for rms in noise]
     measured = TuneReading(
         tune=values[:, 0] % 1,
@@ -316,14 +316,13 @@ def simulate_tunes(
         chromaticity=values[:, 1] if chromaticity else None,
         chromaticity_error=errors[1] if chromaticity else None,
         settings=each if settings else (),
-        **told,
+        **fields,
     )
     return StoredSimulation(measured=measured, **machine.made_of)
 
 
 def _orbits(machine: _Machine, settings: Sequence[Settings]) -> Array:
-    """Where the middle of the stored beam is, [shot, monitor, 2]: a spread of energies has orbits
-    of its own."""
+    """Centroid of the stored beam, [shot, monitor, 2]: orbits depend on the energy."""
     weights, frequencies = energies(machine.engine.ring, machine.every)
     each = [
         machine.engine.closed_orbits([_with_frequency(s, float(f)) for s in settings])
@@ -337,7 +336,7 @@ def _rf_setting(relative: float) -> Settings:
 
 
 def _with_frequency(settings: Settings, relative: float) -> Settings:
-    """A shot's settings with the RF's frequency a little off."""
+    """A shot's settings with a change of the RF frequency."""
     if relative == 0:
         return settings
     changed = {name: own for name, own in settings.items() if name.casefold() != "rf"}
@@ -356,7 +355,7 @@ def _settings(given: Sequence[Settings], shots: int) -> tuple[Settings, ...]:
 
 
 def _noise(noise: Noise, monitors: int) -> tuple[Array, Array | None]:
-    """The rms in (x, y), and what the record says of it."""
+    """rms in (x, y), and the noise in the record."""
     sigma = np.broadcast_to(np.asarray(noise, dtype=float), (2,))
     if not ((sigma >= 0) & (sigma < np.inf)).all():
         raise TmlatticeError(f"the noise is {noise} m; it is an rms, or two (x, y): zero or more")

@@ -1,7 +1,7 @@
 """One second-order map per magnet, from OCELOT's own matrices.
 
-What lies between two magnets (drifts, monitors, markers, cavities) is composed with the magnet that
-follows. So layer k is the way from the exit of magnet k - 1 to the exit of magnet k, and the chain
+The elements between two magnets (drifts, monitors, markers, cavities) are composed with the magnet
+that follows. So layer k leads from the exit of magnet k - 1 to the exit of magnet k, and the chain
 of layers is the ring.
 """
 
@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 
 
 def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMap:
-    """The second-order map of one element from OCELOT, its parts composed.
+    """Return the second-order map of one element from OCELOT, its parts composed.
 
     Args:
         element: of a ring.
@@ -61,7 +61,7 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
 
 
 def part_maps(element: Element, energy: float, dimension: int = 4) -> list[TaylorMap]:
-    """OCELOT's second-order maps of an element's parts: the body, or edge, body and edge.
+    """Return OCELOT's second-order maps of an element's parts: the body, or edge, body and edge.
 
     Args:
         element, energy, dimension: see `element_map`.
@@ -71,7 +71,7 @@ def part_maps(element: Element, energy: float, dimension: int = 4) -> list[Taylo
 
 
 def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
-    """Second-order map of elements in beam order: a layer, with the drifts before its magnet.
+    """Return the second-order map of elements in beam order: a layer, with the drifts before it.
 
     Args:
         elements: any, in beam order.
@@ -85,7 +85,7 @@ def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> T
 
 
 def layer_elements(ring: Ring) -> list[tuple[Element, ...]]:
-    """For each layer the elements that it is made of: the way to its magnet, and the magnet."""
+    """Return the elements of each layer: those before its magnet, and the magnet."""
     layers: list[tuple[Element, ...]] = []
     way: list[Element] = []
     for element in ring.elements:
@@ -106,8 +106,8 @@ class RingMaps:
         W0, W1, W2: the layers, [layer, n], [layer, n, n], [layer, n, n (n + 1) / 2].
         monitors: names of the monitors in beam order.
         s_monitors: their positions, m, [monitor].
-        at: the exit that each monitor hangs on: 0 is the start of the ring, k the exit of layer
-            k - 1, [monitor].
+        at: the exit of each monitor's state: 0 is the start of the ring, k the exit of layer k - 1,
+            [monitor].
         R0, R1, R2: from that exit to the reading (x, y), [monitor, 2], [monitor, 2, n],
             [monitor, 2, n (n + 1) / 2].
         closing: map from the exit of the last layer to the end of the ring.
@@ -138,14 +138,14 @@ class RingMaps:
 
 
 KNOWN = 20_000
-"""Maps, and layers, that are remembered, some 40 MB: more than a large ring has different ones."""
+"""Maps, and layers, in memory, some 40 MB: more than a large ring has different ones."""
 
 
 class LayerMaps:
-    """The layers of one ring, made one by one, also with some elements replaced.
+    """Layers of one ring, made one by one, also with replaced elements.
 
-    Elements with equal physics share one map, and what was asked of OCELOT once is kept, so that a
-    hypothesis or a shot's settings cost only the layers that they touch.
+    Equal elements share one map, and every map of OCELOT is cached, so that a hypothesis or a
+    shot's settings cost only the layers that they change.
 
     Args:
         ring: at least one magnet.
@@ -154,8 +154,9 @@ class LayerMaps:
     Attributes:
         layer_of: the layer whose map holds each element; the number of layers for those behind the
             last magnet, [element].
-        origin: from which these were changed, and the places of the other elements; or None.
-        memory: what was worked out from these maps and is worth keeping, by whoever did.
+        origin: the layers that these were changed from, and the indices of the changed elements; or
+            None.
+        memory: cache of results from these maps.
 
     Raises:
         LatticeError: a ring without magnets, or a map that is not finite.
@@ -166,7 +167,7 @@ class LayerMaps:
         if dimension not in (4, 6):
             raise ValueError(f"OCELOT's maps have 4 or 6 coordinates, not {dimension}")
         if not ring.magnets:
-            raise LatticeError(f"'{ring.name}' has no magnet; a network needs one at least")
+            raise LatticeError(f"'{ring.name}' has no magnet; a network needs at least one")
         self.ring = ring
         self.dimension = dimension
         magnet = np.array([element.is_magnet for element in ring.elements])
@@ -181,8 +182,8 @@ class LayerMaps:
         self.memory: dict[Hashable, Any] = {}
 
     def changed_to(self, ring: Ring) -> tuple["LayerMaps", list[int]]:
-        """Of a ring some of whose elements are others at the same places, and the layers whose maps
-        are others then; all that was worked out already is shared."""
+        """Return the layers of a ring with other elements in the same places, and indices of the
+        changed ones; the cache is shared."""
         own = self.ring.elements
         pairs = zip(own, ring.elements, strict=True)
         places = [i for i, (a, b) in enumerate(pairs) if a is not b]
@@ -197,33 +198,33 @@ class LayerMaps:
 
     @staticmethod
     def physics(element: Element) -> tuple[Hashable, Hashable]:
-        """Equal for elements with equal maps."""
+        """Key that is equal for elements with equal maps."""
         return (physics_of(element), element.errors)
 
     def map(self, element: Element) -> Quadratic:
-        """The map of one element, of this ring or not."""
+        """Return the map of one element, of this ring or not."""
         key = self.physics(element)
         known = self._known.get(key)
         if known is None:
             self._forget(self._known)
             known = self._known[key] = quadratic_map(element, self.ring.map_energy, self.dimension)
-            if isinstance(key[0], int):  # an id: its source must not be freed
+            if isinstance(key[0], int):  # an id: keep its source alive
                 self._kept.append(element.source)
         return known
 
     def _forget(self, known: Mapping[Hashable, Any]) -> None:
-        """A fit asks for ever new amounts: all that is known by an id goes with what it is of."""
+        """Drop all entries by id when a fit asks for ever new amounts."""
         if len(known) > KNOWN:
             for memory in (self._known, self._layers, self._equal):
                 memory.clear()
             self._kept.clear()
 
     def first_element(self, k: int) -> int:
-        """The place in `ring.elements` of the first element of layer k."""
+        """Index in `ring.elements` of the first element of layer k."""
         return int(self._first[k])
 
     def way(self, k: int) -> Quadratic:
-        """From the exit of layer k - 1 to the entrance of its magnet; one object for equal ways."""
+        """Return the map from the exit of layer k - 1 to its magnet; equal ones are one object."""
         if k not in self._ways:
             between = self.ring.elements[self._first[k] : self._first[k + 1] - 1]
             moving = [e for e in between if _moves(e)]
@@ -237,12 +238,13 @@ class LayerMaps:
     def layer(
         self, k: int, replaced: Mapping[int, Element] | None = None
     ) -> tuple[Weights, list[Weights]]:
-        """The weights of layer k, and the read-outs of the monitors before its magnet: do not
-        change them, equal layers share them.
+        """Return the weights of layer k, and the read-outs of the monitors before its magnet.
+
+        Equal layers share them: they are read-only.
 
         Args:
-            k: up to the number of layers, which names the way from the last magnet to the end.
-            replaced: other elements at places of the ring.
+            k: up to the number of layers, which means the drift from the last magnet to the end.
+            replaced: other elements by index in the ring.
         """
         first, last = self._first[k : k + 2]
         own = self.ring.elements[first:last]
@@ -258,7 +260,7 @@ class LayerMaps:
         way = identity(self.dimension)
         readouts = []
         for element in elements:
-            if element.kind == "monitor":  # read in its middle; nearly all have no length
+            if element.kind == "monitor":  # read in its middle; nearly all are thin
                 half = element.length / 2
                 here = drift(half, self.dimension).after(way) if half else way
                 W0, W1, W2 = here.reduced()
@@ -269,8 +271,8 @@ class LayerMaps:
 
 
 def _both_at_rest(one: Element, other: Element) -> bool:
-    """Whether two are one corrector that is not set, its field elsewhere or rolled and nothing else
-    wrong: a way without field. A fit of a response moves all of them, and no map."""
+    """Whether two elements are one corrector at zero setting differing in position or roll alone.
+    A fit of a response changes these for all correctors, and no map."""
     return (
         one.kind in ("hcorrector", "vcorrector")
         and one.angle == other.angle == 0
@@ -280,19 +282,19 @@ def _both_at_rest(one: Element, other: Element) -> bool:
 
 
 def _moves(element: Element) -> bool:
-    """False for what is thin and empty."""
+    """Whether an element is more than an empty thin one."""
     thin = element.kind in ("monitor", "marker") and element.length == 0
     return not thin or element.errors != NO_ERRORS
 
 
 @by_name
 def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -> RingMaps:
-    """Second-order maps of all magnets of a ring, and the read-outs of its monitors.
+    """Return the second-order maps of all magnets of a ring, and the read-outs of its monitors.
 
     Args:
         ring: at least one magnet.
         dimension: 4 for (x, px, y, py) at the nominal energy, 6 for OCELOT's six coordinates.
-        layers: the same ring's, where they are at hand already.
+        layers: of the same ring, if available.
 
     Raises:
         LatticeError: a ring without magnets, or a map that is not finite.
@@ -309,12 +311,12 @@ def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -
 
 
 def changed_maps(maps: RingMaps, layers: LayerMaps, touched: Sequence[int]) -> RingMaps:
-    """A ring's maps with some of its layers anew.
+    """Return a ring's maps with some of its layers recomputed.
 
     Args:
         maps: of a ring that differs from that of `layers` in the touched layers alone.
         layers: of the ring.
-        touched: layers, up to their number, which names the way from the last magnet to the end.
+        touched: layers, up to their number, which means the drift from the last magnet to the end.
     """
     arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2", "R0", "R1", "R2")}
     closing = maps.closing
@@ -394,10 +396,10 @@ def _made(ring: Ring, dimension: int, layers: LayerMaps) -> RingMaps:
 
 
 def ring_matrix(ring: Ring) -> Array:
-    """OCELOT's one-turn matrix, the product of its first-order R of every element, [4, 4].
+    """Return OCELOT's one-turn matrix, the product of its R of every element, [4, 4].
 
-    The truth that tunes are held against; it shares nothing with the network but OCELOT. Where an
-    element has `errors`, its linear map about the design axis stands in.
+    It is the reference of tunes and shares nothing with the network but OCELOT. An element with
+    `errors` has its linear map at the design axis.
     """
     total = np.eye(4)
     known: dict[Hashable, list[Array]] = {}

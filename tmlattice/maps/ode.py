@@ -29,11 +29,11 @@ STEPS = 10_000
 
 
 class OdeError(TmlatticeError):
-    """An equation without a map over that time, or a map without an equation."""
+    """Raised for an equation without a map over that time, or a map without an equation."""
 
 
 class _Equation:
-    """The right-hand side, compiled: exponents with their coefficients, and how to build them."""
+    """Compiled right-hand side: exponents with their coefficients, and how to build them."""
 
     def __init__(self, terms: Terms) -> None:
         if not terms:
@@ -57,7 +57,7 @@ class _Equation:
         self.products = sorted((e for e in needed if sum(e) > 1), key=sum)  # parents come first
 
     def coefficients(self, t: float) -> list[tuple[Exponents, Array]]:
-        """Exponents and coefficient vectors at the time t."""
+        """Return exponents and coefficient vectors at the time t."""
         return [
             (e, np.asarray(c(t) if callable(c) else c, dtype=float))
             for e, c in self._coefficients.items()
@@ -71,7 +71,7 @@ class _Equation:
         return total
 
     def of_map(self, t: float, rows: Array, table: _Table) -> Array:
-        """d rows/dt of a map's rows [n, monomial]: the right-hand side of the weights."""
+        """Return d rows/dt of a map's rows [n, monomial]: the right-hand side of the weights."""
         values = self._units(rows)
         for exponents in self.products:
             below, variable = _parent(exponents)
@@ -82,7 +82,7 @@ class _Equation:
         return total
 
     def _units(self, rows: Array) -> dict[Exponents, Array]:
-        """X^0 = 1 and the coordinates themselves."""
+        """X^0 = 1 and the coordinates."""
         one = np.zeros_like(rows[0])
         one[..., 0] = 1.0
         units = {tuple(int(i == j) for j in range(self.n)): rows[i] for i in range(self.n)}
@@ -90,7 +90,7 @@ class _Equation:
 
 
 def _parent(exponents: Exponents) -> tuple[Exponents, int]:
-    """The monomial with one factor less, and which variable that factor is."""
+    """Monomial with one factor less, and the index of that factor."""
     variable = next(i for i, e in enumerate(exponents) if e)
     below = list(exponents)
     below[variable] -= 1
@@ -98,7 +98,7 @@ def _parent(exponents: Exponents) -> tuple[Exponents, int]:
 
 
 def right_hand_side(terms: Terms) -> Callable[[float, ArrayLike], Array]:
-    """dX/dt as a function of the time and of states [..., n], for a numerical solver.
+    """Return dX/dt as a function of the time and of states [..., n], for a numerical solver.
 
     Args:
         terms: exponents -> coefficient vector [n], or a function of t that returns it.
@@ -108,7 +108,7 @@ def right_hand_side(terms: Terms) -> Callable[[float, ArrayLike], Array]:
 
 
 def recentred(terms: Mapping[Exponents, ArrayLike], centre: ArrayLike) -> dict[Exponents, Array]:
-    """The same equation for the distance from `centre` [n]: X = centre + distance."""
+    """Return the same equation for the distance from `centre` [n]: X = centre + distance."""
     centre = np.asarray(centre, dtype=float)
     result: dict[Exponents, Array] = {}
     for exponents, coefficient in terms.items():
@@ -125,26 +125,25 @@ def recentred(terms: Mapping[Exponents, ArrayLike], centre: ArrayLike) -> dict[E
 def taylor_map_of_ode(
     terms: Terms, order: int, time: float, start: float = 0.0, tolerance: float = 1e-13
 ) -> TaylorMap:
-    """The map from X(start) to X(start + time) under dX/dt = sum of terms, truncated at `order`.
+    """Return the map from X(start) to X(start + time) under dX/dt = sum of terms, up to `order`.
 
-    The flow is differentiable by its start as often as one likes, and this is its Taylor polynomial
-    about X = 0, constant terms included: each coefficient up to the order is that of the exact
-    flow, whatever the degree of the terms. The weights obey an equation of their own, dM/dt =
-    F(M) truncated at the order. With constant coefficients it is solved by Lie series (Taylor
-    series in time), in as many steps as rounding-error convergence asks for; with coefficients
-    that depend on time by DOP853.
+    It is the flow's Taylor polynomial in its start at X = 0, constant terms included: each
+    coefficient is that of the exact flow, whatever the degree of the terms. The weights obey the
+    equation dM/dt = F(M), truncated at the order. With constant coefficients it is solved by Lie
+    series (Taylor series in time), in as many steps as rounding-error convergence needs; with
+    coefficients that depend on time by DOP853.
 
     Args:
         terms: exponents [n] -> coefficient vector [n], or a function of t that returns it; units
             are the coordinates' own.
         order: of the truncation in X, 1 or more.
-        time: how long; it may be negative.
-        start: the time at which it begins; matters only where coefficients depend on time.
-        tolerance: relative error of the weights; only where coefficients depend on time.
+        time: duration; may be negative.
+        start: initial time, for coefficients that depend on time.
+        tolerance: relative error of the weights, for coefficients that depend on time.
 
     Raises:
-        OdeError: the solution that starts at X = 0 does not reach the end: it runs to infinity.
-        ValueError: exponents and coefficients that do not fit together.
+        OdeError: the solution from X = 0 diverges before the end.
+        ValueError: exponents and coefficients of different dimensions.
 
     Source: M. Berz, Modern Map Methods in Particle Beam Physics (1999), for the expansion; A.
     Jorba, M. Zou, Experimental Mathematics 14 (2005) 99, for series in time with steps.
@@ -185,8 +184,8 @@ def _lie_series(equation: _Equation, rows: Array, time: float, table: _Table) ->
         if left <= 0:
             return rows
     raise OdeError(
-        f"the solution from X = 0 runs to infinity after {abs(time) - left:.6g} of the "
-        f"{abs(time):.6g} asked for; take a shorter time, or another centre by `recentred`"
+        f"the solution from X = 0 diverges after {abs(time) - left:.6g} of "
+        f"{abs(time):.6g}; take a shorter time, or another centre by `recentred`"
     )
 
 
@@ -197,7 +196,7 @@ def _series(
     n, monomials = rows.shape
     x = np.zeros((degree + 1, n, monomials))
     x[0] = rows
-    values = equation._units(x.swapaxes(0, 1))  # views of x: they grow with it
+    values = equation._units(x.swapaxes(0, 1))  # views of x, filled with it
     values[(0,) * n] = np.zeros((degree + 1, monomials))
     values[(0,) * n][0, 0] = 1.0
     for exponents in equation.products:
@@ -232,19 +231,18 @@ def _integrated(
 
 
 def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Array]:
-    """The polynomial equation dX/dt of the map's own order whose map over `time` this is.
-
+    """Return the polynomial equation dX/dt, of the map's own order, whose map over `time` this is.
     It is the logarithm of the map's action on monomials (Koopman's matrix, Carleman's in the
     other reading), found degree by degree: the linear part is log(W1) / time, and each higher
     degree is then a linear equation.
 
-    - Ambiguity: a map sees frequencies only modulo 1 / time. The principal logarithm of W1 is
+    - Ambiguity: a map determines frequencies modulo 1 / time. The principal logarithm of W1 is
       taken, so every linear frequency is assumed to be below half a turn in `time`; products of
       frequencies in the higher degrees are counted from it and may be above. A W1 with a negative
       real eigenvalue has no real logarithm.
     - Truncation: coefficients up to the map's order; of an equation of higher degree these are its
-      first coefficients if W0 = 0. With W0 not 0 higher degrees feed down, and what comes out is
-      the one equation of this degree that has this truncated map.
+      first coefficients if W0 = 0. With W0 not 0 higher degrees feed down, and the result is the
+      one equation of this degree with this truncated map.
     - A trained map need not come from an equation of low degree; then the coefficients are those
       of the truncated logarithm, and high ones mean little.
 
@@ -257,7 +255,7 @@ def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Arr
 
     Raises:
         OdeError: W1 is singular or has a negative real eigenvalue, the frequencies are resonant,
-            or W0 is so large that the search does not close.
+            or W0 is so large that the iteration does not converge.
     """
     n, order = taylor_map.n, taylor_map.order
     exponents = exponents_up_to(n, order)
@@ -268,7 +266,7 @@ def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Arr
         rows = rows + correction
         if np.abs(correction).max() <= 1e-13 * np.abs(rows).max():
             return {e: column.copy() for e, column in zip(exponents, rows.T, strict=True)}
-    if np.abs(correction).max() <= 1e-9 * np.abs(rows).max():  # rounding keeps it from closing
+    if np.abs(correction).max() <= 1e-9 * np.abs(rows).max():  # within rounding
         return {e: column.copy() for e, column in zip(exponents, rows.T, strict=True)}
     raise OdeError(
         "no equation of the map's order was found near its logarithm: W0 is too large for it; "
@@ -277,7 +275,7 @@ def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Arr
 
 
 def _logarithm(taylor_map: TaylorMap, time: float) -> Array:
-    """The equation's coefficients [n, monomial], exact where W0 = 0, else a close guess."""
+    """Coefficients of the equation [n, monomial], exact for W0 = 0, else a close guess."""
     from scipy.linalg import expm, logm
 
     n, order = taylor_map.n, taylor_map.order
@@ -316,7 +314,7 @@ def _logarithm(taylor_map: TaylorMap, time: float) -> Array:
 
 
 def _phi(matrix: Array, time: float) -> Array:
-    """The integral of exp(matrix s) over s from 0 to `time`."""
+    """Integral of exp(matrix s) over s from 0 to `time`."""
     from scipy.linalg import expm
 
     n = len(matrix)
@@ -344,5 +342,5 @@ def _derivation(A: Array, degree: int) -> Array:
 
 
 def exponents_up_to(n: int, order: int) -> list[Exponents]:
-    """Exponents of degree 0 to `order` in n coordinates, in the order of a map's weights."""
+    """Return exponents of degree 0 to `order` in n coordinates, in the order of a map's weights."""
     return [e for degree in range(order + 1) for e in kronecker_exponents(n, degree)]

@@ -24,7 +24,7 @@ Made = TypeVar("Made")
 
 @functools.cache
 def _pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Rows and columns of the pairs i <= j of n coordinates, and how often each stands in T."""
+    """Rows and columns of the pairs i <= j of n coordinates, and their multiplicity in T."""
     i, j = np.triu_indices(n)
     return i, j, np.where(i == j, 1.0, 2.0)
 
@@ -38,11 +38,11 @@ class Quadratic:
     T: Array | None
 
     def after(self, first: "Quadratic") -> "Quadratic":
-        """This after `first`, to second order in x."""
+        """Return this map after `first`, to second order in x."""
         if self.T is None:
             bent = None if first.T is None else _on_rows(self.R, first.T)
             return Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
-        fed = self.T @ first.B  # [out, n]: what the constant part feeds down, half of it
+        fed = self.T @ first.B  # [out, n]: half of the constant part's feed-down
         slope = self.R + 2.0 * fed
         bent = first.R.T @ self.T @ first.R
         if first.T is not None:
@@ -50,7 +50,7 @@ class Quadratic:
         return Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
 
     def reduced(self) -> tuple[Array, Array, Array]:
-        """W0 [out], W1 [out, n], W2 [out, n (n + 1) / 2] in the reduced Kronecker order."""
+        """Return W0 [out], W1 [out, n], W2 [out, n (n + 1) / 2] in the reduced Kronecker order."""
         i, j, _ = _pairs(self.R.shape[1])
         if self.T is None:
             return self.B, self.R, np.zeros((len(self.B), len(i)))
@@ -60,7 +60,7 @@ class Quadratic:
 def each_after(
     later: Sequence[Quadratic], first: Sequence[Quadratic], n: int
 ) -> tuple[Array, Array, Array]:
-    """`Quadratic.after` of many pairs at once: B [pair, n], R [pair, n, n], T [pair, n, n, n]."""
+    """Return `Quadratic.after` of many pairs: B [pair, n], R [pair, n, n], T [pair, n, n, n]."""
     (B2, R2, T2), (B1, R1, T1) = _stacked(later, n), _stacked(first, n)
     fed = (T2 @ B1[:, None, :, None])[..., 0]
     slope = R2 + 2.0 * fed
@@ -79,11 +79,11 @@ def _stacked(maps: Sequence[Quadratic], n: int) -> tuple[Array, Array, Array]:
 
 
 def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
-    """The sum of maps with signs, over a step: a derivative by differences.
+    """Return the sum of maps with signs, over a step: a derivative by differences.
 
     Args:
-        ends: signs and maps, one at least.
-        step: of the whole.
+        ends: signs and maps, at least one.
+        step: distance of the ends.
     """
     signs, maps = zip(*ends, strict=True)
 
@@ -98,36 +98,35 @@ def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
 
 
 FAINT = 3e-4
-"""rad; below, OCELOT's map of a bend with k2 has lost a hundredth of its second order to rounding
+"""rad; below, OCELOT's map of a bend with k2 loses a hundredth of its second order to rounding
 (k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large).
-There the sextupole's part is that of a straight magnet, wrong by the bend's angle at most."""
+The sextupole's part is then that of a straight magnet, wrong by the bend's angle at most."""
 
 
 def _on_rows(matrix: Array, T: Array) -> Array:
-    """`np.tensordot(matrix, T, 1)`, whose checks cost more than the product."""
+    """`np.tensordot(matrix, T, 1)` without its checks, which cost more than the product."""
     rows, n = len(T), T.shape[-1]
     return (matrix @ T.reshape(rows, n * n)).reshape(-1, n, n)
 
 
 def identity(n: int) -> Quadratic:
-    """What moves nothing."""
+    """Return the identity."""
     return Quadratic(np.zeros(n), np.eye(n), None)
 
 
 Part = tuple[Array, Array, Array]
 
 ASKED = 5_000
-"""Elements' parts, and halves, that are remembered, some 20 MB: a scan asks for each in many
-hypotheses."""
+"""Elements' parts, and halves, in memory, some 20 MB: a scan needs each in many hypotheses."""
 
 _asked: dict[Hashable, list[Part]] = {}
 _halved: dict[Hashable, tuple["Quadratic", "Quadratic"]] = {}
 
 
 def parts_of(element: Element, energy: float, split: bool) -> list[Part]:
-    """OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element: do not change them.
+    """Return OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element; read-only.
 
-    With `split` the body comes as two halves, in the middle of the list.
+    With `split` the body is two halves, in the middle of the list.
     """
     return _remembered(
         _asked, element, (energy, split), lambda: parts_of_ocelot(element.source, energy, split)
@@ -137,7 +136,7 @@ def parts_of(element: Element, energy: float, split: bool) -> list[Part]:
 def _remembered(
     memory: dict[Hashable, Made], element: Element, how: Hashable, made: Callable[[], Made]
 ) -> Made:
-    """What was made of an element with equal physics, where that is numbers alone."""
+    """Cached result for an element with equal physics, if that is numbers alone."""
     physics = physics_of(element)
     if isinstance(physics, int):
         return made()
@@ -150,12 +149,12 @@ def _remembered(
 
 
 def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
-    """`parts_of` an OCELOT element, asked anew."""
+    """Return `parts_of` an OCELOT element, not cached."""
     from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
 
     atom = source.element
     supported = source.supported_tms  # None: the family declares nothing, and takes any
-    bare = isinstance(source, elements.Matrix)  # OCELOT does not know its inside
+    bare = isinstance(source, elements.Matrix)  # of unknown interior
     body = [(TMTypes.MAIN, atom.l / 2)] * 2 if split and not bare else [(TMTypes.MAIN, None)]
     edges = [(TMTypes.ENTRANCE, None)], [(TMTypes.EXIT, None)]
     parts = [*edges[0], *body, *edges[1]] if atom.has_edge else body
@@ -166,7 +165,7 @@ def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
         atom.k2 = 0.0
     if supported is None or SecondTM in supported:
         try:
-            made = {part: _body(atom, energy, *part) for part in parts}  # two halves are alike
+            made = {part: _body(atom, energy, *part) for part in parts}  # two halves are equal
             second = [made[part] for part in parts]
             if faint:
                 for i, (where, length) in enumerate(parts):
@@ -175,7 +174,7 @@ def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
                         second[i] = B, R, T + _sextupole(source, length, energy), tilt
             return [(B, *_tilted(R, T, tilt)) for B, R, T, tilt in second]
         except (AttributeError, NotImplementedError):
-            pass  # it has no second order: a linear element
+            pass  # a linear element
     zero = np.zeros((6, 6, 6))
     linear = zip(source.B(energy), source.R(energy), strict=True)
     return [(B.ravel(), R, zero) for B, R in linear]
@@ -184,8 +183,8 @@ def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
 def _body(
     atom: Any, energy: float, where: Any, length: float | None
 ) -> tuple[Array, Array, Array, float]:
-    """B, R, T and tilt of one part; for a magnet's body at its place they are what OCELOT's own
-    call gives, but for a loop in Python over what offsets of zero feed down."""
+    """B, R, T and tilt of one part; for a magnet's body as from OCELOT's own call, without its
+    Python loop over the feed-down of zero offsets."""
     from tmlattice.lattice.ocelot import Magnet, SecondTM, TMTypes, t_nnn
 
     usual = getattr(type(atom), "create_second_order_main_params", None)
@@ -199,7 +198,7 @@ def _body(
 
 
 def _sextupole(bend: Any, length: float | None, energy: float) -> Array:
-    """What k2 adds to T of a bend's body if it were straight, [6, 6, 6]."""
+    """Contribution of k2 to T of a bend's body if it were straight, [6, 6, 6]."""
     from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
 
     with_k2, without = (
@@ -213,9 +212,9 @@ def _sextupole(bend: Any, length: float | None, energy: float) -> Array:
 
 
 def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
-    """R and T in axes that are turned by the tilt: what OCELOT's `get_rotated_R` and `_T` say.
+    """R and T in axes rotated by the tilt, as OCELOT's `get_rotated_R` and `_T`.
 
-    The latter is compiled when first called, which takes longer than all maps of a ring.
+    The latter is compiled at its first call, which takes longer than all maps of a ring.
     """
     if tilt == 0:
         return R, T
@@ -226,8 +225,8 @@ def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
 
 
 def physics_of(element: Element) -> Hashable:
-    """Equal for elements with equal maps, but for their errors: the class and every attribute of
-    the source but those for people."""
+    """Key that is equal for elements with equal maps, without their errors: the class and every
+    attribute of the source except labels."""
     if element.data is not None:
         return element.data
     source = element.source
@@ -236,7 +235,7 @@ def physics_of(element: Element) -> Hashable:
     numbers = _PLAIN.issuperset(map(type, physics)) or all(isinstance(v, _NUMBERS) for v in physics)
     if numbers and not values.get("params"):
         return (type(source), physics)
-    return id(source)  # it holds more than numbers: a matrix, a field map
+    return id(source)  # not only numbers: a matrix, a field map
 
 
 _NUMBERS = (int, float, type(None))
@@ -245,7 +244,7 @@ _FOR_PEOPLE = frozenset(("id", "color", "params"))
 
 
 def of_ocelot(part: Part, n: int) -> Quadratic:
-    """OCELOT's part in the first n coordinates, its T made symmetric."""
+    """Return OCELOT's part in the first n coordinates, its T made symmetric."""
     B, R, T = part
     bent = T[:n, :n, :n]
     bent = 0.5 * (bent + bent.swapaxes(1, 2))
@@ -253,18 +252,18 @@ def of_ocelot(part: Part, n: int) -> Quadratic:
 
 
 def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
-    """The map of one element, its errors included.
+    """Return the map of one element, its errors included.
 
     Raises:
-        LatticeError: it is not finite, or it loses energy, which four coordinates cannot hold.
+        LatticeError: it is not finite, or it loses energy, which needs six coordinates.
     """
     errors = element.errors
-    if element.kind == "cavity":  # what it gives depends on the turn: that is the beam's
+    if element.kind == "cavity":  # its gain depends on the turn, see `beam.rf`
         element = _empty(element)
     if errors == NO_ERRORS:
         total = composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
     else:
-        # which errors in the middle do not change
+        # unchanged by errors in the middle
         first, second = _remembered(
             _halved, element, (energy, n), lambda: _halves(element, energy, n)
         )
@@ -293,9 +292,9 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
 
 
 def _in_the_middle(element: Element) -> float:
-    """One kick in the middle that moves and turns the beam as one in the bend's plane does that is
-    spread over the body, over that: rho a (1 - cos angle) and a sin angle are those of 2 a
-    sin(angle / 2), and a gradient k1 in the body focuses like angle^2 / length^2."""
+    """Ratio of one kick in the middle to the equivalent kick in the bend's plane that is spread
+    over the body: rho a (1 - cos angle) and a sin angle are those of 2 a sin(angle / 2), and a
+    gradient k1 in the body focuses like angle^2 / length^2."""
     if element.kind != "bend":
         return 1.0
     half = cmath.sqrt(element.angle**2 + element.k1 * element.length**2) / 2
@@ -303,14 +302,14 @@ def _in_the_middle(element: Element) -> float:
 
 
 def _empty(element: Element) -> Element:
-    """The same element as a drift."""
+    """Return the same element as a drift."""
     from tmlattice.lattice.ocelot import elements
 
     return replace(element, source=elements.Drift(l=element.length))
 
 
 def composed(parts: Iterable[Quadratic | None]) -> Quadratic:
-    """The parts in beam order, composed; None moves nothing."""
+    """Return the parts composed in beam order; None is the identity."""
     given = [part for part in parts if part is not None]
     total = given[0]
     for part in given[1:]:
@@ -319,8 +318,8 @@ def composed(parts: Iterable[Quadratic | None]) -> Quadratic:
 
 
 def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadratic]:
-    """The maps to and from the middle of an element's body."""
-    if element.length == 0:  # as thin as what is put into it
+    """Maps to and from the middle of an element's body."""
+    if element.length == 0:  # as thin as its errors
         parts = [of_ocelot(part, n) for part in parts_of(element, energy, False)]
         return identity(n), composed(parts)
     parts = [of_ocelot(part, n) for part in parts_of(element, energy, True)]
@@ -329,7 +328,7 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
         return composed(parts[:middle]), composed(parts[middle:])
     from scipy.linalg import sqrtm
 
-    body = parts[middle]  # of a bare matrix, or of a cavity: it comes in one piece
+    body = parts[middle]  # of a bare matrix, or of a cavity: in one piece
     root = np.array(np.real(sqrtm(body.R)), dtype=np.float64)
     back: Array = np.linalg.inv(root).astype(np.float64)
     first = Quadratic(np.zeros(n), root, None)
@@ -338,11 +337,11 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
 
 
 def halves_without_sextupole(element: Element, energy: float, n: int) -> list[Quadratic]:
-    """Maps of a magnet without its sextupole field: its entrance edge, both halves of its body, its
+    """Return maps of a magnet without its sextupole field: entrance edge, both halves of the body,
     exit edge.
 
     Args:
-        element: with a length; its `errors` are left out.
+        element: with a length; its `errors` are ignored.
         energy: GeV.
         n: coordinates, 4 or 6.
     """
@@ -373,7 +372,7 @@ def _thin(
     k1sl: float = 0.0,
     slopes: Slopes = NO_ERRORS.middle,
 ) -> Quadratic | None:
-    """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x, and what the slopes say."""
+    """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x, and the slopes' kicks."""
     if kick_x == kick_y == k1l == k1sl == 0 and not any(slopes):
         return None
     B, R = np.zeros(n), np.eye(n)
@@ -396,7 +395,7 @@ def _shift(n: int, dx: float, dy: float) -> Quadratic | None:
 
 
 def _way(n: int, length: float, energy: float) -> Quadratic | None:
-    """A drift, forth or back."""
+    """A drift, forwards or backwards."""
     if length == 0:
         return None
     metre, eye = _metre(n, energy), np.eye(n)
@@ -406,7 +405,7 @@ def _way(n: int, length: float, energy: float) -> Quadratic | None:
 
 @functools.cache
 def _metre(n: int, energy: float) -> Quadratic:
-    """A drift of 1 m: what it does beyond the identity goes with the length."""
+    """A drift of 1 m less the identity, which is proportional to the length."""
     from tmlattice.lattice.ocelot import elements
 
     parts = parts_of_ocelot(elements.Drift(l=1.0), energy, False)
@@ -414,7 +413,7 @@ def _metre(n: int, energy: float) -> Quadratic:
 
 
 def _turn(n: int, roll: float) -> Quadratic | None:
-    """Coordinates in axes that are turned by `roll` from x towards y."""
+    """Rotation to axes that are turned by `roll` from x towards y."""
     if roll == 0:
         return None
     R = np.eye(n)
@@ -426,13 +425,13 @@ def _turn(n: int, roll: float) -> Quadratic | None:
 
 
 def _loss(n: int, loss: float, element: Element) -> Quadratic | None:
-    """The energy falls by loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
+    """Energy loss of loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
     if loss == 0:
         return None
     if n != 6:
         raise LatticeError(
-            f"{element.kind} '{element.name}' loses energy, which four coordinates cannot hold; "
-            "take six (dimension=6)"
+            f"{element.kind} '{element.name}' loses energy, which needs six coordinates "
+            "(dimension=6)"
         )
     B, R = np.zeros(n), np.eye(n)
     B[5] = -loss
@@ -442,7 +441,7 @@ def _loss(n: int, loss: float, element: Element) -> Quadratic | None:
 
 
 def drift(length: float, n: int) -> Quadratic:
-    """A way without field at the nominal energy, length in m."""
+    """Return a drift at the nominal energy, length in m."""
     matrix = np.eye(n)
     matrix[0, 1] = matrix[2, 3] = length
     return Quadratic(np.zeros(n), matrix, None)

@@ -4,8 +4,8 @@ A map sends x [n] to W0 + W1 x + W2 x^[2] + ..., where x^[k] holds the products 
 the reduced Kronecker order: x1^2, x1 x2, ..., x1 xn, x2^2, ..., xn^2 for k = 2. Each Wk is
 [n, C(n + k - 1, k)].
 
-Inside, a polynomial is one row over all monomials of degree 0 to the order, degree by degree; the
-product of two is a table look-up, made once for each dimension and order.
+Internally a polynomial is one row over all monomials of degree 0 to the order, degree by degree.
+The product of two is a table look-up, made once for each dimension and order.
 """
 
 import functools
@@ -37,7 +37,7 @@ def second_derivatives(W2: Array) -> Array:
 
 @functools.cache
 def _pair(count: int) -> tuple[Indices, Array]:
-    """Which of `count` pairs each entry of a symmetric matrix is, and its factor, [n, n]."""
+    """Index of the pair of each entry of a symmetric matrix, and its factor, [n, n]."""
     n = round((8 * count + 1) ** 0.5 - 1) // 2
     i, j = np.triu_indices(n)
     pair = np.empty((n, n), dtype=np.intp)
@@ -59,7 +59,7 @@ def symplectic_form(n: int) -> Array:
 
 @dataclass(frozen=True)
 class _Table:
-    """Monomials of degree 0 to `order`, and how they multiply."""
+    """Monomials of degree 0 to `order`, and their products."""
 
     exponents: Indices  # [monomial, n]
     starts: tuple[int, ...]  # of each degree, and the end
@@ -70,7 +70,7 @@ class _Table:
 
     def multiply(self, a: Array, b: Array) -> Array:
         """Product of polynomials [..., monomial], truncated at the order."""
-        # products are sorted by target and every monomial is a target: 1 times itself
+        # products are sorted by target, and every monomial is a target: 1 times itself
         return np.asarray(
             np.add.reduceat(a[..., self.left] * b[..., self.right], self.first, axis=-1)
         )
@@ -150,12 +150,12 @@ class TaylorMap:
 
     @classmethod
     def identity(cls, n: int, order: int = 1) -> "TaylorMap":
-        """The map that moves nothing."""
+        """Return the identity."""
         return cls.linear(np.eye(n), order)
 
     @classmethod
     def linear(cls, matrix: ArrayLike, order: int = 1) -> "TaylorMap":
-        """The map x -> matrix x, with zero coefficients up to `order`."""
+        """Return the map x -> matrix x, with zero coefficients up to `order`."""
         matrix = np.asarray(matrix, dtype=float)
         n = len(matrix)
         higher = [np.zeros((n, comb(n + k - 1, k))) for k in range(2, order + 1)]
@@ -181,7 +181,7 @@ class TaylorMap:
         return f"TaylorMap(n={self.n}, order={self.order})"
 
     def monomials(self, x: ArrayLike) -> Array:
-        """Monomials of degree 0 to the order of the states x [..., n], [..., monomial]."""
+        """Return monomials of degree 0 to the order of the states x [..., n], [..., monomial]."""
         x = np.asarray(x, dtype=float)
         values = np.ones((*x.shape[:-1], len(self._table.exponents)))
         for i, (parent, variable) in enumerate(self._table.parents[1:], start=1):
@@ -189,18 +189,18 @@ class TaylorMap:
         return values
 
     def __call__(self, x: ArrayLike) -> Array:
-        """Images of the states x [..., n], the same shape."""
+        """Return images of the states x [..., n], the same shape."""
         return np.asarray(self.monomials(x) @ self._rows.T)
 
     def truncated(self, order: int) -> "TaylorMap":
-        """The same map cut, or filled with zeros, to another order."""
+        """Return the map cut, or filled with zeros, to another order."""
         rows = np.zeros((self.n, _table(self.n, order).starts[-1]))
         kept = min(rows.shape[1], self._rows.shape[1])
         rows[:, :kept] = self._rows[:, :kept]
         return self._of_rows(rows, order)
 
     def after(self, first: "TaylorMap", order: int | None = None) -> "TaylorMap":
-        """This map after `first`: x -> self(first(x)), truncated at `order` (else the higher).
+        """Return this map after `first`: x -> self(first(x)), truncated (else the higher order).
 
         Exact up to the order, constant terms included; see `__matmul__`.
         """
@@ -209,7 +209,7 @@ class TaylorMap:
         order = max(self.order, first.order) if order is None else order
         table = _table(self.n, order)
         inner = first.truncated(order)._rows
-        # The outer map enters with all its terms: a constant in `first` feeds them down.
+        # all terms of the outer map: a constant in `first` feeds them down
         outer_table = self._table
         values = [np.eye(1, inner.shape[1])[0]]
         for parent, variable in outer_table.parents[1:]:
@@ -217,11 +217,11 @@ class TaylorMap:
         return self._of_rows(self._rows @ np.array(values), order)
 
     def __matmul__(self, first: "TaylorMap") -> "TaylorMap":
-        """`second @ first`: first `first`, then `second`, as with matrices."""
+        """Return `second @ first`: first `first`, then `second`, as with matrices."""
         return self.after(first)
 
     def jacobian(self, x: ArrayLike) -> Array:
-        """d image / d x at the states x [..., n], [..., n (image), n (x)]."""
+        """Return d image / d x at the states x [..., n], [..., n (image), n (x)]."""
         x = np.asarray(x, dtype=float)
         columns = [self._derivative(i) for i in range(self.n)]
         if self.order == 1:
@@ -243,7 +243,7 @@ class TaylorMap:
         return rows
 
     def symplectic_defect(self) -> list[Array]:
-        """Coefficients of J(x)^T S J(x) - S by degree 0, 1, ..., 2 (order - 1).
+        """Return the coefficients of J(x)^T S J(x) - S by degree 0, 1, ..., 2 (order - 1).
 
         Entry k is [n, n, monomials of degree k]; all are zero for a symplectic map. A truncated
         map of a magnet has its first non-zero entry at degree `order`.

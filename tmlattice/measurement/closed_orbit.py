@@ -1,12 +1,14 @@
 """The closed orbit of the stored beam, as it is."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
+from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.checks import (
     check_energy,
     check_values,
@@ -46,6 +48,33 @@ class ClosedOrbit(Shots):
     shots: tuple[int, ...] = ()
     lattice: str | None = None
     energy: float | None = None
+
+    @classmethod
+    def from_arrays(
+        cls,
+        x: ArrayLike | None,
+        y: ArrayLike | None,
+        monitors: Iterable[Any],
+        *,
+        unit: Unit = "m",
+        noise: Any = None,
+        settings: Sequence[Settings] = (),
+        shots: Sequence[int] = (),
+    ) -> Self:
+        """Return the closed orbits of two arrays.
+
+        Args:
+            x, y: [shot, monitor] or [monitor]; NaN where missing; None: not read.
+            monitors: names, or elements of a ring.
+            unit: of x and y.
+            noise, settings, shots: see the attributes.
+
+        Raises:
+            MeasurementError: shapes that do not fit, or numbers that cannot be.
+        """
+        names = names_of(monitors)
+        orbit = readings_of(x, y, names, ("shot",), unit)
+        return cls(orbit, names, noise, tuple(settings), tuple(shots))
 
     def __post_init__(self) -> None:
         orbit, monitors = np.asarray(self.orbit, dtype=float), tuple(self.monitors)

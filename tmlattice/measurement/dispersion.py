@@ -1,12 +1,14 @@
 """The change of the closed orbit for steps of the RF frequency."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
+from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.checks import check_energy, check_values, keep, monitor_places, spread
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import RfStep, check_rf
@@ -37,6 +39,41 @@ class Dispersion(Shown):
     noise: Array | None = None
     lattice: str | None = None
     energy: float | None = None
+
+    @classmethod
+    def from_arrays(
+        cls,
+        x: ArrayLike | None,
+        y: ArrayLike | None,
+        monitors: Iterable[Any],
+        *,
+        step: float | Sequence[float],
+        frequency: float,
+        harmonic: int,
+        unit: Unit = "m",
+        noise: Any = None,
+    ) -> Self:
+        """Return the orbit changes for steps of the RF frequency.
+
+        Args:
+            x, y: orbit changes, [step, monitor] or [monitor]; NaN where missing; None: not read.
+            monitors: names, or elements of a ring.
+            step: of the frequency, Hz; one number, or one a step.
+            frequency: of the RF, Hz.
+            harmonic: number of RF periods in a turn.
+            unit: of x and y.
+            noise: see the attributes.
+
+        Raises:
+            MeasurementError: shapes that do not fit, or numbers that cannot be.
+        """
+        names = names_of(monitors)
+        orbits = readings_of(x, y, names, ("step",), unit)
+        sizes = np.ravel(np.asarray(step, dtype=float)).tolist()
+        if len(sizes) != len(orbits):
+            raise MeasurementError(f"{len(sizes)} steps of the RF for {len(orbits)} orbit changes")
+        steps = zip(sizes, orbits, strict=True)
+        return cls(tuple(RfStep(frequency, harmonic, s, o) for s, o in steps), names, noise)
 
     def __post_init__(self) -> None:
         monitors = tuple(self.monitors)

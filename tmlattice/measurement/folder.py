@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.measurement.arrays import Unit
 from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import check_table, located, read_document
@@ -22,7 +23,7 @@ from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.rows import dense, match_names, read_rows
 from tmlattice.measurement.stored_files import KINDS, TURNS, places_of
-from tmlattice.measurement.tables import Unit, read_table, read_turn_by_turn
+from tmlattice.measurement.tables import read_table, read_turn_by_turn
 from tmlattice.measurement.trajectory import (
     COORDINATES,
     UNKNOWN_LAUNCH,
@@ -54,9 +55,10 @@ _WORDS = {
 }
 
 
-def in_words(measured: AnyMeasurement) -> str:
-    """What a measurement is, for a sentence."""
-    return _WORDS.get(type(measured), type(measured).__name__)
+def in_words(measured: AnyMeasurement | type) -> str:
+    """What a measurement, or a kind of it, is, for a sentence."""
+    kind = measured if isinstance(measured, type) else type(measured)
+    return _WORDS.get(kind, kind.__name__)
 
 
 def read_measurement(

@@ -1,13 +1,14 @@
 """The change of the stored beam's closed orbit for a step of one corrector at a time."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
+from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
@@ -83,6 +84,48 @@ class OrbitResponse(Shown):
     lattice: str | None = None
     energy: float | None = None
     devices: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        x: ArrayLike | None,
+        y: ArrayLike | None,
+        monitors: Iterable[Any],
+        correctors: Iterable[Any],
+        kicks: float | Sequence[float],
+        *,
+        planes: str | Sequence[str] | None = None,
+        unit: Unit = "m",
+        noise: Any = None,
+        rf: RfStep | None = None,
+    ) -> Self:
+        """Return the orbit response of two matrices.
+
+        Args:
+            x, y: orbit change for the kick, [corrector, monitor], m (not m/rad); None: not read.
+            monitors, correctors: names, or elements of a ring.
+            kicks: rad, one for all or one a corrector.
+            planes: "x" or "y" for all, or one a corrector; None: as the elements' kinds say.
+            unit: of x and y.
+            noise, rf: see the attributes.
+
+        Raises:
+            MeasurementError: shapes that do not fit, or planes that are unknown.
+        """
+        steered, names = tuple(correctors), names_of(monitors)
+        if planes is None:
+            kinds = [getattr(element, "kind", None) for element in steered]
+            if not set(kinds) <= {"hcorrector", "vcorrector"}:
+                raise MeasurementError(
+                    "the planes of the correctors are unknown: give planes=, or elements of the "
+                    "ring as correctors"
+                )
+            planes = ["x" if kind == "hcorrector" else "y" for kind in kinds]
+        number = len(steered)
+        response = readings_of(x, y, names, ("corrector",), unit)
+        sizes = np.full(number, kicks) if np.ndim(kicks) == 0 else np.asarray(kicks, dtype=float)
+        by_column = (planes,) * number if isinstance(planes, str) else tuple(planes)
+        return cls(names_of(steered), by_column, sizes, names, response, noise, rf)
 
     def __post_init__(self) -> None:
         def keep(**values: Any) -> None:

@@ -1,10 +1,12 @@
 """What every measurement shows of itself."""
 
+from collections.abc import Mapping
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
 
-from tmlattice.late import Method
+from tmlattice.late import ClassMethod, Method
 from tmlattice.speaks import Speaks, counted, last_part
 
 
@@ -17,6 +19,35 @@ class Shown(Speaks):
         "Draw what was read: along `ring` where it is given (a Ring, a name or a path), else by "
         "the number of the monitor; a matplotlib Figure.",
     )
+
+    to_dataframe = Method(
+        "tmlattice.measurement.frames",
+        "to_dataframe",
+        "Return the table of the readings as a pandas DataFrame: a row a reading, in m.",
+    )
+    to_xarray = Method(
+        "tmlattice.measurement.frames",
+        "to_xarray",
+        "Return the same as an xarray Dataset, with shots, turns, monitors as its axes.",
+    )
+    from_dataframe = ClassMethod(
+        "tmlattice.importers.frames",
+        "from_frame",
+        "Return the measurement of a pandas DataFrame, in long or wide form.",
+    )
+    from_xarray = ClassMethod(
+        "tmlattice.importers.frames",
+        "from_frame",
+        "Return the measurement of an xarray Dataset or DataArray.",
+    )
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both are of one kind and hold the same values; NaN equals NaN."""
+        return type(self) is type(other) and same(vars(self), vars(other))
+
+    def __hash__(self) -> int:
+        names = (vars(self).get(name) for name in ("monitors", "shots", "correctors"))
+        return hash((type(self).__name__, *names))
 
     def _told(self) -> tuple[str, dict[str, str]]:
         own: dict[str, Any] = vars(self)
@@ -45,6 +76,19 @@ class Shown(Speaks):
             rows["tunes"] = "; ".join(pairs)
         rows["lattice"] = last_part(own.get("lattice") or "")
         return "", rows
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal, arrays and what holds them by their numbers."""
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        return np.shape(one) == np.shape(other) and np.array_equal(one, other, equal_nan=True)
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(same(own, other[k]) for k, own in one.items())
+    if isinstance(one, tuple | list) and isinstance(other, tuple | list):
+        return len(one) == len(other) and all(map(same, one, other))
+    if is_dataclass(one) and type(one) is type(other):
+        return same(vars(one), vars(other))
+    return bool(one == other)
 
 
 def _noise(noise: Any) -> str:

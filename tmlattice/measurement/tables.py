@@ -3,23 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.lattice.mat_file import read_apart
+from tmlattice.measurement.arrays import Unit, metres
 from tmlattice.measurement.documents import located
 from tmlattice.measurement.monitors import Names, merge_spellings
 from tmlattice.measurement.rows import LARGEST_READING, dense, match_names, read_rows
 from tmlattice.measurement.trajectory import Measurement
 
 Array = NDArray[np.float64]
-Unit = Literal["m", "mm", "um", "nm"]
-
-_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
-
 COLUMNS = ("shot", "turn", "monitor", "x", "y")
 
 
@@ -51,7 +48,7 @@ def read_table(
         MeasurementError: one sentence with the file, the line and what would mend it.
     """
     rows = read_rows(Path(path), COLUMNS, optional=("shot", "turn"))
-    rows = replace(rows, xy=rows.xy * _scale(unit))
+    rows = replace(rows, xy=rows.xy * metres(unit))
     rows.check(*(k for k in COLUMNS if k in rows.whole), "monitor")
     numbers = rows.whole.get("shot", np.zeros(len(rows), dtype=np.int64))
     shots, place = np.unique(numbers, return_inverse=True)
@@ -99,7 +96,7 @@ def read_turn_by_turn(
         MeasurementError: its readings cannot be metres.
     """
     path = Path(path)
-    scale = _scale(unit)
+    scale = metres(unit)
     if datatype not in KINDS.split(", "):
         raise OtherFormatError(f"no kind '{datatype}' of turn-by-turn files; there are {KINDS}")
     tables, bunches = read_apart(
@@ -136,9 +133,3 @@ def read_turn_by_turn(
             noise=noise,
             shots=tuple(bunches),
         )
-
-
-def _scale(unit: str) -> float:
-    if unit not in _METRES:
-        raise MeasurementError(f"no unit '{unit}'; readings are in {', '.join(_METRES)}")
-    return _METRES[unit]

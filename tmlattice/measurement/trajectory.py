@@ -1,13 +1,14 @@
 """Trajectories as the monitors read them: the first turn, or turn by turn."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError, first_of, unknown_name
+from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
@@ -84,6 +85,45 @@ class Measurement(Shown):
     lattice: str | None = None
     energy: float | None = None
     devices: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        x: ArrayLike | None,
+        y: ArrayLike | None,
+        monitors: Iterable[Any],
+        *,
+        unit: Unit = "m",
+        noise: Any = None,
+        launches: ArrayLike | None = None,
+        launch_sigma: ArrayLike | None = None,
+        settings: Sequence[Settings] = (),
+        shots: Sequence[int] = (),
+    ) -> Self:
+        """Return the readings of one or more first turns; launches are unknown unless stated.
+
+        Args:
+            x, y: [shot, turn, monitor], [turn, monitor] or [monitor]; NaN where missing; None: not
+                read.
+            monitors: names, or elements of a ring.
+            unit: of x and y.
+            noise, settings, shots: see the attributes.
+            launches: [shot, 4 or 5], m and rad; None: unknown.
+            launch_sigma: their rms, see the attributes; None: unknown.
+
+        Raises:
+            MeasurementError: shapes that do not fit, or numbers that cannot be.
+        """
+        names = names_of(monitors)
+        readings = readings_of(x, y, names, ("shot", "turn"), unit)
+        number = len(readings)
+        if launches is None:
+            launches, launch_sigma = np.zeros((number, 5)), np.tile(UNKNOWN_LAUNCH, (number, 1))
+        return cls(
+            np.asarray(launches, dtype=float), readings, names, noise,
+            None if launch_sigma is None else np.asarray(launch_sigma, dtype=float),
+            tuple(settings), tuple(shots),
+        )  # fmt: skip
 
     def __post_init__(self) -> None:
         def keep(**values: Any) -> None:

@@ -23,7 +23,7 @@ class TuneReading(Shown):
     signal; these were read.)
 
     Attributes:
-        tune: (x, y), [shot, 2], NaN where not measured.
+        tune: (x, y), [shot, 2], NaN where not measured; of one shot [2] is taken too.
         tune_error: its rms, [shot, 2], NaN where not known; None: unknown.
         chromaticity: (x, y), dQ / d delta, not divided by the tune, [shot, 2], NaN where not
             measured; None: not measured.
@@ -46,7 +46,7 @@ class TuneReading(Shown):
     energy: float | None = None
 
     def __post_init__(self) -> None:
-        tune = np.asarray(self.tune, dtype=float)
+        tune = np.atleast_2d(np.asarray(self.tune, dtype=float))
         if tune.ndim != 2 or tune.shape[1] != 2 or not len(tune):
             raise MeasurementError(f"tunes have the shape {tune.shape}; it should be [shots, 2]")
         off = ~((tune >= 0) & (tune < 1)) & ~np.isnan(tune)
@@ -79,7 +79,7 @@ def _beside(what: str, values: Any, tune: Array) -> Array | None:
     """Numbers in the shape of the tunes; None where there are none."""
     if values is None:
         return None
-    array = np.asarray(values, dtype=float)
+    array = np.atleast_2d(np.asarray(values, dtype=float))
     if array.shape != tune.shape:
         raise MeasurementError(
             f"{what} have the shape {array.shape}; it should be {list(tune.shape)}, as the tunes"

@@ -1,13 +1,14 @@
 """Turns of the stored beam after a kick."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
+from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.checks import (
     check_energy,
     check_values,
@@ -54,6 +55,33 @@ class TurnByTurn(Shots):
     lattice: str | None = None
     energy: float | None = None
     devices: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        x: ArrayLike | None,
+        y: ArrayLike | None,
+        monitors: Iterable[Any],
+        *,
+        unit: Unit = "m",
+        noise: Any = None,
+        settings: Sequence[Settings] = (),
+        shots: Sequence[int] = (),
+    ) -> Self:
+        """Return the turns of a stored beam of two arrays.
+
+        Args:
+            x, y: [shot, turn, monitor] or [turn, monitor]; NaN where missing; None: not read.
+            monitors: names, or elements of a ring.
+            unit: of x and y.
+            noise, settings, shots: see the attributes.
+
+        Raises:
+            MeasurementError: shapes that do not fit, or numbers that cannot be.
+        """
+        names = names_of(monitors)
+        readings = readings_of(x, y, names, ("shot", "turn"), unit)
+        return cls(readings, names, noise, tuple(settings), tuple(shots))
 
     def __post_init__(self) -> None:
         readings, monitors = np.asarray(self.readings, dtype=float), tuple(self.monitors)

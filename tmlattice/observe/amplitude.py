@@ -1,11 +1,10 @@
-"""What the size of an oscillation does to its lines: tunes and ratios shift with the amplitude.
+"""Amplitude dependence of betatron lines: shifts of tunes and of ratios between monitors.
 
-Sextupoles shift the tunes by the square of the amplitude, octupoles do, and where cavities hold the
-energy, so does the longer way of an oscillation. The phases between monitors, and with them the
-lines, shift by as much. The design is tracked from the measured amplitudes, and its turns are read
-by the same `lines` as the measured ones; what differs from an oscillation without size is the
-shift. Its next order, in the fourth power of the amplitude, is what is left of the shift less twice
-that at half the action.
+Sextupoles and octupoles shift the tunes by the square of the amplitude; so does the longer path of
+an oscillation where cavities hold the energy. The phases between monitors, and with them the lines,
+shift by as much. The design is tracked from the measured amplitudes, and its turns are analysed by
+the same `lines` as the measured ones. The shift is the difference from a small oscillation. Its
+next order, in the fourth power of the amplitude, is the shift less twice that at half the action.
 """
 
 from collections.abc import Sequence
@@ -26,32 +25,32 @@ ComplexArray = NDArray[np.complex128]
 Flags = NDArray[np.bool_]
 
 TURNS = (256, 1024)
-"""Fewest and most turns that are tracked, else as many as were measured: a line is read well of the
-first; the second hold some periods of the synchrotron motion that a longer way starts."""
-NEARLY = 0.5
-"""Most by which a kick is corrected, as a share of it."""
+"""Fewest and most turns that are tracked, else as many as were measured: the first resolve a line;
+the second hold some periods of the synchrotron motion that a longer path starts."""
+MAX_CORRECTION = 0.5
+"""Largest correction of a kick, as a share of it."""
 SMALL = 1e-2
-"""Of the measured amplitude: that of an oscillation without size."""
+"""Amplitude of a small oscillation, as a share of the measured one."""
 SHARE = 0.1
 """rms error of a shift, as a share of it. BPM gains that are all wrong by 5 % make as much of the
-action; a beta beat of some percent does of the sextupoles' effect; and bends have a third order,
-which their maps lack: 13 % of the shift in ThomX, 6 % in the Australian Synchrotron."""
+action; a beta beat of a few per cent does of the sextupoles' effect. The maps also lack a third
+order of bends: 13 % of the shift in ThomX, 6 % in the Australian Synchrotron."""
 CONVERGED = 0.5
-"""Largest next order of a shift, as a share of it, with which its series still says anything."""
+"""Largest next order of a shift, as a share of it, for which its series is used."""
 SEEN = 1e-3
-"""Of a line: a smaller shift is below the noise of its monitors, whatever its next order."""
+"""Share of a line below which a shift is within the monitors' noise, whatever its next order."""
 
 
 @dataclass(frozen=True)
 class Shift:
-    """How the amplitude of each shot shifts its lines.
+    """Shift of the lines of each shot by its amplitude.
 
     Attributes:
         modes: change of the modes' vectors at the monitors, [shot, monitor, 2, mode].
         tunes: change of Q, [shot, mode].
-        error: relative rms error of both, one for all monitors, [shot, mode].
-        mode_error, tune_error: rms of what is beyond that, of the next order: of the lines, m, each
-            monitor's own, [shot, monitor, 2, mode], and of the tunes, [shot, mode].
+        error: relative rms error of both, common to all monitors, [shot, mode].
+        mode_error, tune_error: rms of the next order: of the lines, m, independent between
+            monitors, [shot, monitor, 2, mode], and of the tunes, [shot, mode].
         too_large: shots whose amplitude second-order maps do not describe, [shot].
     """
 
@@ -64,19 +63,19 @@ class Shift:
 
     @classmethod
     def none(cls, shots: int, monitors: int) -> "Shift":
-        """No shift at all."""
+        """Return no shift."""
         modes, two = np.zeros((shots, monitors, 2, 2)), np.zeros((shots, 2))
         none = np.zeros(shots, dtype=np.bool_)
         return cls(modes.astype(np.complex128), two.copy(), two + SHARE, modes, two.copy(), none)
 
 
 def shift_of(ring: Ring, beams: Sequence[StoredBeam], found: Lines, at: Array) -> Shift:
-    """The shift of measured lines.
+    """Return the shift of measured lines.
 
     Args:
         ring: the design.
-        beams: of each shot, without what is wrong.
-        found: their lines.
+        beams: stored beam of each shot.
+        found: the measured lines.
         at: s / C of each monitor.
     """
     shift = Shift.none(len(beams), len(at))
@@ -89,7 +88,7 @@ def shift_of(ring: Ring, beams: Sequence[StoredBeam], found: Lines, at: Array) -
 
 
 def _amplitudes(found: Lines, shot: int, beam: StoredBeam) -> ComplexArray:
-    """By which a shot shows each mode, 0 where there is no line, [mode]."""
+    """Amplitude of each mode in a shot, 0 without a line, [mode]."""
     read, error = found.amplitude[shot], found.error[shot]
     there = np.isfinite(read) & np.isfinite(error)
     weight = np.where(there, 1 / np.maximum(np.where(there, error, 1.0), 1e-300) ** 2, 0.0)
@@ -99,8 +98,8 @@ def _amplitudes(found: Lines, shot: int, beam: StoredBeam) -> ComplexArray:
 
 
 def _spread(found: Lines, shots: Sequence[int]) -> Array:
-    """The square of an envelope as it is at most, and on the mean over the line's power, [shot,
-    mode, 2]: particles that decohere keep the first, a beam that is damped has the second."""
+    """Squared envelope over the line's mean power: its maximum, and its power-weighted mean, [shot,
+    mode, 2]. The first holds for particles that decohere, the second for a damped beam."""
     g = np.abs(found.envelope[shots]) ** 2
     mean = (g**2).sum(axis=2) / np.maximum(g.sum(axis=2), 1e-300)
     return np.stack([g.max(axis=2), mean], axis=2)
@@ -110,7 +109,7 @@ def _tracked(
     ring: Ring, beam: StoredBeam, wanted: ComplexArray, turns: int, at: Array
 ) -> tuple[ComplexArray, Array, Flags]:
     """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes [shot, mode], and
-    whether the beam was kept [shot], for amplitudes [shot, mode] of which the last is small."""
+    whether the beam survived [shot], for amplitudes [shot, mode] of which the last is small."""
     way, maps = nonlinear_turn(beam.model.layers), beam.model.maps
     names = tuple(monitor.name for monitor in ring.monitors)
 
@@ -122,10 +121,10 @@ def _tracked(
         unit = np.einsum("mpk,smpk->sk", beam.modes.conj(), found.amplitude)
         return np.asarray(unit / (np.abs(beam.modes) ** 2).sum(axis=(0, 1))), found, kept
 
-    # a kick is no pure mode: sextupoles make its lines by some percent larger or smaller
+    # sextupoles change the lines of a kick by a few per cent
     unit, *_ = seen(wanted, TURNS[0])
     ratio = wanted / np.where(unit == 0, np.nan, unit)
-    good = np.abs(ratio - 1) < NEARLY
+    good = np.abs(ratio - 1) < MAX_CORRECTION
     unit, found, kept = seen(wanted * np.where(good, ratio, 1.0), turns)
     return found.amplitude / unit[:, None, None], found.tune, kept
 
@@ -134,7 +133,7 @@ def _fill(
     shift: Shift, ring: Ring, beam: StoredBeam, shots: Sequence[int], amplitude: ComplexArray,
     found: Lines, at: Array,
 ) -> None:  # fmt: skip
-    """What amplitudes [shot, mode] of some shots do, written into the shift."""
+    """Write the shift by amplitudes [shot, mode] of some shots."""
     spread = _spread(found, shots)
     size = amplitude * np.sqrt(spread.mean(axis=2))
     scales = (1.0, np.sqrt(0.5), SMALL)
@@ -147,17 +146,17 @@ def _fill(
     beyond, beyond_tune = whole - 2 * half, tune - 2 * tune_half
 
     def rms(change: ComplexArray) -> Array:
-        """Of the modes' size, [shot, mode]."""
+        """Relative to the modes, [shot, mode]."""
         squares = (np.abs(change) ** 2).sum(axis=(1, 2))
         return np.asarray(np.sqrt(squares / (np.abs(beam.modes) ** 2).sum(axis=(0, 1))))
 
-    # a mode without a line was not kicked, or its plane was not read
+    # a mode without a line was not kicked, or its plane was not measured
     there = np.isfinite(rms(whole) + rms(half) + tune) & (size != 0)
     large = there & (rms(whole) > SEEN)
     share = np.where(large, rms(beyond) / np.maximum(rms(whole), 1e-300), 0.0)
     shift.modes[shots] = np.where(there[:, None, None], whole, 0.0)
     shift.tunes[shots] = np.where(there, tune, 0.0)
-    # an action that is wrong by SHARE makes twice as much of its square
+    # an action with an error of SHARE makes twice that of its square
     more = np.where(there[:, None, None], np.abs(beyond * amplitude[:, None, None]), 0.0)
     shift.mode_error[shots] = 2 * SHARE * more
     shift.tune_error[shots] = 2 * SHARE * np.where(there, np.abs(beyond_tune), 0.0)
@@ -167,7 +166,7 @@ def _fill(
 
 
 def too_large(shift: Shift, shots: Sequence[int], found: Lines) -> list[str]:
-    """A sentence where the amplitude of shots is too large."""
+    """Return a warning if the amplitude of shots is too large."""
     own = np.flatnonzero(shift.too_large).tolist()
     if not own:
         return []
@@ -175,6 +174,6 @@ def too_large(shift: Shift, shots: Sequence[int], found: Lines) -> list[str]:
     ids = first_of([shots[i] for i in own])
     return [
         f"shot{'s' * (len(own) > 1)} {ids}: an oscillation of {1e3 * size:.2g} mm rms is too large "
-        "for second-order maps of this ring: its tunes do not shift by the square of the amplitude "
-        "any more; kick the beam less; these turns are not used"
+        "for second-order maps of this ring: its tunes no longer shift by the square of the "
+        "amplitude; kick the beam less; these turns are not used"
     ]

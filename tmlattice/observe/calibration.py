@@ -1,4 +1,4 @@
-"""Calibration of monitors and correctors: a file of effects, and the response that they make."""
+"""Calibration of monitors and correctors: a file of effects, and the calibrated response."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -17,23 +17,23 @@ from tmlattice.measurement.documents import located, read_document
 Array = NDArray[np.float64]
 
 ENERGY = 1e-3
-"""Energy deviation of the differences that tell what an energy spread does."""
+"""Energy step of the differences for an energy spread."""
 FORMAT = "tmlattice-calibration"
 CALIBRATES = tuple(name for name, effect in CATALOGUE.items() if effect.calibrates)
-"""The effects that a calibration may hold."""
+"""Effects in a calibration file."""
 Dispersion = Mapping[str, tuple[float, float]]
-"""What kicks of the closed orbit add to the dispersion of the lattice at monitors and correctors, x
-and y, m per relative energy; see `beam.kicks`."""
+"""Dispersion by kicks of the closed orbit, beyond the lattice's, at monitors and correctors, x and
+y, m per relative energy; see `beam.kicks`."""
 Channel = tuple[str, str | None]
-"""A monitor and its plane, "x" or "y"; or a corrector, and None."""
+"""A monitor and its plane, "x" or "y"; or a corrector and None."""
 
 
 def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
-    """The effects of a calibration file.
+    """Return the effects of a calibration file.
 
     Args:
         path: JSON, see the schema `calibration`.
-        ring: that they sit on.
+        ring: the ring of the effects.
 
     Raises:
         MeasurementError: no such file, or not a calibration of this ring.
@@ -52,16 +52,16 @@ def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
 
 
 def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
-    """What a calibration file says of the dispersion beside the lattice's; empty where nothing.
+    """Return the dispersion of a calibration file beyond the lattice's; empty if it has none.
 
     Args:
         path: JSON, see the schema `calibration`.
-        ring: that it is of.
+        ring: its ring.
 
     Raises:
-        MeasurementError: no such file, not a calibration, a row that is no number or of nothing
-            that is read or kicks.
-        UnknownNameError: of another ring.
+        MeasurementError: no such file, not a calibration, a row that is not a number, or an element
+            that is neither a monitor nor a corrector.
+        UnknownNameError: an element of another ring.
     """
     path = Path(path)
     document = read_document(path, "calibration", FORMAT)
@@ -87,8 +87,9 @@ def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
 
 
 def read_energy(path: str | Path, ring: Ring) -> tuple[float, float]:
-    """The relative deviation of the beam's mean energy in a calibration file, and its standard
-    error, 0 where the file does not state one.
+    """Relative deviation of the beam's mean energy in a calibration file, and its standard error.
+
+    The error is 0 if the file does not state it.
 
     Raises:
         MeasurementError: no such file, or not a calibration of this ring.
@@ -100,15 +101,15 @@ def read_energy(path: str | Path, ring: Ring) -> tuple[float, float]:
 
 
 def read_rejected(path: str | Path, ring: Ring) -> list[Channel]:
-    """The channels of which a calibration file lets nothing be predicted; empty if it names none.
+    """Return the rejected channels of a calibration file, which are not predicted.
 
     Args:
         path: JSON, see the schema `calibration`.
-        ring: that it is of.
+        ring: its ring.
 
     Raises:
         MeasurementError: no such file, or not a calibration.
-        UnknownNameError: of another ring.
+        UnknownNameError: an element of another ring.
     """
     path = Path(path)
     document = read_document(path, "calibration", FORMAT)
@@ -123,18 +124,18 @@ def write_calibration(
     rejected: Iterable[Channel] = (),
     errors: Mapping[Channel, float] | None = None,
 ) -> None:
-    """Write a calibration file: whole, or not at all.
+    """Write a calibration file, atomically.
 
     Args:
         path: of the file, JSON.
         causes: effects on monitors, correctors and the beam.
-        dispersion: beside that of the lattice.
-        rejected: channels that the fit rejected.
-        errors: standard errors of the amounts, by effect and element, where they are known.
+        dispersion: beyond that of the lattice.
+        rejected: rejected channels.
+        errors: standard errors of the amounts, by effect and element, where known.
 
     Raises:
-        EffectError: an effect that is no calibration.
-        OutputError: it cannot be written.
+        EffectError: an effect that is not a calibration.
+        OutputError: the file cannot be written.
     """
     from tmlattice import __version__
 
@@ -157,7 +158,7 @@ def write_calibration(
 
 
 def corrector_scales(ring: Ring, causes: Iterable[Cause], names: Sequence[str]) -> Array:
-    """What each corrector does of what it is told, 1 for a good one, [corrector]."""
+    """Actual kick over the set one of each corrector, [corrector]."""
     scale = {ring[name].name: 1.0 for name in names}
     for cause in causes:
         if cause.effect == "corrector_calibration":
@@ -168,7 +169,7 @@ def corrector_scales(ring: Ring, causes: Iterable[Cause], names: Sequence[str]) 
 
 
 def offset_of(causes: Iterable[Cause]) -> float:
-    """The relative deviation of the beam's mean energy."""
+    """Relative deviation of the beam's mean energy."""
     return sum(cause.amount for cause in causes if cause.effect == "energy_offset")
 
 
@@ -179,22 +180,22 @@ def calibrated_response(
     dispersion: Dispersion | None = None,
     rejected: Iterable[Channel] = (),
 ) -> tuple[Columns, Array]:
-    """What the monitors of a ring with errors read for a radian of each corrector.
+    """Return the response as the monitors of a ring with errors read it.
 
     Args:
         ring: the design.
-        causes: on the ring, on its monitors, and of the beam's energies.
+        causes: on the ring, its monitors, and the beam's energy.
         correctors: names; None: all, in beam order.
-        dispersion: beside that of the ring.
-        rejected: channels of which nothing is predicted.
+        dispersion: beyond that of the ring.
+        rejected: channels that are not predicted.
 
     Returns:
-        The correctors, and m/rad [corrector, monitor, 2]; NaN where a monitor is silent, and of
-        rejected channels.
+        The correctors, and m/rad [corrector, monitor, 2]; NaN for silent monitors and rejected
+        channels.
 
     Raises:
         EffectError, UnknownNameError: a cause that the ring cannot have.
-        MeasurementError: a corrector that is none.
+        MeasurementError: an element that is not a corrector.
         UnstableRingError: no closed orbit.
     """
     model = ResponseModel(apply(ring, causes))
@@ -217,8 +218,8 @@ def calibrated_response(
 def _of_centroid(
     model: ResponseModel, columns: Columns, causes: Iterable[Cause], dispersion: Dispersion
 ) -> Array:
-    """m/rad of particles that answer each as its energy has it: half the second derivative by the
-    energy, times the mean square, beside what one particle does."""
+    """Correction of the response, m/rad, for the centroid of an energy spread: half the second
+    derivative by the energy times the mean square."""
     nothing = (0.0, 0.0)
     monitors = np.array([dispersion.get(name, nothing) for name in model.monitors])
     correctors = np.array([
@@ -250,7 +251,7 @@ def _check(causes: Iterable[Cause]) -> None:
 
 
 def _once(causes: Iterable[Cause]) -> None:
-    """Of an effect that is stated twice of one element, the amounts would be added."""
+    """Raise if an effect is stated twice for one element."""
     seen: set[tuple[str, str]] = set()
     for cause in causes:
         place = cause.element or "the beam"

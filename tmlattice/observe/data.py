@@ -1,4 +1,4 @@
-"""What was measured, as the diagnosis needs it: readings, their noise, launches."""
+"""Data of a diagnosis: readings, their noise, launches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,14 +21,13 @@ class Data:
 
     Attributes:
         readings: [shot, reading, 2], m, with reading = turn * monitors + monitor; 0 where missing.
-        valid: which readings there are, [shot, reading, 2].
-        sigma: noise of each reading, m, [shot, reading, 2]; NaN where it is not known yet.
+        valid: whether a reading exists, [shot, reading, 2].
+        sigma: noise of each reading, m, [shot, reading, 2]; NaN where unknown.
         launches: nominal (x, px, y, py, delta), [shot, 5].
         launch_sigma: its rms; inf where unknown, 0 where exact, [shot, 5].
         settings: of each shot.
         turns: of each shot.
-        active: shots in which the causes that are looked for are there; not those of a reference
-            from before the fault, [shot].
+        active: shots in which the causes sought act; not those of a reference, [shot].
     """
 
     readings: Array
@@ -42,36 +41,36 @@ class Data:
 
     @property
     def shots(self) -> int:
-        """Their number."""
+        """Number of shots."""
         return len(self.readings)
 
     @property
     def planes(self) -> Flags:
-        """Whether anything was read in x, and in y, [2]."""
+        """Whether there are readings in x, and in y, [2]."""
         return np.asarray(self.valid.any(axis=(0, 1)))
 
     def with_sigma(self, planes: Array) -> "Data":
-        """The same with the noise of each plane [2] put in where it is not known."""
+        """Return the data with the noise of each plane [2] where it is unknown."""
         filled = np.where(np.isfinite(self.sigma), self.sigma, planes)
         return replace(self, sigma=filled)
 
     def of_shots(self, shots: NDArray[np.intp]) -> "Data":
-        """Some of the shots."""
+        """Return some of the shots."""
         names = ("readings", "valid", "sigma", "launches", "launch_sigma", "active")
         arrays = {name: getattr(self, name)[shots] for name in names}
         return replace(self, settings=tuple(self.settings[i] for i in shots), **arrays)
 
     def without(self, dropped: Flags) -> "Data":
-        """The same with these readings missing."""
+        """Return the data without some readings."""
         return replace(self, valid=self.valid & ~dropped)
 
 
 def of_measurement(ring: Ring, measurement: Measurement, reference: bool = False) -> Data:
-    """The shots of a measurement.
+    """Return the shots of a measurement.
 
     Raises:
-        UnknownNameError: a monitor that the ring does not have.
-        MeasurementError: no reading at all.
+        UnknownNameError: a monitor that is not in the ring.
+        MeasurementError: no reading.
     """
     names = [monitor.name for monitor in ring.monitors]
     ordered = measurement.in_order_of(names)
@@ -99,7 +98,7 @@ def of_measurement(ring: Ring, measurement: Measurement, reference: bool = False
 
 
 def joined(first: Data, second: Data) -> Data:
-    """The shots of both.
+    """Return the shots of both.
 
     Raises:
         MeasurementError: different numbers of turns.
@@ -137,7 +136,7 @@ def launch_errors(
 
 
 NOISE_FLOOR = 1e-9
-"""m. Readings without noise are trusted to this: where OCELOT's maps are rounded and truncated."""
+"""m; smallest noise of a reading: rounding and truncation of OCELOT's maps."""
 
 
 def first_turn(
@@ -147,7 +146,7 @@ def first_turn(
     launch_sigma: ArrayLike | None,
     dimension: int = 4,
 ) -> Data:
-    """The first turn alone, with a stated noise and launches as they are said to be.
+    """First turn alone, with a stated noise and launches.
 
     Args:
         monitors: names, in the order of the readings.
@@ -157,12 +156,12 @@ def first_turn(
         dimension: n, of the network.
 
     Raises:
-        MeasurementError: no reading of the first turn, nobody states the noise, or a launch that n
-            coordinates do not know.
+        MeasurementError: no reading of the first turn, no stated noise, or a launch that n
+            coordinates cannot describe.
         UnknownNameError: another monitor.
     """
     ordered = measurement.in_order_of(monitors)
-    ordered.states(dimension)  # says where four coordinates do not do
+    ordered.states(dimension)  # raises if four coordinates are too few
     readings = ordered.readings[:, 0]
     valid = np.isfinite(readings)
     if not valid.any():

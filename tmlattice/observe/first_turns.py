@@ -1,4 +1,4 @@
-"""First turns: trajectories from launches that are known only so well.
+"""First turns: trajectories from launches of limited accuracy.
 
 >>> problem = FirstTurns(model=Model(ring, data.settings), data=data, places={})
 >>> fit(problem, [Cause("quadrupole_gradient", "qd::12", -0.1)], data.launches)
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
-from tmlattice.inference.judge import Half, Judged, other_half
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.root import Root
+from tmlattice.inference.validation import Half, HeldOut, cross_predicted
 from tmlattice.inference.whitening import EXACT, Projection, Whitening
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import TurnMetric, metric
@@ -29,23 +29,23 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 COORDINATES = 2
-"""Of a launch in one plane."""
-MANY = 10
-"""Fixed causes that are worth a model of their own."""
-ENOUGH = 20
-"""Readings of which a median is taken at least."""
+"""Coordinates of a launch in one plane."""
+MIN_FIXED = 10
+"""Number of fixed causes above which they are built into the model."""
+MIN_READINGS = 20
+"""Readings of a median, at least."""
 STEPS = 24
-"""Of a fit of launches, at most: in a plane without readings they act by their squares."""
+"""Steps of a fit of launches, at most: without readings in a plane they act by their squares."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FirstTurns(Problem):
-    """The shots of a measurement, a turn or a few each, in a ring with what is known of it.
+    """Shots of a measurement, a few turns each, in a ring with known causes.
 
     Attributes:
-        model: the ring as these shots saw it.
+        model: the ring of these shots.
         data: readings.
-        white: the whitening where it is known already.
+        white: the whitening, if known.
     """
 
     model: Model = field(repr=False)
@@ -59,14 +59,14 @@ class FirstTurns(Problem):
 
     @property
     def whitening(self) -> Whitening:
-        """By the noise of the readings."""
+        """Whitening by the noise of the readings."""
         assert self.white is not None
         return self.white
 
     # --- the model ------------------------------------------------------------------------------
     @property
     def first(self) -> Array:
-        """The nominal launches; one sigma from that in a plane without readings.
+        """Nominal launches, moved by one sigma in a plane without readings.
 
         At y = 0 the readings in x do not depend on y to first order, so a fit never leaves it.
         """
@@ -78,22 +78,21 @@ class FirstTurns(Problem):
 
     @property
     def free(self) -> int:
-        """Coordinates that are not known exactly."""
+        """Number of free launch coordinates."""
         return self.data.shots * len(self.whitening.columns)
 
-    def standing(self, causes: Sequence[Cause]) -> "FirstTurns":
-        """With errors of magnets and monitors in the model itself, where there are many: each
-        trajectory would build all these magnets again."""
+    def with_fixed(self, causes: Sequence[Cause]) -> "FirstTurns":
+        """Return the problem with fixed causes; many are built into the model, which is faster."""
         rest, built = list[Cause](), list[Cause]()
         for cause in causes:
             of_model = isinstance(find(cause.effect), RingEffect | ReadingEffect)
             (built if of_model else rest).append(cause)
-        if len(built) < MANY and self.alone:
-            return super().standing(causes)
+        if len(built) < MIN_FIXED and self.alone:
+            return super().with_fixed(causes)
         return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
-        """Trajectories and what they leave; `view` is their `Paths`."""
+        """Return trajectories and residual; `view` are the `Paths`."""
         paths = self.model.paths(nuisances, (*self.fixed, *causes), self._of_shots(kicks))
         residual = self._residual(paths.readings, nuisances)
         projection, lost = None, ""
@@ -106,7 +105,7 @@ class FirstTurns(Problem):
         )
 
     def slope(self, point: Point, cause: int) -> Array:
-        """By central differences of the readings: all orders, monitors' errors included."""
+        """Slope by central differences of the readings, monitors' errors included."""
         causes = point.causes
         effect = find(causes[cause].effect)
         h = (1e-3 if effect.power == 1 else 1e-2) * effect.largest
@@ -119,19 +118,19 @@ class FirstTurns(Problem):
         return self.whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
 
     def metres(self, row: Array) -> Array:
-        """A slope as readings move, where they are not correlated: [shot * reading * 2], m."""
+        """A slope in units of uncorrelated readings, [shot * reading * 2], m."""
         rows = row.reshape(self.data.shots, -1)[:, :-5].reshape(self.valid.shape)
         weight = self.whitening.weight
         return np.where(weight > 0, rows / np.where(weight > 0, weight, 1.0), 0.0).ravel()
 
     def moved(self, nuisances: Array, change: Array) -> Array:
-        """Launches with their free coordinates changed."""
+        """Launches after a change of their free coordinates."""
         launches = nuisances.copy()
         launches[:, self.whitening.columns] += change.reshape(len(launches), -1)
         return launches
 
     def metric(self, point: Point) -> TurnMetric:
-        """Products of signatures along these trajectories."""
+        """Return products of signatures along these trajectories."""
         assert point.projection is not None
         return metric(
             self.model, point.view, point.nuisances, self.whitening, point.projection,
@@ -139,7 +138,7 @@ class FirstTurns(Problem):
         )  # fmt: skip
 
     def metric_among(self, point: Point, root: Root, projection: Projection) -> TurnMetric:
-        """Sums over the readings behind each monitor give most products, see `DenseMetric`."""
+        """Return products from sums over the readings behind each monitor, see `DenseMetric`."""
         whitening = self.whitening.correlated(root.matrix)
         return metric(
             self.model, point.view, point.nuisances, whitening, projection, self.data.active
@@ -147,11 +146,11 @@ class FirstTurns(Problem):
 
     @property
     def alone(self) -> bool:
-        """Whether no shot is of a reference."""
+        """Whether no shot is a reference."""
         return bool(self.data.active.all())
 
     def reference(self, nuisances: Array) -> "tuple[FirstTurns | None, Array]":
-        """Shots of a reference."""
+        """Return the reference shots."""
         if self.alone:
             return None, nuisances
         shots = np.flatnonzero(~self.data.active)
@@ -162,12 +161,12 @@ class FirstTurns(Problem):
         return replace(self, model=model, data=data, white=None), nuisances[shots]
 
     def everywhere(self) -> "FirstTurns":
-        """With causes that act in all shots."""
+        """Return the problem with causes that act in all shots."""
         every = np.ones(self.data.shots, dtype=bool)
         return replace(self, data=replace(self.data, active=every))
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Those that sit between the same monitors as a magnet."""
+        """Return hypotheses between the same monitors as a magnet."""
         ring = self.model.ring
         if hypothesis[1] is None or not any(e.name == hypothesis[1] for e in ring.magnets):
             return []
@@ -184,11 +183,11 @@ class FirstTurns(Problem):
     # --- what has no name -----------------------------------------------------------------------
     @property
     def kick_places(self) -> Sequence[str]:
-        """The magnets."""
+        """Names of the magnets."""
         return self.model.maps.layers
 
     def kick_rows(self, point: Point, place: int) -> Array:
-        """Of (px, py) in the middle of a magnet, each active shot's own."""
+        """Rows of (px, py) in the middle of a magnet, independent in each active shot."""
         kicked = self.model.kick_signatures(point.view, np.array([place]))[0]
         shots = np.flatnonzero(self.data.active)
         alone = np.zeros((len(shots), *kicked.shape))
@@ -205,7 +204,7 @@ class FirstTurns(Problem):
 
     @property
     def monitors(self) -> Sequence[str]:
-        """In the order of the readings."""
+        """Monitors in the order of the readings."""
         return self.model.maps.monitors
 
     # --- readings -------------------------------------------------------------------------------
@@ -215,40 +214,40 @@ class FirstTurns(Problem):
         return self.data.valid
 
     def owner(self) -> NDArray[np.int64]:
-        """The monitor of each reading."""
+        """Monitor of each reading."""
         one = np.tile(np.arange(len(self.monitors)), self.data.turns)
         return np.broadcast_to(one[None, :, None], self.valid.shape)
 
     @property
     def freedom(self) -> int:
-        """What is known of a launch counts as readings of it."""
+        """Degrees of freedom; prior knowledge of a launch counts as readings of it."""
         free = self.data.launch_sigma > 0
         priors = int((free & np.isfinite(self.data.launch_sigma)).sum())
         return int(self.valid.sum()) + priors - int(free.sum())
 
     def as_rows(self, readings: Array) -> Array:
-        """With rows of zeros for what is known of the launches."""
+        """Whitened rows of readings, with zeros for the launches' priors."""
         return self.whitening.signature(readings)
 
     def noise_rows(self) -> list[Flags]:
-        """Of x, and of y, where there are readings."""
+        """Return the rows of x, and of y, that have readings."""
         planes = np.zeros((2, *self.valid.shape))
         planes[0, ..., 0], planes[1, ..., 1] = self.valid[..., 0], self.valid[..., 1]
         return [own > 0 for own in self.whitening.signature(planes)]
 
     def noisier(self, factors: Array) -> "FirstTurns":
-        """By plane."""
+        """Return the problem with the noise of each plane scaled."""
         data = replace(self.data, sigma=self.data.sigma * factors)
         return replace(self, data=data, white=None)
 
     def disagreement(self, point: Point) -> float:
-        """Of what each monitor reads less what the two before it predict."""
+        """Median misfit of each reading with the prediction from the two monitors before it."""
         left = local_misfit(self.data, point.view) / self.data.sigma
         left = np.abs(left[np.isfinite(left)])
-        return float(np.median(left)) if len(left) > ENOUGH else 0.0
+        return float(np.median(left)) if len(left) > MIN_READINGS else 0.0
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """The launch takes some of a reading."""
+        """Residuals and their variances, reduced by the fitted launch."""
         assert point.projection is not None
         shots = self.data.shots
         clean = point.projection.out(point.residual).reshape(shots, -1)[:, :-5]
@@ -257,7 +256,7 @@ class FirstTurns(Problem):
         return clean.reshape(self.valid.shape), size.reshape(self.valid.shape)
 
     def without(self, dropped: Flags) -> "FirstTurns":
-        """The noise is worked out anew."""
+        """Return the problem without some readings; the noise is estimated anew."""
         if not dropped.any():
             return self
         return replace(self, data=self.data.without(dropped), white=None)
@@ -268,16 +267,16 @@ class FirstTurns(Problem):
         return self.whitening.residual(difference, launches)
 
 
-def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:
-    """What a model leaves of shots that no fit saw.
+def held_out_residuals(problem: FirstTurns, unknown: Array | None = None) -> HeldOut:
+    """Residuals of a model on held-out shots.
 
-    In each shot only the launch is fitted, to one half of the monitors; the readings of the other
+    In each shot the launch alone is fitted, to one half of the monitors; the readings of the other
     half are predicted.
 
     Args:
         problem: of these shots; its `fixed` causes are the model's.
-        unknown: covariance that what is not known of the model makes of all readings,
-            [shot * reading * 2] twice, m^2; None: nothing.
+        unknown: covariance of all readings by the model's uncertainty, [shot * reading * 2] twice,
+            m^2; None: none.
     """
     data = problem.data
     odd = problem.owner() % 2 == 1
@@ -285,7 +284,7 @@ def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:
     point = fit(fitted, (), fitted.first, steps=STEPS).point
     residuals = np.full(data.valid.shape, np.nan)
     if point.projection is None:
-        return Judged(residuals, ())
+        return HeldOut(residuals, ())
     left = np.where(data.valid, data.readings - point.view.readings, 0.0)
     columns = fitted.whitening.columns
     off = (data.launches - point.nuisances)[:, columns]
@@ -306,18 +305,18 @@ def judged(problem: FirstTurns, unknown: Array | None = None) -> Judged:
         )
         order = np.concatenate([index[shots][gives], index[shots][scored]])
         among = None if unknown is None else unknown[np.ix_(order, order)]
-        found = other_half(first, second, off[shots].ravel(), known.ravel(), among)
+        found = cross_predicted(first, second, off[shots].ravel(), known.ravel(), among)
         parts.append(found)
         residuals[shots] = _scattered(found.residual, scored)
-    return Judged(residuals, tuple(parts))
+    return HeldOut(residuals, tuple(parts))
 
 
 def _bounded(data: Data, model: Model) -> Data:
-    """The data, launches in planes without readings as unknown as the orbit is large.
+    """Limit launches in planes without readings to the size of the orbit.
 
-    In a plane with fewer readings than a launch has coordinates the trajectory is expected to be as
-    large as what was read of the shot: without a prior, sextupoles let it go anywhere for the sake
-    of noise in the other plane.
+    In a plane with fewer readings than launch coordinates, the prior is as large as the shot's
+    readings. Without it sextupoles would let the trajectory diverge to fit noise in the other
+    plane.
     """
     count = data.valid.sum(axis=1)  # [shot, plane]
     few = np.repeat(count < COORDINATES, 2, axis=1)

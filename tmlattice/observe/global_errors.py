@@ -1,12 +1,12 @@
-"""Which wrong sign, unit or order everywhere makes first turns agree: global before local.
+"""Global errors of first turns: a wrong sign, unit or order of all readings or settings.
 
->>> judge = Judge(ring, measurement)
->>> judge.verdicts()                    # what would make the data far better, the best first
+>>> search = GlobalErrors(ring, measurement)
+>>> search.verdicts()                   # corrections that improve the data far, the best first
 
-Each assumption is undone in the data, and the trajectories of all sections are fitted again: what
-counts is how well they agree with themselves, where one joins the next, and with the launches.
-Every term has its own scale, so a section that a fault spoils costs the logarithm of its misfit: a
-strong fault does not look global, and a global error is seen although a fault is there.
+Each assumption is corrected in the data, and the trajectories of all sections are fitted again. The
+score is their agreement with themselves, with the next section, and with the launches. Every term
+has its own scale, so that the section of a fault costs the logarithm of its misfit: a strong fault
+does not look global, and does not hide a global error.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,46 +30,48 @@ from tmlattice.observe.evidence import (
     widely,
     worth,
 )
-from tmlattice.observe.sections import Found, Passes, Sections, distance, openness
+from tmlattice.observe.sections import Passes, SectionFits, Sections, distance, log_uncertainty
 
 Array = NDArray[np.float64]
 
 SHOTS, TURNS = 8, 3
-"""That are looked at: a global error is in each."""
-ROUGH = 1e-5
-"""m; stands for a noise that nobody states."""
-TRUSTED = 0.03
-"""Share of the launches to which a fitted one is compared: small errors of magnets and monitors of
-the first section spoil it by as much."""
+"""Shots and turns that are used: a global error is in each."""
+UNSTATED_NOISE = 1e-5
+"""m; noise of a measurement that states none."""
+LAUNCH_TOLERANCE = 0.03
+"""Relative tolerance of fitted launches, for small errors of magnets and monitors in the first
+section."""
 NOISE_WIDTH = np.log(3.0)
-"""A stated noise is right to a factor of three, one standard deviation."""
+"""Uncertainty of a stated noise: a factor of three, one standard deviation."""
 ORBIT, ORBIT_WIDTH = 1e-3, np.log(10.0)
-"""m; first turns have an orbit of a millimetre, to a factor of ten, one standard deviation."""
+"""m; usual orbit of first turns, to a factor of ten, one standard deviation."""
 ALIKE = 3.0
-"""Log evidence below which two assumptions explain the data alike."""
+"""Log evidence below which two assumptions are equivalent."""
 _LAST = ("noise-from-data", "launches-unknown", "readings-doubled", "readings-halved")
-"""Not tried: of the first two others decide, and small errors everywhere look like a factor of two.
+"""Not tried: other assumptions include the first two, and distributed errors mimic a factor of two.
 """
 BEAM = 4
-"""Assumptions, the best ones, that are tried together with every other."""
+"""Best assumptions that are combined with every other."""
 _TURNED = np.array([1.0, -1.0, 1.0, -1.0])
 
 
 @dataclass
-class Judge:
-    """Judges the assumptions about one measurement.
+class GlobalErrors:
+    """Search for global errors of one measurement.
 
     Args:
         ring: the design.
         measurement: first turns, its monitors those of the ring.
-        known: causes that the model holds.
+        known: causes in the model.
     """
 
     ring: Ring
     measurement: Measurement
     known: Sequence[Cause] = ()
     _sections: dict[float, Sections] = field(default_factory=dict, repr=False)
-    _found: dict[object, tuple[object, Passes, Found]] = field(default_factory=dict, repr=False)
+    _found: dict[object, tuple[object, Passes, SectionFits]] = field(
+        default_factory=dict, repr=False
+    )
     _made: dict[Names, Measurement] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -79,32 +81,32 @@ class Judge:
         self.kicks = _kicks(self.measurement.settings)
 
     def assumed(self, names: Names) -> Measurement:
-        """The data with what is assumed undone."""
+        """Return the data with assumptions corrected."""
         if names not in self._made:
             self._made[names] = assume(self.measurement, names, self.monitors)
         return self._made[names]
 
     # --- one assumption -------------------------------------------------------------------------
-    def found(self, data: Measurement) -> tuple[Passes, Found]:
-        """The trajectories of the sections of a measurement."""
+    def found(self, data: Measurement) -> tuple[Passes, SectionFits]:
+        """Return the trajectories of the sections of a measurement."""
         factor = self._times(data)
         key = (id(data.readings), factor)
         if key not in self._found:
-            self._found[key] = (data, *self._fit(data, factor))  # the data stay: so does their id
+            self._found[key] = (data, *self._fit(data, factor))  # keeps the data, and so their id
         return self._found[key][1:]
 
     def _times(self, data: Measurement) -> float:
-        """By what the kicks of the shots are multiplied."""
+        """Common factor of the shots' kicks."""
         if data.settings is self.measurement.settings or not self.kicks.any():
             return 1.0
         return float(_kicks(data.settings) @ self.kicks / (self.kicks @ self.kicks))
 
-    def _fit(self, data: Measurement, times: float) -> tuple[Passes, Found]:
+    def _fit(self, data: Measurement, times: float) -> tuple[Passes, SectionFits]:
         shots, turns = data.readings.shape[:2]
         readings = data.readings.reshape(shots * turns, -1, 2)
         read = np.isfinite(readings).any(axis=(1, 2))
         shot, turn = (own[read] for own in np.divmod(np.arange(len(readings)), turns))
-        noise = np.full((len(data.monitors), 2), ROUGH)
+        noise = np.full((len(data.monitors), 2), UNSTATED_NOISE)
         if self.measurement.noise is not None:
             own = self._noise(data)
             noise = np.where(np.isfinite(own), own, np.nanmedian(own))
@@ -115,7 +117,7 @@ class Judge:
         return passes, self._section(times).fit(passes)
 
     def _section(self, times: float) -> Sections:
-        """The sections, the shots' kicks multiplied."""
+        """Sections with the shots' kicks multiplied."""
         if 1.0 not in self._sections:
             at = {name.casefold(): i for i, name in enumerate(self.monitors)}
             data = self.measurement
@@ -127,7 +129,7 @@ class Judge:
         return self._sections[times]
 
     def _noise(self, data: Measurement) -> Array:
-        """As it was stated, monitor by monitor in the order in which the data stand now."""
+        """Stated noise, in the present order of the monitors."""
         assert self.measurement.noise is not None
         if data.noise is None or data.noise.shape != self.measurement.noise.shape:
             return self.measurement.noise
@@ -135,11 +137,11 @@ class Judge:
         return np.asarray(data.noise / ratio)
 
     def terms(self, names: Names, square: float) -> Terms:
-        """What an assumption leaves.
+        """Return the mismatches that an assumption leaves.
 
         Args:
-            names: what is assumed, together; () for the data as stated.
-            square: of the readings' noise, in units of the stated one.
+            names: assumptions, together; () for the data as stated.
+            square: variance of the readings, in units of the stated one.
         """
         data = self.assumed(names)
         passes, found = self.found(data)
@@ -158,7 +160,7 @@ class Judge:
         backwards = "beam-backwards" in names
         launch, blur = self._launch(data, passes, found, square, backwards)
         times = _size(data) / self.scale
-        blur += sum(openness(own / times**2) for own in spreads)
+        blur += sum(log_uncertainty(own / times**2) for own in spreads)
         return Terms(
             found.misfit.ravel(),
             np.concatenate(joints),
@@ -171,26 +173,26 @@ class Judge:
             unit,
         )
 
-    def launches(self, square: float, trusted: float) -> tuple[Array, Array]:
-        """Mean squares of fitted less stated launches, each plane's own, [shot, 2], and the misfit
-        of the sections that tell them, [shot]."""
+    def launches(self, square: float, tolerance: float) -> tuple[Array, Array]:
+        """Mean squares of fitted less stated launches by plane, [shot, 2], and the misfit of the
+        sections that determine them, [shot]."""
         passes, found = self.found(self.measurement)
         first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
-        own, _ = self._launch(self.measurement, passes, found, square, False, trusted)
+        own, _ = self._launch(self.measurement, passes, found, square, False, tolerance)
         return own.reshape(-1, 2), found.misfit[first, 0]
 
     def _launch(
         self,
         data: Measurement,
         passes: Passes,
-        found: Found,
+        found: SectionFits,
         square: float,
         backwards: bool,
-        trusted: float = TRUSTED,
+        tolerance: float = LAUNCH_TOLERANCE,
     ) -> tuple[Array, float]:
-        """Mean squares of fitted less stated launches, each plane's own, [shot * 2], and log of
-        what the readings leave open of them."""
-        if backwards:  # where the last turn ends, against the launches as they were stated
+        """Mean squares of fitted less stated launches by plane, [shot * 2], and the log of their
+        uncertainty."""
+        if backwards:  # the end of the last turn, against the stated launches
             last = np.flatnonzero(np.append(np.diff(passes.shot) != 0, True))
             shot, fitted = passes.shot[last], found.end[last, -1] * _TURNED
             covariance = found.carried[last, -1] * np.outer(_TURNED, _TURNED)
@@ -209,12 +211,12 @@ class Judge:
         if sigma is None or np.isinf(sigma[shot, :4]).all():
             return np.zeros(0), 0.0
         own = np.minimum(sigma[shot, :4], 1e3)
-        width = trusted * np.sqrt(np.mean(fitted**2, axis=0))
+        width = tolerance * np.sqrt(np.mean(fitted**2, axis=0))
         spread = square * covariance + (J * own[:, None] ** 2) @ np.swapaxes(J, 1, 2)
         spread = spread + np.diag(np.maximum(width, 1e-12) ** 2)
         times = _size(data) / self.scale
         open_ = square * covariance / (own**2 + np.maximum(width, 1e-12) ** 2)[:, None] / times**2
-        blur = openness(np.eye(4) + open_)
+        blur = log_uncertainty(np.eye(4) + open_)
         miss = np.clip(np.nan_to_num(fitted - stated[:, :4], nan=1e6), -1e6, 1e6)
         planes = [distance(miss[:, p], spread[:, p, p]) for p in (slice(0, 2), slice(2, 4))]
         return np.stack(planes, axis=1).ravel(), blur
@@ -222,7 +224,7 @@ class Judge:
     def _carried(
         self, data: Measurement, passes: Passes, first: NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Launches carried to the first turn that was read."""
+        """Launches carried to the first measured turn."""
         sections = self._section(self._times(data))
         stated, slopes = np.zeros((len(first), 5)), np.zeros((len(first), 4, 4))
         for i, one in enumerate(first):
@@ -234,13 +236,13 @@ class Judge:
 
     # --- all of them ----------------------------------------------------------------------------
     def candidates(self) -> list[Names]:
-        """What may be assumed of these data."""
+        """Return the assumptions that these data allow."""
         data = self.measurement
         names = [n for n, a in ASSUMPTIONS.items() if a.trajectory and n not in _LAST]
         without = []
         if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
             without += ["launches", "slopes", "positions", "beam"]
-            without += ["readings-in-km"]  # only curvature would tell
+            without += ["readings-in-km"]  # distinguished by curvature alone
         if not data.launches[:, 4].any():
             without += ["energies"]
         if not any("kick" in own for shot in data.settings for own in shot.values()):
@@ -258,14 +260,14 @@ class Judge:
         return True
 
     def square(self, several: Iterable[Names]) -> float:
-        """Square of the readings' noise in units of the stated one: what the best of several
-        assumptions leaves."""
+        """Variance of the readings in units of the stated one, from the best of several
+        assumptions."""
         found = [self.found(self.assumed(names))[1].level for names in several]
         return max(float(np.nanmin(found)), 1e-12) if np.isfinite(found).any() else 1.0
 
     def verdict(self) -> Verdict | None:
-        """The assumption that makes the data far better, if there is one; two together where that
-        is far better still."""
+        """Return the assumption that improves the data far, if any; two together if that is far
+        better still."""
         several = self.candidates()
         square = self.square([(), *several])
         stated = self.terms((), square)
@@ -292,8 +294,7 @@ class Judge:
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
 
     def _judged(self, names: Names, stated: Terms, square: float) -> Verdict | None:
-        """What an assumption gains, if it changes nearly everything that it changes for the
-        better."""
+        """Return the gain of an assumption that improves nearly all terms that it changes."""
         other = self.terms(names, square)
         if not widely(stated, other, square):
             return None
@@ -302,31 +303,31 @@ class Judge:
         return Verdict(names, gain, levels(stated), levels(other))
 
     def verdicts(self, most: int = 3) -> list[Verdict]:
-        """Global errors one after another, each with those before it undone."""
+        """Return global errors one after another, each with those before it corrected."""
         found: list[Verdict] = []
         judge = self
         while len(found) < most and (own := judge.verdict()) is not None:
             found.append(own)
-            judge = judge.mended(own.names)
+            judge = judge.corrected(own.names)
         return found
 
-    def mended(self, names: Names) -> "Judge":
-        """The same with what is assumed undone."""
+    def corrected(self, names: Names) -> "GlobalErrors":
+        """Return the search with assumptions corrected in the data."""
         data = self.assumed(names)
         sections = {1.0: self._section(self._times(data))}
-        return Judge(self.ring, data, self.known, sections)
+        return GlobalErrors(self.ring, data, self.known, sections)
 
 
 def _same_part(one: str, other: str) -> bool:
-    """Whether two assumptions are about the order of the monitors, about the settings, or about the
-    unit of one thing: of such, one is true."""
+    """Whether two assumptions exclude each other: both about the order of the monitors, about the
+    settings, or about the unit of one quantity."""
     (a, *_), (b, *_) = one.split("-"), other.split("-")
     units = "-in-" in one and "-in-" in other
     return one == other or (a == b and (units or a in ("monitors", "settings")))
 
 
 def _kicks(settings: Sequence[Settings]) -> Array:
-    """All that were set, in their order."""
+    """All set kicks, in order."""
     return np.array([
         own["kick"] for shot in settings for own in shot.values() if "kick" in own
     ])  # fmt: skip

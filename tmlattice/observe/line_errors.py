@@ -1,4 +1,4 @@
-"""What amplitudes of lines are worth: the noise where and when a line is, and how they change."""
+"""Errors of line amplitudes: noise at a line's frequency and turns, and drifts."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,16 +8,15 @@ from tmlattice.observe.line_fit import LineFit
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-FEWEST = 64
-"""Turns from which on half of them tell a change."""
+MIN_TURNS = 64
+"""Turns of which half determine a change."""
 
 
 def floor(fit: LineFit) -> Array:
-    """What noise is over the rms of what is left, [signal]: 1 but where lines are left, as
-    sextupoles make them of a large oscillation. Lines fill few of the frequencies, so the median of
-    the spectrum shows the noise."""
+    """Noise over the rms of the residual, [signal]: 1 unless lines remain, as sextupoles make them
+    of a large oscillation. Lines fill few frequencies: the spectrum's median shows the noise."""
     turns = fit.residual.shape[1]
-    if turns < 2 * FEWEST:
+    if turns < 2 * MIN_TURNS:
         return np.ones(len(fit.residual))
     window = np.hanning(turns + 2)[1:-1]
     power = np.abs(np.fft.rfft(fit.residual * window)[:, 1:]) ** 2
@@ -26,15 +25,14 @@ def floor(fit: LineFit) -> Array:
 
 
 def noise_at(fit: LineFit, line: int, quiet: Array) -> float:
-    """What noise is where a line is, over what it is at all frequencies and turns, at least 1.
+    """Noise at a line over that at all frequencies and turns, at least 1; of the typical signal.
 
-    A line is read in the turns in which its envelope is large, so noise counts as much as it is
-    there, near the line's frequency. The typical signal's is taken.
+    A line is measured in the turns in which its envelope is large, near its frequency.
 
     Args:
         fit: the lines.
-        line: which.
-        quiet: the noise at all frequencies, [signal].
+        line: index of the line.
+        quiet: noise at all frequencies, [signal].
     """
     turns = fit.envelope.shape[1]
     envelope = np.abs(fit.envelope[line])
@@ -49,16 +47,16 @@ def noise_at(fit: LineFit, line: int, quiet: Array) -> float:
 
 
 def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
-    """By how much amplitudes change between two halves of a line's power, the first and the last.
+    """Change of amplitudes between the first and the last half of a line's power, [signal].
 
-    Where amplitude and energy shape the beam's optics, the particles that decohere last have other
-    ratios between monitors than all of them had at first. What both halves share, and what noise
-    makes of the difference, does not count. It is the rms of the real and of the imaginary part,
-    typical for the monitors of a plane, and goes with the amplitude, [signal].
+    Where amplitude and energy shape the optics, the particles that decohere last have other ratios
+    between monitors than all of them had at first. The common change and the noise are subtracted.
+    It is the rms of the real and of the imaginary part, typical for the monitors of a plane, and
+    proportional to the amplitude.
     """
     turns = fit.envelope.shape[1]
     found = np.zeros(len(planes))
-    if turns < FEWEST:
+    if turns < MIN_TURNS:
         return found
     envelope = fit.envelope[line]
     moving = envelope * np.exp(2j * np.pi * fit.frequency[line] * np.arange(turns))
@@ -87,6 +85,6 @@ def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
 
 
 def growth(envelope: ComplexArray) -> complex:
-    """By how much an envelope grows in a turn, on the mean over the line's power."""
+    """Growth of an envelope per turn, averaged over the line's power."""
     power = (np.abs(envelope) ** 2).sum()
     return complex((envelope.conj() * np.gradient(envelope)).sum() / power)

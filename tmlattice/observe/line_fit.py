@@ -1,11 +1,11 @@
-"""Spectral lines that many signals share: each signal's complex amplitude, one envelope for all.
+"""Spectral lines common to many signals: a complex amplitude per signal, one envelope for all.
 
-A signal is read as offset + sum over lines of Re(A g(t) exp(2 pi i f t)). The frequency f and the
-complex envelope g of a line are the same in all signals: what decoherence, chromaticity and
-detuning with amplitude make of a kicked beam is the same for all monitors, so that the ratios of
-the A have no part in it. The fit alternates between two linear least squares: the lines' values of
-each turn, from all signals, and the amplitudes of each signal, from all turns; between them a
-line's values lose what is not near its frequency.
+A signal is offset + sum over lines of Re(A g(t) exp(2 pi i f t)). The frequency f and the complex
+envelope g of a line are the same in all signals, as decoherence, chromaticity and detuning of a
+kicked beam are the same for all monitors; the ratios of the A are unaffected. The fit alternates
+between two linear least squares: the lines' values of each turn, from all signals, and the
+amplitudes of each signal, from all turns. In between a line's values are filtered near its
+frequency.
 """
 
 from collections.abc import Sequence
@@ -24,14 +24,14 @@ Mask = NDArray[np.bool_]
 WIDEST = 0.05
 """Largest half width of a line, in tune: the envelope of a beam that decoheres in 10 turns."""
 NARROW = 0.004
-"""The same of a line that is no betatron line."""
+"""Largest half width of a line that is no betatron line, in tune."""
 ROUNDS = 4
-"""Of the alternation; it starts within the noise of its end, and three rounds reach it."""
+"""Rounds of the alternation: it starts within the noise of its end, and three reach it."""
 QUIETEST = 0.1
-"""Of the typical noise, the least that a signal's is taken to be: none rules over all others."""
+"""Smallest noise of a signal over the typical one, so that none dominates."""
 TINY = 1e-30
 _SMALL = 1e-6
-"""Of an eigenvalue: one monitor alone cannot part the quadratures of a turn; the band does."""
+"""Smallest eigenvalue: one monitor cannot separate the quadratures of a turn; the band does."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class LineFit:
 
     Attributes:
         frequency: in (0, 0.5), [line].
-        frequency_error: rms, from the noise and from how far the line drifts, [line].
+        frequency_error: rms, from the noise and from the line's drift, [line].
         amplitude: complex, in the signals' unit, [signal, line].
         variance: of the real and of the imaginary part, for a noise of 1, [signal, line].
         envelope: complex, mean square 1 and mean phase 0, [line, turn].
-        noise: rms of a reading, from what is left, [signal].
-        residual: what is left, 0 where missing, [signal, turn].
+        noise: rms of a reading, from the residual, [signal].
+        residual: 0 where missing, [signal, turn].
     """
 
     frequency: Array
@@ -61,15 +61,15 @@ def fit_lines(
     data: Array, there: Mask, frequencies: Sequence[float], noise: Array, *,
     broad: int, span: int, rounds: int = ROUNDS,
 ) -> LineFit:  # fmt: skip
-    """Fit lines near these frequencies to all signals at once.
+    """Fit lines near given frequencies to all signals at once.
 
     Args:
         data: [signal, turn], 0 where missing.
-        there: what was read, [signal, turn].
+        there: valid readings, [signal, turn].
         frequencies: of the lines, in (0, 0.5), to within half a bin.
         noise: rms of a reading, for the weights of the signals, [signal].
-        broad: the first so many lines have an envelope; the others are narrow.
-        span: turns from the first on in which the lines stand out: where the fit starts.
+        broad: number of lines with an envelope, the first ones; the others are narrow.
+        span: first turns in which the lines are visible: where the fit starts.
         rounds: of the alternation.
     """
     turns = data.shape[1]
@@ -119,19 +119,18 @@ def least_squares(
     weights: Array | None = None,
     prior: float = 0.0,
 ) -> tuple[Array, Array]:
-    """Coefficients of many signals in one basis, each from what was read of it.
+    """Coefficients of many signals in one basis, each from its valid samples.
 
     Args:
         basis: [sample, function].
         data: [signal, sample], 0 where missing.
-        there: [signal, sample].
+        there: valid samples, [signal, sample].
         weights: of the samples; None: 1.
-        prior: what the coefficients are known to be beforehand, 1 over the square of their size:
-            what no sample shows stays small, instead of being noise.
+        prior: prior precision of the coefficients, so that undetermined ones stay small.
 
     Returns:
         Coefficients and the diagonal of the inverse normal matrix, both [signal, function]; the
-        least of all solutions where functions cannot be told apart.
+        smallest solution where functions cannot be distinguished.
     """
     weighted = basis if weights is None else basis * weights[:, None]
     size = np.sqrt((basis * weighted).sum(axis=0))
@@ -162,7 +161,7 @@ def _quadratures(values: ComplexArray) -> Array:
 
 
 def _widths(lines: Array, broad: int) -> Array:
-    """How far from its frequency a line may reach, in tune: less than half way to the next."""
+    """Half width of each line, in tune: less than half the distance to the next."""
     apart = np.abs(lines[:, None] - lines) + np.eye(len(lines))
     next_one = np.append(apart[:broad, :broad].min(axis=1), apart[broad:].min(axis=1))
     mirror = np.minimum(2 * lines, 1 - 2 * lines)
@@ -171,16 +170,16 @@ def _widths(lines: Array, broad: int) -> Array:
 
 
 def _cosines(width: Array | float, turns: int) -> NDArray[np.int64]:
-    """How many cosines of the turns stay below a width."""
+    """Number of cosines of the turns within a width."""
     return np.maximum(1, np.round(2 * np.asarray(width) * turns)).astype(np.int64)
 
 
 def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[float, ComplexArray]:
-    """Frequency and envelope of a line, of its values turn by turn.
+    """Frequency and envelope of a line from its values by turn.
 
     The envelope is smooth: its slowest cosines, up to the width. The frequency is the peak of the
-    spectrum with the envelope's modulus as window; where a span is given, it is looked for near
-    NAFF's in so many turns.
+    spectrum with the envelope's modulus as window; with a span, it is sought near NAFF's in so many
+    turns.
     """
     turns = len(values)
     turn = np.arange(turns)
@@ -200,7 +199,7 @@ def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[f
 
 
 def _peak(signal: ComplexArray) -> float:
-    """Where the spectrum of a signal with a line near 0 peaks: Newton's method on its square."""
+    """Peak frequency of a signal with a line near 0, by Newton's method on its squared spectrum."""
     turn = np.arange(len(signal)) - (len(signal) - 1) / 2
     at = 0.0
     for _ in range(5):
@@ -209,14 +208,14 @@ def _peak(signal: ComplexArray) -> float:
         slope = -2j * np.pi * (turn * turned).sum()
         bend = -4 * np.pi**2 * (turn**2 * turned).sum()
         below = abs(slope) ** 2 + (value.conjugate() * bend).real
-        if below >= 0:  # no peak here: the line has no steady part
+        if below >= 0:  # no peak: the line has no steady part
             break
         at -= float((value.conjugate() * slope).real / below)
     return at
 
 
 def _frequency_errors(envelopes: ComplexArray, quadrature: Array) -> Array:
-    """Errors of the frequencies, from the noise and from the drift between two halves.
+    """Errors of the frequencies, from noise and from the drift between two halves.
 
     Args:
         envelopes: [line, turn].

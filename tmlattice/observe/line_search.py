@@ -1,4 +1,4 @@
-"""Which lines the turns of a stored beam have: found in all monitors' spectra, then fitted."""
+"""Search for the betatron lines of a stored beam in the spectra of all monitors."""
 
 from collections.abc import Sequence
 
@@ -13,35 +13,35 @@ Mask = NDArray[np.bool_]
 Planes = NDArray[np.int64]
 Near = Sequence[float] | Array | None
 Modes = tuple[int | None, int | None]
-"""The lines of the modes nearer to x and to y; None where there is none."""
+"""Lines of the modes nearer to x and to y; None without a line."""
 
 SLOWEST = 0.02
-"""Lines below this frequency are not betatron lines, where no tune is given: synchrotron motion."""
+"""Smallest frequency of a betatron line, if no tune is given: below is synchrotron motion."""
 AROUND = 0.12
-"""How far from a given tune its line is looked for."""
+"""Distance from a given tune within which its line is sought."""
 SHORTEST = 32
-"""Fewest turns of a longer measurement in which a line is looked for."""
-OTHERS = 3
-"""Most lines beside the betatron lines that are fitted."""
+"""Fewest turns of a longer measurement in which a line is sought."""
+MAX_OTHERS = 3
+"""Largest number of other lines that are fitted."""
 CHANCE = 1e-6
-"""That noise alone makes a line somewhere in the spectrum."""
+"""Probability that noise alone makes a line somewhere in the spectrum."""
 
 
 def betatron_lines(data: Array, there: Mask, planes: Planes, near: Near) -> LineFit:
-    """The fit of up to two betatron lines, the first two, and of others that are seen.
+    """Fit up to two betatron lines, the first two, and other significant lines.
 
-    The strongest line comes first. The second is the strongest of what is left in the plane in
-    which the first is weaker: there the first cannot hide it.
+    The strongest line is the first. The second is the strongest remaining line in the plane in
+    which the first is weaker and cannot hide it.
     """
     noise = np.sqrt((data**2).sum(axis=1) / there.sum(axis=1))
     first, span = _strongest(data, there, [planes == 0, planes == 1], near)
     fit = fit_lines(data, there, [first], noise, broad=1, span=span, rounds=2)
     weak = planes == int(share(fit, planes, 0) > 0.5)
     first = float(fit.frequency[0])
-    second, _ = _strongest(fit.residual, there, [weak], near, apart_from=first)
+    second, _ = _strongest(fit.residual, there, [weak], near, away_from=first)
     chosen = [first] if second == 0 else [first, second]
     fit = fit_lines(data, there, chosen, fit.noise, broad=len(chosen), span=span)
-    others = _others(fit, there, planes)
+    others = _other_lines(fit, there, planes)
     if not others:
         return fit
     chosen = [*fit.frequency, *others]
@@ -53,12 +53,12 @@ def _strongest(
     there: Mask,
     groups: Sequence[Mask],
     near: Near,
-    apart_from: float | None = None,
+    away_from: float | None = None,
 ) -> tuple[float, int]:
-    """Frequency of the line that stands out most in any group of signals, 0 for none.
+    """Frequency of the most significant line in any group of signals, 0 for none, and its turns.
 
-    It is looked for in all turns, in the first quarter of them, ...: a beam that decoheres has its
-    line in the first. The second value is that number of turns.
+    It is sought in all turns, in the first quarter of them, and so on: a beam that decoheres has
+    its line in the first.
     """
     turns = data.shape[1]
     best, found, span = 0.0, 0.0, turns
@@ -66,20 +66,20 @@ def _strongest(
     while length == turns or length >= SHORTEST:
         frequency, power = _power(data[:, :length], there[:, :length])
         allowed = _allowed(frequency, near)
-        if apart_from is not None:
-            allowed &= np.abs(frequency - apart_from) >= 2 / turns
+        if away_from is not None:
+            allowed &= np.abs(frequency - away_from) >= 2 / turns
         for group in groups:
             seen = np.where(allowed, _typical(power[group]), 0.0)
-            if seen.max() > 1.5 * best:  # fewer turns only where they show it better
+            if seen.max() > 1.5 * best:  # fewer turns only if the line is clearer
                 best, found, span = float(seen.max()), float(frequency[seen.argmax()]), length
         length //= 4
     return found, span
 
 
 def _power(data: Array, there: Mask) -> tuple[Array, Array]:
-    """Frequencies and each signal's spectrum in units of its own floor, [signal, frequency].
+    """Frequencies, and each signal's spectrum in units of its own floor, [signal, frequency].
 
-    The floor is told by the quarter of the spectrum that is lowest: lines are elsewhere.
+    The floor is that of the lowest quarter of the spectrum, which has no lines.
     """
     turns = data.shape[1]
     mean = data.sum(axis=1, keepdims=True) / np.maximum(there.sum(axis=1, keepdims=True), 1)
@@ -91,7 +91,7 @@ def _power(data: Array, there: Mask) -> tuple[Array, Array]:
 
 
 def _allowed(frequency: Array, near: Near) -> Mask:
-    """Where a betatron line may be."""
+    """Frequencies at which a betatron line may be."""
     if near is None:
         return (frequency > SLOWEST) & (frequency < 0.5)
     folded = np.abs(np.asarray(near) - np.round(near))
@@ -100,7 +100,7 @@ def _allowed(frequency: Array, near: Near) -> Mask:
 
 
 def _typical(power: Array) -> Array:
-    """The median of the signals, the higher of two: one bad monitor makes no line."""
+    """Upper median of the signals: one bad monitor makes no line."""
     if not len(power):
         return np.zeros(power.shape[1])
     middle = len(power) // 2
@@ -108,40 +108,41 @@ def _typical(power: Array) -> Array:
 
 
 def _seen(signals: int, trials: int) -> float:
-    """What `_typical` of so many signals' noise exceeds in so many trials by CHANCE."""
+    """Level that `_typical` of noise signals exceeds in some of the trials with probability
+    CHANCE."""
     above = signals - signals // 2
     return float(-np.log(betaincinv(above, signals - above + 1, CHANCE / trials)))
 
 
-def _others(fit: LineFit, there: Mask, planes: Planes) -> list[float]:
-    """Lines beside the betatron lines: up to three that stand above the noise."""
+def _other_lines(fit: LineFit, there: Mask, planes: Planes) -> list[float]:
+    """Frequencies of up to three significant lines other than the betatron lines."""
     turns = there.shape[1]
-    if turns < 64:  # the floor is not seen between the lines
+    if turns < 64:  # the floor between the lines is not resolved
         return []
     frequency, power = _power(fit.residual, there)
     seen = [power[planes == plane] for plane in (0, 1)]
     left = np.max([_typical(own) / _seen(*own.shape) for own in seen if len(own)], axis=0)
-    beside = max(2 * NARROW, 6 / turns)
-    left[np.abs(frequency - fit.frequency[:, None]).min(axis=0) < beside] = 0.0
+    width = max(2 * NARROW, 6 / turns)
+    left[np.abs(frequency - fit.frequency[:, None]).min(axis=0) < width] = 0.0
     left[(frequency < 2 / turns) | (frequency > 0.5 - 2 / turns)] = 0.0
     found: list[float] = []
-    while len(found) < OTHERS and left.max() > 1:
+    while len(found) < MAX_OTHERS and left.max() > 1:
         found.append(float(frequency[left.argmax()]))
-        left[np.abs(frequency - found[-1]) < beside] = 0.0
+        left[np.abs(frequency - found[-1]) < width] = 0.0
     return found
 
 
 def share(fit: LineFit, planes: Planes, line: int) -> float:
-    """How much of a line's power, less the noise's, is in x, 0 to 1."""
+    """Share of a line's power, less the noise's, that is in x, 0 to 1."""
     power = np.abs(fit.amplitude[:, line]) ** 2 - 2 * fit.variance[:, line] * fit.noise**2
     x, y = (max(float(_typical(power[planes == p, None])[0]), 0.0) for p in (0, 1))
     return x / (x + y) if x + y > 0 else 0.5
 
 
 def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
-    """The lines of the modes nearer to x and to y; None where none stands above the noise.
+    """Lines of the modes nearer to x and to y; None without a significant line.
 
-    Where one plane was read the second line is none of these, and the tune alone tells the mode.
+    If one plane was measured the second line is none of these: the tune alone identifies the mode.
     """
     read = len(np.unique(planes))
     lines = min(len(fit.frequency), read)
@@ -158,14 +159,14 @@ def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
         if folded is not None and (read == 1 or 0.2 < shares[0] < 0.8):
             mode = int(np.argmin(np.abs(fit.frequency[0] - folded)))
         modes = [0 if mode == 0 else -1, 0 if mode == 1 else -1]
-    kept = [i if i >= 0 and _stands(fit, planes, i) else None for i in modes]
+    kept = [i if i >= 0 and _significant(fit, planes, i) else None for i in modes]
     return kept[0], kept[1]
 
 
-def _stands(fit: LineFit, planes: Planes, line: int) -> bool:
-    """Whether a line is above what an envelope makes of noise, in the plane where it is larger.
+def _significant(fit: LineFit, planes: Planes, line: int) -> bool:
+    """Whether a line exceeds what an envelope makes of noise, in the plane where it is larger.
 
-    Its envelope has picked the largest of so many directions of noise as it has cosines: the
+    Its envelope has picked the largest of as many directions of noise as it has cosines: the
     largest singular value of a random matrix.
     """
     turns = fit.envelope.shape[1]

@@ -1,9 +1,9 @@
 """Products of signatures of first turns, launches projected out.
 
-Most signatures are a launch's own from a reading on (a single kick), or live at one monitor (an
-effect on readings): sums over the readings behind each, taken once, give all their products. The
-others are made in chunks. Two kinds of noise have two ways to do this: readings that are
-independent, and readings that a background of small errors correlates over all shots.
+Most signatures equal a launch's from a reading on (a single kick), or are confined to one monitor
+(an effect on readings): cumulative sums over the readings give all their products. The others are
+formed in chunks. Independent noise, and noise correlated over all shots by distributed errors, have
+separate implementations.
 """
 
 from collections.abc import Sequence
@@ -19,25 +19,25 @@ from tmlattice.inference.whitening import Projection, Whitening
 
 Array = NDArray[np.float64]
 
-ROOM = 20_000_000
-"""Numbers of signatures that are held at once: many shots, and fewer hypotheses at a time."""
+MAX_NUMBERS = 20_000_000
+"""Numbers of signatures in memory: with many shots, fewer hypotheses at a time."""
 KICKS = 128
 """Layers at a time, of free kicks."""
 
 
 def behind(values: Array) -> Array:
-    """Sums over all readings from each one on, [shot, reading, ...] -> [shot, reading + 1, ...]."""
+    """Sums over all readings from each on, [shot, reading, ...] -> [shot, reading + 1, ...]."""
     zero = np.zeros_like(values[:, :1])
     return np.concatenate([np.cumsum(values[:, ::-1], axis=1)[:, ::-1], zero], axis=1)
 
 
 class TurnMetric(Metric):
-    """Products about one set of trajectories; this one makes every signature.
+    """Products at one set of trajectories; this class forms every signature.
 
     Args:
-        model, paths, launches: the base.
+        model, paths, launches: the trajectories.
         whitening, projection: of the data, and of the launches.
-        active: shots in which a cause would be there, [shot].
+        active: shots in which causes act, [shot].
     """
 
     def __init__(
@@ -55,29 +55,29 @@ class TurnMetric(Metric):
         self.active = active
         self.shots = np.flatnonzero(active)
         self.weight = whitening.weight * active[:, None, None]
-        self.chunk = int(np.clip(ROOM // self.weight.size, 1, Metric.chunk))
+        self.chunk = int(np.clip(MAX_NUMBERS // self.weight.size, 1, Metric.chunk))
 
     # --- named hypotheses -----------------------------------------------------------------------
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
-        """Every signature."""
+        """Return every signature."""
         signatures = np.nan_to_num(self.model.signatures(self.paths, hypotheses, self.launches))
         return self.whitening.signature(signatures * self.active[:, None, None])
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Single kicks, and what acts on readings."""
+        """Put in products of single kicks and of effects on readings; return their indices."""
         done = (self.kicks(hypotheses, data, found), self.readings(hypotheses, data, found))
         return np.concatenate(done)
 
     def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in what is a single kick; returns which of the hypotheses these are."""
+        """Put in products of single kicks; return the indices of their hypotheses."""
         return np.zeros(0, dtype=np.intp)
 
     def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in what acts on readings; returns which of the hypotheses these are."""
+        """Put in products of effects on readings; return the indices of their hypotheses."""
         return np.zeros(0, dtype=np.intp)
 
     def _on_readings(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Indices, Indices]]:
-        """By effect on readings: which of the hypotheses, and at which monitors."""
+        """Indices of the hypotheses on readings, and of their monitors, by effect."""
         monitor = {name: m for m, name in enumerate(self.model.maps.monitors)}
         members: dict[str, list[tuple[int, int]]] = {}
         for i, (name, place) in enumerate(hypotheses):
@@ -119,7 +119,7 @@ class TurnMetric(Metric):
         return rows.reshape(len(kicked), 1, -1, len(clean)), clean[None]
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """The same for all readings of a monitor, in every active shot and turn, [monitor, ...]."""
+        """Information of all readings of each monitor, in every active shot and turn."""
         precision = self.whitening.projected_precision(self.projection)
         data = self.whitening.back(clean.reshape(self.whitening.shots, -1)[:, :-5])
         monitors, weight = len(self.model.at), self.whitening.weight
@@ -134,7 +134,7 @@ class TurnMetric(Metric):
 
 
 class IndependentMetric(TurnMetric):
-    """Where every reading has a noise of its own."""
+    """Products with independent noise of the readings."""
 
     @cached_property
     def _slopes(self) -> Array:
@@ -143,7 +143,7 @@ class IndependentMetric(TurnMetric):
 
     @cached_property
     def _known(self) -> Array:
-        """The launches' directions in the readings, [shot, reading, 2, direction]."""
+        """Directions of the launches in the readings, [shot, reading, 2, direction]."""
         shots, readings = self.weight.shape[:2]
         return self.projection.Q[:, :-5].reshape(shots, readings, 2, -1)
 
@@ -153,25 +153,27 @@ class IndependentMetric(TurnMetric):
         return data.reshape(len(data), shots, -1)[:, :, :-5].reshape(-1, shots, readings, 2)
 
     def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Sums over the readings behind each monitor give every product."""
-        which, start, pulled = self.model.single_kicks(self.paths, hypotheses)
+        """Put in products of single kicks, from cumulative sums over the readings."""
+        which, start, launch_kick = self.model.single_kicks(self.paths, hypotheses)
         if not len(which):
             return which
-        pulled = pulled * self.active[:, None, None]
+        launch_kick = launch_kick * self.active[:, None, None]
         slopes = self._slopes
         gram = behind(np.einsum("smpi,smpj->smij", slopes, slopes, optimize=True))
         along = behind(np.einsum("smpi,smpq->smiq", slopes, self._known, optimize=True))
-        whole = np.einsum("ski,skij,skj->k", pulled, gram[:, start], pulled, optimize=True)
-        inside = np.einsum("ski,skiq->skq", pulled, along[:, start], optimize=True)
+        whole = np.einsum(
+            "ski,skij,skj->k", launch_kick, gram[:, start], launch_kick, optimize=True
+        )
+        inside = np.einsum("ski,skiq->skq", launch_kick, along[:, start], optimize=True)
         inner = np.empty((len(which), len(data)))
         for d, row in enumerate(self._rows(data)):
             sums = behind(np.einsum("smpi,smp->smi", slopes, row))
-            inner[:, d] = np.einsum("ski,ski->k", pulled, sums[:, start])
+            inner[:, d] = np.einsum("ski,ski->k", launch_kick, sums[:, start])
         found.put(which, whole, np.einsum("skq,skq->k", inside, inside), inner)
         return which
 
     def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """A signature lives in the readings of one monitor."""
+        """Put in products of effects on readings, each from one monitor's readings."""
         shape = (len(self.active), self.model.turns, len(self.model.at), 2)
         Q, rows = self._known.reshape(*shape, -1), self._rows(data).reshape(-1, *shape)
         done = [np.zeros(0, dtype=np.intp)]
@@ -188,14 +190,14 @@ class IndependentMetric(TurnMetric):
         return np.concatenate(done)
 
     def _free_rows(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
-        """A kick reaches the rows of its own shot alone: shots are the blocks."""
+        """Rows of free kicks; each shot is a block, as a kick acts in its own shot."""
         kicked = self.model.kick_signatures(self.paths, layers)
         rows = self.projection.out(self.whitening.signature(kicked))
         by_shot = rows.reshape(len(kicked), 2, len(self.active), -1).swapaxes(1, 2)
         return by_shot[:, self.shots], clean.reshape(len(self.active), -1)[self.shots]
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """Blocks are shots: a monitor's rows there, less what the launch's directions have."""
+        """Information by shot: a monitor's rows less their part along the launch's directions."""
         monitors, count = len(self.model.at), len(self.active)
         rows = np.arange(self.weight[0].size).reshape(self.model.turns, monitors, 2)
         at = rows.swapaxes(0, 1).reshape(monitors, -1)  # [monitor, turn * plane]
@@ -208,22 +210,21 @@ class IndependentMetric(TurnMetric):
 
 
 class DenseMetric(TurnMetric):
-    """Where a background correlates all readings of all shots, of one turn.
+    """Products with readings of one turn that are correlated over all shots.
 
-    Readings stand monitor by monitor. The launches' signatures behind each monitor have a Gram
-    matrix that grows by that monitor's rows: all of them cost one product of the precision with
-    the slopes.
+    Readings are ordered by monitor. The Gram matrix of the launches' signatures behind a monitor
+    grows by that monitor's rows: all of them cost one product of the precision with the slopes.
     """
 
     @cached_property
     def _precision(self) -> Array:
-        """Less what launches explain, in units of the noise, [monitor shot plane, the same]."""
+        """Precision less the launches' part, in units of the noise, [monitor shot plane, same]."""
         order = np.arange(self.weight.size).reshape(self.weight.shape).swapaxes(0, 1).ravel()
         precision = self.whitening.projected_precision(self.projection)
         return precision[np.ix_(order, order)]
 
     def _block(self, m: int) -> Array:
-        """That of one monitor's readings, [shot plane, shot plane]."""
+        """Block of one monitor's readings, [shot plane, shot plane]."""
         own = slice(2 * len(self.active) * m, 2 * len(self.active) * (m + 1))
         return np.asarray(self._precision[own, own])
 
@@ -239,7 +240,8 @@ class DenseMetric(TurnMetric):
 
     @cached_property
     def _grams(self) -> Array:
-        """Of the launches' signatures from each reading on, [reading + 1, shot n, shot n]."""
+        """Gram matrices of the launches' signatures from each reading on, [reading + 1, shot n,
+        shot n]."""
         slopes = self.weight[..., None] * self._slopes
         shots, monitors, _, n = slopes.shape
         spread = np.zeros((monitors, shots, 2, shots, n))
@@ -256,11 +258,11 @@ class DenseMetric(TurnMetric):
         return grams
 
     def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """A kick's change of the launch, between the Gram matrices of what lies behind."""
-        which, start, pulled = self.model.single_kicks(self.paths, hypotheses)
+        """Put in products of single kicks, from the Gram matrices of the readings behind them."""
+        which, start, launch_kick = self.model.single_kicks(self.paths, hypotheses)
         if not len(which):
             return which
-        stacked = np.moveaxis(pulled, 0, 1).reshape(len(which), -1)  # [kick, shot n]
+        stacked = np.moveaxis(launch_kick, 0, 1).reshape(len(which), -1)  # [kick, shot n]
         whole = np.empty(len(which))
         for m in np.unique(start):
             at = start == m
@@ -268,12 +270,12 @@ class DenseMetric(TurnMetric):
         inner = np.empty((len(which), len(data)))
         for d, row in enumerate(self._data(data)):
             sums = behind(np.einsum("smpi,smp->smi", self._slopes, row))
-            inner[:, d] = np.einsum("ski,ski->k", pulled, sums[:, start])
+            inner[:, d] = np.einsum("ski,ski->k", launch_kick, sums[:, start])
         found.put(which, whole, 0.0, inner)
         return which
 
     def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """One monitor's block of the precision."""
+        """Put in products of effects on readings, from one monitor's block of the precision."""
         rows = self._data(data)
         done = [np.zeros(0, dtype=np.intp)]
         for name, (which, at) in self._on_readings(hypotheses).items():
@@ -287,14 +289,14 @@ class DenseMetric(TurnMetric):
 
     def free_kicks(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
         """One block for all shots: the background correlates them."""
-        first, pulled = self.model.free_kicks(self.paths, layers)  # [layer, 2, shot, n]
+        first, launch_kick = self.model.free_kicks(self.paths, layers)  # [layer, 2, shot, n]
         sums = behind(np.einsum("smpi,smp->smi", self._slopes, self._data(clean[None])[0]))
         size = 2 * len(self.shots)
         gram, inner = np.empty((len(layers), 1, size, size)), np.empty((len(layers), 1, size))
         for k, m in enumerate(first):
-            alone = np.zeros((len(self.shots), 2, len(self.active), pulled.shape[3]))
+            alone = np.zeros((len(self.shots), 2, len(self.active), launch_kick.shape[3]))
             for i, shot in enumerate(self.shots):
-                alone[i, :, shot] = pulled[k, :, shot]
+                alone[i, :, shot] = launch_kick[k, :, shot]
             flat = alone.reshape(size, -1)
             gram[k, 0] = flat @ self._grams[m] @ flat.T
             inner[k, 0] = flat @ sums[:, m].ravel()

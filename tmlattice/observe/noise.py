@@ -1,9 +1,8 @@
-"""The noise of readings where nobody states it: from what neighbours leave unexplained.
+"""Estimates of the readings' noise from neighbouring monitors or from repeated shots.
 
-Between two errors a trajectory is free: the reading of a monitor follows from those of the two
-before it, in each plane. What is left of a reading has the noise of three, with known weights; the
-median over all monitors does not see a few errors. One signal under two names, of monitors at one
-place, counts once: it has no noise against itself.
+Without an error in between, the reading of a monitor follows from those of the two before it, in
+each plane. The remainder has the noise of three readings with known weights; the median over all
+monitors is robust to some errors. Two names of one signal, of monitors at one place, count once.
 """
 
 import numpy as np
@@ -11,18 +10,18 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Paths
 from tmlattice.observe.data import Data
-from tmlattice.observe.sections import Found, Passes
+from tmlattice.observe.sections import Passes, SectionFits
 
 Array = NDArray[np.float64]
 
 SAME_PLACE = 1e-6
-"""m; two monitors nearer to each other stand at one place."""
+"""m; monitors within this distance are at one place."""
 _MAD = 1.4826  # of a Gaussian
 
 
 def local_misfit(data: Data, paths: Paths) -> Array:
-    """Each reading's difference from the model less what its two predecessors make of it, divided
-    by the norm of the weights, [shot, reading, 2]; NaN where it cannot be said."""
+    """Each reading's difference from the model less the prediction from its two predecessors, over
+    the norm of the weights, [shot, reading, 2]; NaN without a prediction."""
     result = np.full(data.valid.shape, np.nan)
     own = _signals(data, paths)
     difference = np.where(data.valid, data.readings - paths.readings, np.nan)[:, own]
@@ -36,13 +35,13 @@ def local_misfit(data: Data, paths: Paths) -> Array:
             size = np.sqrt(1 + a**2 + b**2)
             r = difference[:, :, plane]
             left = (r[:, 2:] - a * r[:, :-2] - b * r[:, 1:-1]) / size
-        # where the weights are large, small model errors are too
+        # large weights amplify small model errors
         result[:, own[2:], plane] = np.where(size < 10, left, np.nan)
     return result
 
 
 def _signals(data: Data, paths: Paths) -> NDArray[np.intp]:
-    """The readings that are no copies, to the last digit, of the one before at the same place."""
+    """Readings that are not identical copies of the one before at the same place."""
     moved = np.abs(np.diff(paths.beam_launch[..., :4], axis=1)).max(axis=(0, 2, 3))
     copied = (np.diff(data.readings, axis=1) == 0) & (data.valid[:, 1:] == data.valid[:, :-1])
     copied = copied.all(axis=(0, 2)) & data.valid[:, 1:].any(axis=(0, 2))
@@ -54,25 +53,24 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def estimate(data: Data, paths: Paths) -> Array:
-    """rms noise of one reading in x and y, m, [2]; NaN for a plane without enough readings."""
+    """rms noise of one reading in x and y, m, [2]; NaN for a plane with too few readings."""
     misfit = local_misfit(data, paths)
     planes = [misfit[:, :, plane][np.isfinite(misfit[:, :, plane])] for plane in (0, 1)]
     return np.array([_MAD * np.median(np.abs(p)) if len(p) > 20 else np.nan for p in planes])
 
 
 LEAST_FREEDOM = 2
-"""Shots beyond those that the errors between neighbours take up, to estimate a scatter."""
+"""Shots beyond those absorbed by errors between neighbours, for an estimate."""
 LEAST_READINGS = 8
-"""Of the median: with two shots beyond, it is known to a fifth then."""
+"""Readings of the median, at least: with two further shots it is known to a fifth."""
 
 
 def scatter(data: Data, paths: Paths) -> Array:
-    """rms noise of one reading from its scatter between shots, m, [2]; NaN without enough shots.
+    """rms noise of one reading from its scatter between shots, m, [2]; NaN with too few shots.
 
-    Static errors (offsets, gains, gradients between neighbours) leave the same of a reading in
-    every shot, or what is linear in the trajectory: that is fitted and taken out, so that small
-    errors are not taken for noise. The median over the readings does not see a fault that only
-    some of the shots have.
+    Static errors (offsets, gains, gradients between neighbours) leave a constant in every shot, or
+    a part linear in the trajectory. That is fitted and subtracted, so that it does not count as
+    noise. The median over the readings is robust to a fault of some shots.
 
     Args:
         data: several shots of one machine.
@@ -84,7 +82,7 @@ def scatter(data: Data, paths: Paths) -> Array:
         for i in range(1, misfit.shape[1]):
             there = np.isfinite(misfit[:, i, plane])
             count = int(there.sum())
-            both = count >= 5 + LEAST_FREEDOM  # the other plane's too, where there are enough
+            both = count >= 5 + LEAST_FREEDOM  # the other plane too, with enough shots
             columns = 4 if both else 2
             freedom = count - columns - 1
             if freedom < LEAST_FREEDOM:
@@ -102,20 +100,20 @@ def scatter(data: Data, paths: Paths) -> Array:
 
 
 SCATTER = 3
-"""Passes beyond those that errors of monitors and magnets take up: a constant, and what is in
-proportion to the trajectory in its plane (or in both, where there are enough)."""
+"""Passes beyond those absorbed by errors of monitors and magnets: a constant, and a part linear in
+the trajectory in its plane (or in both, with enough passes)."""
 PASSES = 5 + SCATTER
-"""From which errors of both planes are taken out."""
+"""Passes from which errors of both planes are subtracted."""
 IN_PROPORTION = 0.015
-"""Share of the orbit that unknown errors leave in proportion to what is not taken up."""
+"""Share of the orbit that unknown errors leave in proportion to what is not subtracted."""
 
 
-def random_part(passes: Passes, found: Found) -> float | None:
-    """How many times its noise a reading scatters from pass to pass.
+def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
+    """Scatter of a reading from pass to pass over its noise; None if it is not determined.
 
-    Small errors everywhere leave the same in every shot, or in proportion to its trajectory: that
-    is taken out, and what is left is noise. None where there are too few passes, or too little is
-    left to tell it from errors of the other plane.
+    Distributed errors leave a constant in every shot, or a part linear in its trajectory: that is
+    subtracted, and the remainder is noise. Too few passes, or too small a remainder compared with
+    errors of the other plane, determine nothing.
     """
     count = len(found.left)
     both = count >= PASSES

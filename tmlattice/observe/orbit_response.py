@@ -1,8 +1,8 @@
-"""What is read of an orbit response with errors of ring, monitors, correctors and beam; and rows.
+"""Orbit response as monitors with errors read it, linearised at those errors.
 
 >>> data = response_data(ring, measured)
 >>> there = Predicted(data, Errors.none(data))
->>> data.orbits - there.read                       # what the design leaves, [column, monitor, 2]
+>>> data.orbits - there.read                       # residual of the design, [column, monitor, 2]
 
 Columns and blocks are those of `response_data`.
 """
@@ -27,29 +27,28 @@ Flags = NDArray[np.bool_]
 Hypothesis = tuple[str, str | None]
 
 DELTA = 1e-3
-"""Energy deviation of the differences that tell what an energy spread does; its square is also
-the unit in which the spread's is fitted."""
+"""Energy step of the differences for an energy spread; its square is the unit of the fitted
+spread."""
 TURN = 0.1
-"""Roll that shows a corrector's kick in the other plane, rad."""
+"""Roll with which a corrector's kick in the other plane is computed, rad."""
 SMALL = 1e-3
-"""Of a monitor's largest error: the step of the differences."""
-OFF = 0.1
-"""Share of what a corrector is told, below which what it kicks says nothing of its plane."""
+"""Step of the differences, as a share of a monitor's largest error."""
+MIN_KICK = 0.1
+"""Kick over the set one below which a corrector's plane is undetermined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """What is wrong with monitors, correctors, ring and beam.
+    """Errors of monitors, correctors, ring and beam.
 
     Attributes:
         monitors: d reading / d beam, [monitor, 2, 2].
         calibration, roll: of the columns, 0 for the RF, [column].
         ring: causes in the ring.
-        energy: relative deviation of the beam's mean energy from the one that its magnets are set
-            for.
+        energy: relative deviation of the beam's mean energy from that of the magnets' settings.
         spread: mean square energy deviation, in units of `DELTA` squared.
-        dispersion: what the RF's orbit has of kicks, see `beam.kicks`, m, [monitor, 2].
-        at_correctors: the dispersion of these kicks in each one's plane, m, [corrector].
+        dispersion: contribution of kicks to the RF's orbit, see `beam.kicks`, m, [monitor, 2].
+        at_correctors: dispersion of these kicks in each corrector's plane, m, [corrector].
     """
 
     monitors: Array
@@ -63,35 +62,34 @@ class Errors:
 
     @classmethod
     def none(cls, data: ResponseData) -> "Errors":
-        """The design."""
+        """Return the design, without errors."""
         columns, monitors = data.shape
         eye = np.tile(np.eye(2), (monitors, 1, 1))
         return cls(eye, np.zeros(columns), np.zeros(columns))
 
     @property
     def turned(self) -> Flags:
-        """Columns of correctors that kick more in the other plane than in their own, and not next
-        to nothing: these are off."""
-        return np.abs(self.roll) > np.maximum(np.abs(1 + self.calibration), OFF)
+        """Correctors whose kick is larger in the other plane than in their own, [column]."""
+        return np.abs(self.roll) > np.maximum(np.abs(1 + self.calibration), MIN_KICK)
 
     @property
     def kick(self) -> Array:
-        """Of both planes, as a share of what a corrector is told; negative for a reversed one,
-        which is told from one that is turned by more than half a right angle, [column]."""
+        """Kick in both planes over the set one, [column]; negative if reversed, which is a turn by
+        more than half a right angle."""
         own = 1 + self.calibration
         return np.where((own < 0) & ~self.turned, -1.0, 1.0) * np.hypot(own, self.roll)
 
     @property
     def angle(self) -> Array:
-        """Of each kick to its plane, rad: a right one where it has nothing in that, [column]."""
+        """Angle of each kick to its plane, rad, [column]."""
         sign = np.sign(self.kick)
         return np.arctan2(sign * self.roll, sign * (1 + self.calibration))
 
     def with_causes(self, data: ResponseData, causes: Sequence[Cause]) -> "Errors":
-        """These and more; an energy spread adds in square.
+        """Return the errors with more causes; an energy spread adds in square.
 
         Raises:
-            EffectError: an effect of the launch, which a closed orbit does not have.
+            EffectError: an effect of the launch, which does not act on a closed orbit.
         """
         ring = list(self.ring)
         scale, energy, spread = np.ones(len(data.kicks)), self.energy, self.spread
@@ -102,7 +100,7 @@ class Errors:
                 energy += cause.amount
             elif isinstance(find(cause.effect), RingEffect):
                 ring.append(cause)
-                if cause.effect == "corrector_calibration":  # of the steps, beside the setting's
+                if cause.effect == "corrector_calibration":  # of the steps; the setting has it too
                     scale[_column(data, cause.element)] *= 1 + cause.amount
             elif not isinstance(find(cause.effect), ReadingEffect):
                 raise EffectError(f"'{cause.effect}' does not act on a closed orbit")
@@ -122,12 +120,12 @@ def _column(data: ResponseData, name: str | None) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What monitors read with some errors, and how it changes: linear about them.
+    """Response with some errors, and its derivatives there.
 
     Attributes:
-        data: correctors, kicks and monitors are its.
-        errors: that are there.
-        bent: what the steps' finite size adds to their linear orbit changes, m; see `bend`.
+        data: the measurement, with correctors, kicks and monitors.
+        errors: of the prediction.
+        bent: correction of the linear orbit changes for finite steps, m; see `bend`.
     """
 
     data: ResponseData
@@ -136,7 +134,7 @@ class Predicted:
 
     @cached_property
     def model(self) -> ResponseModel:
-        """Of the ring with its errors, at the beam's energy; UnstableRingError where it has no
+        """Model of the ring with its errors, at the beam's energy; UnstableRingError without a
         closed orbit."""
         model, errors = self.data.design, self.errors
         if errors.ring:
@@ -146,8 +144,8 @@ class Predicted:
     def orbits(self, model: ResponseModel) -> Array:
         """Orbit changes of the steps, the RF's last, m, [column, monitor, 2].
 
-        The RF's is as large as the dispersion: a step of half a per cent in energy has a third
-        order that is several times the readings' noise.
+        The RF's is not linearised: at half a per cent in energy its third order is several times
+        the readings' noise.
         """
         data = self.data
         steps = model.response(data.measured.correctors) * data.kicks[:-1, None, None]
@@ -162,10 +160,10 @@ class Predicted:
         return np.asarray(whole + self.bent)
 
     def bend(self) -> "Predicted":
-        """With the third order of the correctors' two-sided steps.
+        """Return the prediction with the third order of the correctors' two-sided steps.
 
-        It is a micrometre where the orbit is a millimetre, and the closed orbits of all correctors
-        take seconds: it is taken once a step.
+        It is a micrometre for an orbit of a millimetre. The closed orbits of all correctors take
+        seconds, so it is computed once per step.
         """
         data, names = self.data, self.data.measured.correctors
         kicks = data.kicks[:-1] * (1 + self.errors.calibration[:-1])
@@ -173,21 +171,21 @@ class Predicted:
         linear = self.model.response(names) * kicks[:, None, None]
         bent = np.zeros_like(data.orbits)
         bent[:-1] = (up - down - linear)[:, data.at]
-        bowed = Predicted(data, self.errors, bent)
-        bowed.__dict__["model"] = self.model  # the same ring
-        return bowed
+        finite = Predicted(data, self.errors, bent)
+        finite.__dict__["model"] = self.model  # the same ring
+        return finite
 
     @cached_property
     def straight(self) -> Array:
-        """Orbit changes of one particle, correctors as they are told, m, [column, monitor, 2]."""
+        """Orbit changes of one particle for the set kicks, m, [column, monitor, 2]."""
         return self.orbits(self.model)
 
     @cached_property
     def curved(self) -> Array:
-        """What a mean square energy deviation of `DELTA` squared adds to that.
+        """Change of these by a mean square energy deviation of `DELTA` squared.
 
-        A monitor reads the centroid of particles whose orbits answer each as its energy has it:
-        half the second derivative by the energy, times the mean square.
+        A monitor reads the centroid of particles with different energies: half the second
+        derivative by the energy, times the mean square.
         """
         up, down = self._off_energy
         return np.asarray((up + down) / 2 - self.straight)
@@ -200,8 +198,8 @@ class Predicted:
 
     @cached_property
     def _off_energy(self) -> tuple[Array, Array]:
-        """Orbit changes of one particle `DELTA` above and below; as they are where a ring stores no
-        beam so far off, for that says nothing of it."""
+        """Orbit changes of one particle `DELTA` above and below; the nominal ones if no beam is
+        stored there."""
         try:
             up, down = (self.orbits(self.model.at_energy(side * DELTA)) for side in (1, -1))
         except UnstableRingError:
@@ -222,14 +220,14 @@ class Predicted:
 
     @cached_property
     def beam(self) -> Array:
-        """Orbit changes of the centroid, correctors as told, m, [column, monitor, 2]."""
+        """Orbit changes of the centroid for the set kicks, m, [column, monitor, 2]."""
         if not self.errors.spread:
             return self.straight
         return np.asarray(self.straight + self.errors.spread * self.curved)
 
     @cached_property
     def kicked(self) -> Array:
-        """The beam's orbit changes with the correctors as they are, m, [column, monitor, 2]."""
+        """Orbit changes of the beam for the actual kicks, m, [column, monitor, 2]."""
         errors = self.errors
         beam = (1 + errors.calibration)[:, None, None] * self.beam
         if errors.roll.any():
@@ -237,26 +235,27 @@ class Predicted:
         return np.asarray(beam)
 
     def seen(self, beam: Array) -> Array:
-        """What the monitors make of the beam's orbit changes [..., monitor, 2]."""
+        """Readings of orbit changes [..., monitor, 2] by the monitors."""
         return np.asarray(np.einsum("mij,...mj->...mi", self.errors.monitors, beam))
 
     @cached_property
     def read(self) -> Array:
-        """What monitors read, m, [column, monitor, 2]."""
+        """Predicted readings, m, [column, monitor, 2]."""
         return self.seen(self.kicked)
 
     @cached_property
     def left(self) -> Array:
-        """Measured less this, m, [column, monitor, 2]."""
+        """Residual, measured less predicted, m, [column, monitor, 2]."""
         return np.asarray(self.data.orbits - self.read)
 
     def gain(self, block: int) -> Array:
-        """Of each reading's monitor in the plane that is read, [column, monitor]."""
+        """Gain of each reading's monitor in the plane of a block, [column, monitor]."""
         own = np.diagonal(self.errors.monitors, axis1=1, axis2=2)
         return np.asarray(own[:, self.data.plane_of(block)].T)
 
     def slopes(self, pairs: Sequence[Hypothesis]) -> Iterator[Array]:
-        """d beam's orbit changes / d amount of effects on the ring, m, [column, monitor, 2]."""
+        """Yield d beam's orbit changes / d amount of effects on the ring, m, [column, monitor,
+        2]."""
         data = self.data
         scale = ((1 + self.errors.calibration) * data.kicks)[:, None, None]
         for change in self.response_slopes.factors(pairs):
@@ -264,19 +263,18 @@ class Predicted:
 
     @cached_property
     def response_slopes(self) -> ResponseSlopes:
-        """Of the linear response, at all of the ring's monitors."""
+        """Derivatives of the linear response, at all of the ring's monitors."""
         return ResponseSlopes(self.model, self.data.measured.correctors)
 
     def slopes_of(self, block: int, pairs: Sequence[Hypothesis]) -> Iterator[Array]:
-        """The same, of the plane that a block is read in, m, [column, monitor]: one array, that
-        each overwrites."""
+        """Yield the same in the plane of a block, m, [column, monitor]; one array, overwritten."""
         data = self.data
         scale = ((1 + self.errors.calibration) * data.kicks)[:, None]
         for slope in self.response_slopes.picked(pairs, data.at, data.plane_of(block)):
             yield np.multiply(slope, scale, out=slope)
 
     def rows(self, effect: str, places: Sequence[str], block: int) -> Array:
-        """What the readings of a block do for each error, gains alone, [error, column, monitor]."""
+        """Derivatives of a block's readings, with gains alone, [error, column, monitor]."""
         out = np.empty((len(places), *self.data.shape))
         gain = self.gain(block)
         for own, slope in zip(
@@ -292,18 +290,18 @@ class Predicted:
         columns = model.columns(data.measured.correctors)
         jump = np.zeros((len(columns.names), model.dimension))
         jump[np.arange(len(jump)), 2 * data.plane[:-1]] = 1
-        pulled = np.einsum("cij,cj->ci", model.inverse[columns.layer + 1], jump)
-        before = np.einsum("mai,ci->cma", model.reading_slopes, pulled @ model.closing.T)
-        behind = np.einsum("mai,ci->cma", model.reading_slopes, pulled)
+        launch_kick = np.einsum("cij,cj->ci", model.inverse[columns.layer + 1], jump)
+        before = np.einsum("mai,ci->cma", model.reading_slopes, launch_kick @ model.closing.T)
+        behind = np.einsum("mai,ci->cma", model.reading_slopes, launch_kick)
         whole = before + model.downstream(columns)[:, :, None] * behind
         return np.concatenate([whole[:, data.at], np.zeros((1, len(data.at), 2))])
 
     # --- one cause more ---------------------------------------------------------------------------
     def signatures(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Array]:
-        """d reading / d amount of causes that are added, m, [column, monitor, 2], one by one.
+        """Yield d reading / d amount of additional causes, m, [column, monitor, 2].
 
-        Of an effect that is there or not: the whole change. What a closed orbit does not see (an
-        offset of a monitor) is zero.
+        Of a discrete effect the change; of one without effect on a closed orbit (a monitor's
+        offset) zero.
         """
         on_ring = [h for h in hypotheses if isinstance(find(h[0]), RingEffect)]
         slopes = self.slopes(on_ring)
@@ -328,7 +326,7 @@ class Predicted:
         return out
 
     def monitor(self, name: str | None) -> int:
-        """Which of the measured monitors it is; -1 for none of them."""
+        """Index among the measured monitors; -1 for none."""
         return self._monitors.get(self.data.ring[name or ""].name, -1)
 
     @cached_property
@@ -336,7 +334,7 @@ class Predicted:
         return {self.data.ring[name].name: i for i, name in enumerate(self.data.measured.monitors)}
 
     def monitor_slope(self, name: str, at: int) -> Array:
-        """d reading / d amount of an effect on one of the measured monitors, m, [column, 2]."""
+        """d reading / d amount of an effect on one measured monitor, m, [column, 2]."""
         effect, read, nothing = find(name), self.read[:, at], np.zeros((1, 2))
         assert isinstance(effect, ReadingEffect)
         steps = (1.0, 0.0) if effect.discrete else (SMALL * effect.largest, -SMALL * effect.largest)
@@ -344,5 +342,5 @@ class Predicted:
         return np.asarray((up - down) / (steps[0] - steps[1]))
 
     def with_causes(self, causes: Sequence[Cause]) -> "Predicted":
-        """The same with more causes, not linearised."""
+        """Return the prediction with more causes, not linearised."""
         return Predicted(self.data, self.errors.with_causes(self.data, causes), self.bent)

@@ -1,8 +1,8 @@
-"""Closed orbits, and their changes for steps of the RF.
+"""Closed orbits, and their changes with the RF frequency.
 
-A closed orbit is the sum of all dipole errors and of the monitors' zeros. Its change for a step of
-the RF is the dispersion, in which the zeros cancel; it is not linearised, so that a step of a per
-cent in energy is right.
+A closed orbit is the sum of all dipole errors and of the monitors' offsets. Its change with the RF
+frequency is the dispersion, without the offsets. It is not linearised, so that energy steps of a
+per cent are exact.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,8 +31,8 @@ class Orbits(Stored):
         """No nuisances."""
         return NOTHING
 
-    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
-        """A shot is a state."""
+    def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """Return the readings; a shot is a state."""
         return stacked(states, "orbit")
 
 
@@ -45,18 +45,18 @@ class RfOrbits(Stored):
         """No nuisances."""
         return NOTHING
 
-    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
-        """From half a step below to half a step above."""
+    def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """Return the change from half a step below to half a step above."""
         both = stacked(states, "orbit")
         return np.asarray(both[..., ::2, :, :] - both[..., 1::2, :, :])
 
 
 def closed_orbits(ring: Ring, measured: ClosedOrbit, places: Mapping[str, float]) -> Orbits:
-    """What a measured closed orbit is for an inference.
+    """Return the problem of measured closed orbits.
 
     Raises:
-        MeasurementError: its noise is not known.
-        UnknownNameError: a monitor that the ring does not have.
+        MeasurementError: unknown noise.
+        UnknownNameError: a monitor that is not in the ring.
     """
     whole = measured.in_order_of([monitor.name for monitor in ring.monitors])
     settings: tuple[Settings, ...] = whole.settings or ({},) * len(whole.orbit)
@@ -68,11 +68,11 @@ def closed_orbits(ring: Ring, measured: ClosedOrbit, places: Mapping[str, float]
 
 
 def dispersion(ring: Ring, measured: Dispersion, places: Mapping[str, float]) -> RfOrbits:
-    """What measured orbit changes for the RF's steps are for an inference.
+    """Return the problem of measured orbit changes with the RF frequency.
 
     Raises:
-        MeasurementError: their noise is not known.
-        UnknownNameError: a monitor that the ring does not have.
+        MeasurementError: unknown noise.
+        UnknownNameError: a monitor that is not in the ring.
     """
     whole = measured.in_order_of([monitor.name for monitor in ring.monitors])
     data, errors, used, read_by = _of_monitors(whole.orbits, whole.noise, "dispersion")
@@ -86,12 +86,12 @@ def dispersion(ring: Ring, measured: Dispersion, places: Mapping[str, float]) ->
 def _of_monitors(
     orbits: Array, noise: Array | None, kind: str
 ) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.int64]]:
-    """Data, errors, which there are, and whose they are, all [shot, monitor, 2]."""
+    """Data, errors, validity and monitor of each reading, all [shot, monitor, 2]."""
     there = np.isfinite(orbits)
     sigma = np.broadcast_to(np.nan if noise is None else noise, orbits.shape)
     if not np.isfinite(sigma[there]).all():
         raise MeasurementError(
-            f"the noise of {kind} is not known, and one orbit does not tell it; add it"
+            f"the noise of {kind} is unknown, and one orbit does not determine it; state it"
         )
     at = np.broadcast_to(np.arange(orbits.shape[1])[:, None], orbits.shape)
     return np.where(there, orbits, 0.0), np.where(there, sigma, 1.0), there, at

@@ -1,4 +1,4 @@
-"""What a measured orbit response would be in the model."""
+"""Prediction of a measured orbit response by a model."""
 
 from dataclasses import replace
 
@@ -10,23 +10,23 @@ from tmlattice.measurement import OrbitResponse
 
 
 def predict(model: ResponseModel, measured: OrbitResponse) -> OrbitResponse:
-    """The model's orbit changes for the same correctors, kicks, monitors and RF step.
+    """Return the model's orbit changes for the same correctors, kicks, monitors and RF step.
 
-    Linear in the kicks and in the step; missing readings are there.
+    It is linear in kicks and step, and has no missing readings.
 
     Args:
-        model: six coordinates where the RF was stepped.
-        measured: its numbers are not read, but for kicks and the RF.
+        model: with six coordinates if the RF was stepped.
+        measured: for its names, kicks and RF step.
 
     Raises:
-        UnknownNameError: a corrector or a monitor that the ring does not have.
-        MeasurementError: a corrector that kicks in another plane than the ring's, or is none.
+        UnknownNameError: a corrector or a monitor that is not in the ring.
+        MeasurementError: a corrector of another plane, or an element that is not a corrector.
     """
     columns = model.columns(measured.correctors)
     for name, plane, own in zip(measured.correctors, measured.planes, columns.planes, strict=True):
         if plane != own:
             raise MeasurementError(
-                f"corrector '{name}' is said to kick in {plane}; the ring's kicks in {own}"
+                f"corrector '{name}' is stated to kick in {plane}; the ring's kicks in {own}"
             )
     order = {name: i for i, name in enumerate(model.monitors)}
     ring = model.ring

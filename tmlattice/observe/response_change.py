@@ -1,10 +1,10 @@
-"""What changed between two orbit responses of one ring, as a measurement of its own.
+"""Change between two orbit responses of one ring, as a measurement of its own.
 
 >>> change = response_change(data_before, errors, data_after)
->>> change.orbits                                  # the model before, and what changed since
+>>> change.orbits                                  # the model before plus the measured change
 
-What the model of the first measurement lacks is in the second one too: it cancels in their
-difference. So the difference is put on top of what the model with the errors of the first says.
+Model discrepancy is the same in both measurements and cancels in their difference, which is added
+to the response of the model with the errors of the first.
 """
 
 from collections.abc import Sequence
@@ -22,18 +22,19 @@ from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 
-LEAST = 3
-"""Monitors, and correctors, that both measurements have at least."""
+MIN_SHARED = 3
+"""Common monitors, and correctors, at least."""
 
 
 def alike(
     ring: Ring, before: OrbitResponse, after: OrbitResponse
 ) -> tuple[OrbitResponse, OrbitResponse]:
-    """The correctors and monitors that both have, in the order of the first.
+    """Return both measurements with their common correctors and monitors, in the order of the
+    first.
 
     Raises:
-        MeasurementError: hardly any, or other planes.
-        UnknownNameError: one that the ring does not have.
+        MeasurementError: too few in common, or other planes.
+        UnknownNameError: an element that is not in the ring.
     """
     before, after = (_as_the_ring_names_them(ring, one) for one in (before, after))
     columns = [name for name in before.correctors if name in set(after.correctors)]
@@ -41,7 +42,7 @@ def alike(
     for what, own, all_of in (
         ("correctors", columns, after.correctors), ("monitors", monitors, after.monitors),
     ):  # fmt: skip
-        if len(own) < max(LEAST, len(all_of) // 4):
+        if len(own) < max(MIN_SHARED, len(all_of) // 4):
             raise MeasurementError(
                 f"the reference shares {len(own)} of {len(all_of)} {what}: it is not of this "
                 "machine; give one with the same names"
@@ -62,21 +63,21 @@ def _as_the_ring_names_them(ring: Ring, measured: OrbitResponse) -> OrbitRespons
 
 
 def response_change(
-    before: ResponseData, errors: Errors, after: ResponseData, astray: Array | None = None
+    before: ResponseData, errors: Errors, after: ResponseData, orbit_kicks: Array | None = None
 ) -> ResponseData:
-    """What the second measurement would have been in the ring of the first.
+    """Return the second measurement as it would be in the ring of the first.
 
     Args:
         before: of the design; correctors and monitors as in `after`.
         errors: of ring, monitors, correctors and energy, fitted to it.
         after: the second measurement.
-        astray: kicks of the closed orbit, which make the dispersion that a changed gradient acts
-            on, see `ResponseModel`.
+        orbit_kicks: kicks of the closed orbit, whose dispersion acts with a changed gradient, see
+            `ResponseModel`.
 
     Returns:
-        In the design with the ring's errors, its energy, kicks astray and the correctors' rolls, a
-        measurement by perfect monitors with steps as the correctors really made them: that ring's
-        response to steps of that size, and on top of it the difference of the two.
+        A measurement by perfect monitors with the actual corrector steps, in the design with the
+        ring's errors, energy, orbit kicks and corrector rolls: that ring's response plus the
+        difference of the two measurements.
     """
     columns = before.measured.correctors
     scale = (before.kicks / after.kicks)[:, None, None]
@@ -90,7 +91,7 @@ def response_change(
         kicks=kicks,
         noise=noise,
         energy=errors.energy,
-        astray=astray,
+        orbit_kicks=orbit_kicks,
     )
     orbits = _as_stepped(there) + change
     rf = before.measured.rf
@@ -101,12 +102,12 @@ def response_change(
 
 
 def _as_the_beam(monitors: Array, read: Array, power: int = 1) -> Array:
-    """Readings [..., monitor, 2] as perfect monitors have them, where the other plane is not read
-    by the own gain alone: what a monitor mixes of a change is next to nothing.
+    """Readings [..., monitor, 2] as of perfect monitors; without the other plane's reading by the
+    gain alone, as a mixed change is negligible.
 
     Args:
-        monitors: gains and what mixes the planes, [monitor, 2, 2].
-        read: of the monitors.
+        monitors: gains and coupling, [monitor, 2, 2].
+        read: readings.
         power: of the factors: 2 for variances.
     """
     both = np.einsum("mij,...mj->...mi", np.linalg.inv(monitors) ** power, read)
@@ -115,7 +116,7 @@ def _as_the_beam(monitors: Array, read: Array, power: int = 1) -> Array:
 
 
 def _as_stepped(data: ResponseData) -> Array:
-    """Orbit changes of the ring, as large as the steps make them: they are in both measurements."""
+    """Orbit changes of the ring for these steps, which are in both measurements."""
     there = Predicted(data, Errors.none(data))
     try:
         return there.bend().straight

@@ -1,4 +1,4 @@
-"""A measured orbit response as a ring has it.
+"""A measured orbit response in the order and units of a ring.
 
 >>> data = response_data(ring, measured)
 >>> data.orbits                                    # [column, monitor, 2]
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 NO_RF = 1e-6
-"""Relative step of an RF that was not stepped: its orbit is missing."""
+"""Relative RF step for a measurement without one: its orbit is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +34,13 @@ class ResponseData:
     Attributes:
         ring: the design.
         measured: the response.
-        at: the monitors' places among the ring's, [monitor].
+        at: indices of the monitors among the ring's, [monitor].
         orbits: measured orbit changes, the RF's last, m, [column, monitor, 2].
         kicks: the steps, rad, the RF's relative, [column].
         plane: in which each column kicks, [column].
         noise: rms of a reading, m, [monitor, 2].
-        energy: of the beam beside the one that its magnets are set for, relative.
-        astray: kicks of its closed orbit, rad, see `ResponseModel`, [magnet, 2]; None: there are
-            none.
+        energy: deviation of the beam from the energy of the magnets' settings, relative.
+        orbit_kicks: kicks of the closed orbit, rad, see `ResponseModel`, [magnet, 2]; or None.
     """
 
     ring: Ring
@@ -52,22 +51,22 @@ class ResponseData:
     plane: Indices
     noise: Array
     energy: float = 0.0
-    astray: Array | None = None
+    orbit_kicks: Array | None = None
 
     @property
     def energy_of_rf(self) -> float:
-        """Relative energy that the RF's step makes in the design."""
+        """Relative energy change of the RF's step in the design."""
         return float(self.kicks[-1] * self.design.rf_start[5])
 
     @cached_property
     def design(self) -> ResponseModel:
-        """Of the ring as it is given; UnstableRingError where it has no closed orbit."""
-        model = ResponseModel(self.ring, astray=self.astray)
+        """Model of the design; UnstableRingError without a closed orbit."""
+        model = ResponseModel(self.ring, orbit_kicks=self.orbit_kicks)
         return model.at_energy(self.energy) if self.energy else model
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Columns, monitors."""
+        """Numbers of columns and monitors."""
         return self.orbits.shape[0], self.orbits.shape[1]
 
     def plane_of(self, block: int) -> Indices:
@@ -75,25 +74,25 @@ class ResponseData:
         return self.plane if block == 0 else 1 - self.plane
 
     def pick(self, values: Array, block: int = 0) -> Array:
-        """One plane of [column, monitor, 2] for each column."""
+        """Values [column, monitor, 2] in one plane for each column, [column, monitor]."""
         plane = self.plane_of(block)[:, None, None]
         return np.asarray(np.take_along_axis(values, plane, 2)[..., 0])
 
     def noise_of(self, block: int) -> Array:
-        """rms of each reading, m, [column, monitor]."""
+        """Noise rms of each reading, m, [column, monitor]."""
         return np.asarray(self.noise[:, self.plane_of(block)].T)
 
 
 def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
-    """What was measured, as the ring has it.
+    """Return a measured response in the ring's order.
 
-    Without an RF step, or with an orbit of it that no monitor read (`response_rf`), its column is
-    empty, and only priors tell the correctors' scale from the monitors'. Noise that nobody states
-    is learnt, see `response_noise`.
+    Without an RF step, or with an RF orbit that was not measured (`response_rf`), its column is
+    empty, and only priors separate the scales of correctors and monitors. Unstated noise is
+    estimated, see `response_noise`.
 
     Raises:
-        MeasurementError: no noise, and too few readings to learn it.
-        UnknownNameError: a monitor that the ring does not have.
+        MeasurementError: no noise, and too few readings to estimate it.
+        UnknownNameError: a monitor that is not in the ring.
     """
     names = [monitor.name for monitor in ring.monitors]
     known = {ring[name].name: name for name in measured.monitors}
@@ -123,7 +122,7 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
 
 
 def _without_blanks(measured: OrbitResponse) -> OrbitResponse:
-    """Without the other plane's readings where all of them are 0: they were not taken."""
+    """Drop the other plane's readings if all of them are 0: they were not measured."""
     response = measured.response
     for p, plane in enumerate("xy"):
         rows = np.array([own == plane for own in measured.planes])
@@ -135,7 +134,7 @@ def _without_blanks(measured: OrbitResponse) -> OrbitResponse:
 
 
 def _computed(data: ResponseData) -> bool:
-    """Whether the RF's orbit is the design's own."""
+    """Whether the RF's orbit is the design's."""
     try:
         design = data.design.rf_change(data.kicks[-1])[data.at]
     except UnstableRingError:

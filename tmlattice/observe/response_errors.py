@@ -1,11 +1,11 @@
-"""Which wrong sign, unit or order everywhere makes an orbit response agree with the design.
+"""Global errors of an orbit response: a wrong sign, unit or order of all readings or kicks.
 
->>> judge = ResponseJudge(ring, measured)
->>> judge.verdicts()
+>>> search = ResponseGlobalErrors(ring, measured)
+>>> search.verdicts()
 
-A machine's response is its design's to a tenth or so, column by column; a wrong sign or unit
-everywhere makes nearly all columns of a plane another thing. A single bad corrector is one column,
-a single bad monitor a little of all.
+A machine's response is its design's to a tenth or so, column by column. A wrong sign or unit of all
+readings makes nearly all columns of a plane unrelated to it. A single bad corrector is one column,
+a single bad monitor a small part of all.
 """
 
 from dataclasses import dataclass, replace
@@ -25,36 +25,37 @@ Array = NDArray[np.float64]
 Names = tuple[str, ...]
 
 USUAL = 0.01
-"""Mean square of what the usual errors leave of a column, in units of the column's own: a tenth."""
+"""Mean square misfit of a column by usual errors, relative to the column: a tenth squared."""
 GAIN = 2.5
-"""Log of the misfit that each of the changed columns has to lose in the mean."""
+"""Mean fall of the log misfit that the changed columns need."""
 OF_RF = 1.4
-"""The same of the RF's one orbit, whose size the ring's length gives whatever its errors."""
-STRANGERS, RESEMBLING = 1.5, 0.5
-"""Or: typical misfits before and after, of columns that were strangers and resemble the design."""
+"""The same for the RF's one orbit, whose size follows from the ring's length."""
+UNRELATED, RESEMBLING = 1.5, 0.5
+"""Or: typical misfits before and after, of columns that were unrelated and now resemble the
+design."""
 SCALES, NEAR, SIMILAR = {"kicks-doubled": 2.0, "kicks-halved": 0.5}, 0.15, 0.8
-"""Or: that the typical column's size is so many times the design's, and how near the logarithm is;
-and its correlation with the design's, at least."""
+"""Or: ratio of the typical column to the design's, tolerance of its logarithm, and smallest
+correlation with the design."""
 COLUMNS = 2
-"""At least, that an assumption about correctors or monitors changes: one may be a bad corrector."""
+"""Columns that an assumption must change, at least: one may be a bad corrector."""
 SEEN = 1e-3
-"""Share of the design's square, at the monitors that read, from which a column says something."""
+"""Smallest share of the design's square at the monitors that read a column."""
 SHARE = 0.8
-"""Of the columns that an assumption changes, how many it has to change for the better."""
+"""Share of the changed columns that an assumption must improve."""
 ALIKE = 2.0
-"""Gain below which two assumptions explain the data alike: less than the RF's column tells."""
+"""Gain below which two assumptions are equivalent: less than the RF's column alone."""
 ANOTHER = 1.0
-"""Misfit of the typical column from which the response is of another ring."""
+"""Misfit of the typical column above which the response is of another ring."""
 
 
 @dataclass(frozen=True)
 class ResponseVerdict:
-    """A global error that makes an orbit response far better.
+    """A global error whose correction improves an orbit response far.
 
     Attributes:
         names: assumptions, together.
-        gain: sum over columns of the log of the misfit.
-        before, after: misfit of the typical column that is changed, 0 to 4.
+        gain: sum over columns of the fall of the log misfit.
+        before, after: misfit of the typical changed column, 0 to 4.
         alike: other assumptions that explain the data as well.
     """
 
@@ -66,8 +67,8 @@ class ResponseVerdict:
 
 
 @dataclass(frozen=True)
-class ResponseJudge:
-    """Judges the assumptions about one orbit response.
+class ResponseGlobalErrors:
+    """Search for global errors of one orbit response.
 
     Args:
         ring: the design.
@@ -83,12 +84,12 @@ class ResponseJudge:
 
     @cached_property
     def monitors(self) -> list[str]:
-        """The ring's, in beam order."""
+        """Monitors of the ring, in beam order."""
         return [monitor.name for monitor in self.ring.monitors]
 
     @cached_property
     def design(self) -> OrbitResponse:
-        """What the design would have answered, for steps of one."""
+        """Response of the design to steps of one."""
         data = in_beam_order(self.measured, self.monitors)
         rf = data.rf if data.rf is None else replace(data.rf, step=data.rf.frequency * TINY)
         ones = replace(data, kicks=np.ones(len(data.kicks)), rf=rf)
@@ -96,9 +97,8 @@ class ResponseJudge:
         return predict(ResponseModel(self.ring, 6 if stepped else 4), ones)
 
     def misfit(self, names: Names) -> Array:
-        """Of each column, the RF's last: |measured - design|^2 over the mean of both squares, 0
-        for equal ones, 2 for strangers, 4 for a wrong sign; NaN where nothing was read that the
-        design answers (vertical steps, say, by monitors of x alone)."""
+        """Misfit of each column, the RF's last: |measured - design|^2 over the mean of both
+        squares. 0: equal, 2: unrelated, 4: wrong sign, NaN: no reading of what the design does."""
         data = assume(in_beam_order(self.measured, self.monitors), names, self.monitors)
         read, made = [*data.response], [*(data.kicks[:, None, None] * self.design.response)]
         rf, own = data.rf, self.design.rf
@@ -114,8 +114,7 @@ class ResponseJudge:
         return np.where(seen, left / np.where(seen, size, 1.0), np.nan)
 
     def scale(self) -> float:
-        """Of what the typical column reads over the design's, for correctors; NaN where the typical
-        column resembles the design too little to say so."""
+        """Ratio of the typical corrector's column to the design's; NaN if they are unrelated."""
         read, made = self.measured, self.design
         data = in_beam_order(read, self.monitors)
         there = np.isfinite(data.response)
@@ -129,8 +128,7 @@ class ResponseJudge:
         return float(np.median(both[seen] / design[seen])) if alike > SIMILAR else float("nan")
 
     def rf_scale(self) -> float:
-        """Of the RF's orbit over the design's for its step; NaN where none was read, or one that
-        the design's does not resemble."""
+        """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
         own, made = in_beam_order(self.measured, self.monitors).rf, self.design.rf
         if own is None or made is None or own.orbit is None or made.orbit is None:
             return float("nan")
@@ -143,14 +141,14 @@ class ResponseJudge:
         return both / float(b @ b) if alike and both else float("nan")
 
     def candidates(self) -> list[Names]:
-        """What may be assumed of these data."""
+        """Return the assumptions that these data allow."""
         found: list[Names] = [(n,) for n, a in ASSUMPTIONS.items() if a.response]
         if self.measured.rf is None or self.measured.rf.orbit is None:
             found = [own for own in found if not own[0].startswith("rf")]
         return found
 
     def verdict(self) -> ResponseVerdict | None:
-        """The assumption that makes the data far better, if there is one."""
+        """Return the assumption that improves the data far, if any."""
         stated = self.misfit(())
         found = []
         for names in self.candidates():
@@ -161,11 +159,11 @@ class ResponseJudge:
             if moved.any() and not few and (change[moved] < 0).mean() >= SHARE:
                 gain = -float(change[moved].sum())
                 before, after = (float(np.median(own[moved])) for own in (stated, other))
-                mended = before > STRANGERS and after < RESEMBLING
-                if names[0] in SCALES:  # whatever else is wrong, all correctors say the same
-                    mended |= abs(np.log(self.scale() / SCALES[names[0]])) < NEAR
+                corrected = before > UNRELATED and after < RESEMBLING
+                if names[0] in SCALES:  # common to all correctors, whatever other errors
+                    corrected |= abs(np.log(self.scale() / SCALES[names[0]])) < NEAR
                 least = OF_RF if names[0].startswith("rf") else GAIN
-                if mended or gain > least * moved.sum():
+                if corrected or gain > least * moved.sum():
                     found.append(ResponseVerdict(names, gain, before, after))
         if not found:
             return None
@@ -175,21 +173,21 @@ class ResponseJudge:
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
 
     def verdicts(self, most: int = 4) -> list[ResponseVerdict]:
-        """Global errors one after another, each with those before it undone."""
+        """Return global errors one after another, each with those before it corrected."""
         found: list[ResponseVerdict] = []
         judge = self
         while len(found) < most and (own := judge.verdict()) is not None:
             found.append(own)
-            judge = judge.mended(own.names)
+            judge = judge.corrected(own.names)
         return found
 
-    def mended(self, names: Names) -> "ResponseJudge":
-        """The same with what is assumed undone."""
+    def corrected(self, names: Names) -> "ResponseGlobalErrors":
+        """Return the search with assumptions corrected in the data."""
         data = assume(in_beam_order(self.measured, self.monitors), names, self.monitors)
-        made = ResponseJudge(self.ring, data)
-        made.__dict__["design"] = self.design  # of the same correctors and monitors
+        made = ResponseGlobalErrors(self.ring, data)
+        made.__dict__["design"] = self.design  # same correctors and monitors
         return made
 
 
 TINY = 1e-6
-"""Relative step of the RF that stands for one of 1."""
+"""Relative RF step used in place of a step of 1."""

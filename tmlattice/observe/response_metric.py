@@ -1,9 +1,9 @@
-"""Products of an orbit response's signatures, which are never written out.
+"""Products of an orbit response's signatures without forming them.
 
-What an error of the ring does to a response is a few numbers a column and a few a monitor
-(`beam.response_derivatives.Factors`). So its product with data is that of these numbers with sums
-over the data that are taken once; its square is summed up reading by reading, each with its own
-weight. An error of a monitor is in that monitor's readings alone.
+An error of the ring changes a response by a few numbers per column and per monitor
+(`beam.response_derivatives.Factors`). Its products with data are those of these numbers with sums
+over the data. Its square is summed over readings, each with its weight. An error of a monitor
+affects that monitor's readings alone.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,19 +18,19 @@ from tmlattice.beam.response_squares import squares
 from tmlattice.effects import ReadingEffect, RingEffect, find
 from tmlattice.inference.metric import Hypothesis, Indices, Products
 from tmlattice.observe.orbit_response import Predicted
-from tmlattice.observe.steady import ROOM, SteadyMetric
+from tmlattice.observe.steady import MAX_NUMBERS, SteadyMetric
 
 Array = NDArray[np.float64]
 
 AT_ONCE = 128
-"""Errors whose factors are held at a time: 17 MB for 330 correctors and 246 monitors."""
+"""Errors whose factors are in memory: 17 MB for 330 correctors and 246 monitors."""
 
 
 class ResponseMetric(SteadyMetric):
-    """About one point of a `Response`, which has no nuisances."""
+    """Products at one point of a `Response`, which has no nuisances."""
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Errors of the ring and of monitors."""
+        """Put in products of errors of the ring and of monitors; return their indices."""
         kinds = [find(name) for name, _ in hypotheses]
         on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
         if len(on_ring):
@@ -41,7 +41,7 @@ class ResponseMetric(SteadyMetric):
         return np.concatenate([on_ring, of_monitors])
 
     def pieces(self, hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[Indices, Array]]:
-        """Some monitors at a time, from the factors of all errors of the ring."""
+        """Yield signatures at some monitors at a time, from the factors of all ring errors."""
         kinds = [find(name) for name, _ in hypotheses]
         on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
         of_monitors = np.flatnonzero([isinstance(kind, ReadingEffect) for kind in kinds])
@@ -52,7 +52,7 @@ class ResponseMetric(SteadyMetric):
         places = np.array([self.point.view.monitor(hypotheses[int(i)][1]) for i in of_monitors])
         used, row = self.problem.used, self._numbered()
         measured = np.flatnonzero(used.any(axis=(0, 2)))
-        count = max(ROOM // max(len(hypotheses) * used[:, 0].size, 1), 1)
+        count = max(MAX_NUMBERS // max(len(hypotheses) * used[:, 0].size, 1), 1)
         for start in range(0, len(measured), count):
             group = measured[start : start + count]
             out = []
@@ -70,7 +70,7 @@ class ResponseMetric(SteadyMetric):
             yield np.concatenate(rows), np.concatenate(out, axis=1)
 
     def _numbered(self) -> Indices:
-        """The row of each reading that is used, of the readings' shape."""
+        """Row of each used reading, of the readings' shape."""
         used = self.problem.used
         row = np.zeros(used.shape, dtype=np.intp)
         row[used] = np.arange(np.count_nonzero(used))
@@ -79,7 +79,7 @@ class ResponseMetric(SteadyMetric):
     def _on_ring(
         self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
     ) -> None:
-        """Through their factors."""
+        """Put in products of ring errors, from their factors."""
         here = _Here(self.point.view, self.problem.used, self.problem.sigma)
         sums = here.sums(data)
         factors = here.slopes.factors([hypotheses[i] for i in which])
@@ -91,7 +91,7 @@ class ResponseMetric(SteadyMetric):
     def _of_monitors(
         self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
     ) -> None:
-        """Monitor by monitor: of each the errors have its rows in common."""
+        """Put in products of monitor errors, from each monitor's own rows."""
         used, row = self.problem.used, self._numbered()
         places = np.array([self.point.view.monitor(hypotheses[i][1]) for i in which])
         for at in np.unique(places[places >= 0]):
@@ -105,8 +105,8 @@ class ResponseMetric(SteadyMetric):
 
 @dataclass(frozen=True)
 class _Stack:
-    """Factors of many, stacked, with `seen` as measured monitors tell it in units of the noise; or
-    sums over data, of which products with those are products of signatures with the data.
+    """Stacked factors with `seen` in readings over noise, or sums over data that give products of
+    signatures with the data.
 
     Attributes:
         seen, before, behind: see `Factors`, [many, ...].
@@ -130,7 +130,7 @@ class _Here:
 
     Attributes:
         view: the response.
-        used: readings that are fitted, [column, monitor, 2].
+        used: fitted readings, [column, monitor, 2].
         sigma: noise, m, [monitor, 2].
     """
 
@@ -140,31 +140,31 @@ class _Here:
 
     @property
     def slopes(self) -> ResponseSlopes:
-        """Of the beam's orbit by a unit of each column."""
+        """Derivatives of the beam's orbit for a unit of each column."""
         return self.view.response_slopes
 
     @cached_property
     def scale(self) -> Array:
-        """Of the columns, [column]."""
+        """Step of each column, [column]."""
         return (1 + self.view.errors.calibration) * self.view.data.kicks
 
     @cached_property
     def first(self) -> NDArray[np.intp]:
-        """The first of the measured monitors behind each column's kick, [column]."""
+        """First measured monitor behind each column's kick, [column]."""
         return np.searchsorted(self.view.data.at, self.slopes.first)
 
     def seen(self, slopes: Array) -> Array:
-        """What the measured monitors tell, in noise, of orbits at all [..., monitor, 2, n]."""
+        """Readings over noise of orbit slopes at all monitors, [..., monitor, 2, n]."""
         own = self.view.errors.monitors / self.sigma[:, :, None]
         return np.asarray(own @ slopes[..., self.view.data.at, :, :])
 
     @cached_property
     def readings(self) -> Array:
-        """What they tell of the launch, [monitor, 2, n]."""
+        """Readings over noise by launch, [monitor, 2, n]."""
         return self.seen(self.slopes.readings)
 
     def read(self, changes: Sequence[Factors]) -> _Stack:
-        """As the measured monitors tell them."""
+        """Return the factors as readings of the measured monitors."""
         seen = self.seen(np.stack([change.seen for change in changes]))
         before, behind = (
             np.stack([getattr(change, name) for change in changes]) for name in ("before", "behind")
@@ -172,7 +172,7 @@ class _Here:
         return _Stack(seen, before, behind)
 
     def read_all(self, hypotheses: Sequence[Hypothesis]) -> _Stack:
-        """Of errors of the ring, some at a time."""
+        """Return the factors of ring errors, formed some at a time."""
         factors = self.slopes.factors(hypotheses)
         parts = [
             self.read([next(factors) for _ in hypotheses[start : start + AT_ONCE]])
@@ -182,16 +182,16 @@ class _Here:
                         for name in ("seen", "before", "behind")))  # fmt: skip
 
     def at(self, monitor: int, some: _Stack) -> Array:
-        """Signatures in the readings of one monitor, [error, column, 2]."""
+        """Signatures at one monitor, [error, column, 2]."""
         slopes, late = self.slopes, (monitor >= self.first)[:, None]
-        launch = slopes.start + late * slopes.pulled
+        launch = slopes.start + late * slopes.launch_kick
         orbit = some.seen[:, monitor] @ launch.T  # [error, 2, column]
         change = np.where(late, some.before + some.behind, some.before)
         moved = np.swapaxes(orbit, 1, 2) + change @ self.readings[monitor].T
         return np.asarray(moved * self.scale[:, None])
 
     def sums(self, data: Array) -> _Stack:
-        """Of data [data, row]."""
+        """Sums of data [data, row]."""
         n, columns = self.readings.shape[2], len(self.scale)
         G = self.readings.reshape(-1, n)
         behind = np.repeat(np.arange(len(self.readings)) >= self.first[:, None], 2, axis=1)
@@ -202,19 +202,19 @@ class _Here:
             whole[self.used] = row
             D = whole.reshape(columns, -1) * self.scale[:, None]
             late = np.where(behind, D, 0.0)
-            seen[d] = D.T @ self.slopes.start + late.T @ self.slopes.pulled
+            seen[d] = D.T @ self.slopes.start + late.T @ self.slopes.launch_kick
             before[d], added[d] = D @ G, late @ G
         return _Stack(seen, before, added)
 
     def squares(self, some: _Stack) -> Array:
-        """Of signatures, [error]."""
+        """Squares of signatures, [error]."""
         slopes, n = self.slopes, self.readings.shape[2]
         seen = some.seen.reshape(len(some.seen), -1, n)
         return np.asarray(
             squares(
                 np.ascontiguousarray(np.moveaxis(seen, 2, 1)),
                 np.ascontiguousarray(self.readings.reshape(-1, n).T),
-                np.stack([slopes.start, slopes.start + slopes.pulled]),
+                np.stack([slopes.start, slopes.start + slopes.launch_kick]),
                 np.stack([some.before, some.before + some.behind]),
                 2 * self.first,
                 self.used.reshape(len(self.scale), -1) * self.scale[:, None] ** 2,

@@ -1,8 +1,8 @@
-"""The noise of an orbit response where nobody states it, from the readings alone.
+"""Noise of an orbit response, estimated from its readings.
 
-Between two kicks an orbit is free: what a monitor reads follows from what its neighbours read, in
-the same way for every corrector that does not stand among them (and the energy's share with the
-one neighbour more). What is left of the best such rule has the noise of all its readings.
+Between two kicks an orbit is free: a monitor's reading is a linear function of its neighbours'
+readings, the same for every corrector that is not between them (and with one neighbour more for the
+energy). The residual of the best such function has the noise of all its readings.
 """
 
 from typing import NamedTuple
@@ -18,18 +18,18 @@ from tmlattice.observe.noise import SAME_PLACE
 Array = NDArray[np.float64]
 
 NEIGHBOURS = 4
-"""Readings that a monitor's follows from: two for the orbit, one for the energy, one to spare."""
+"""Neighbours of a monitor: two for the orbit, one for the energy, one more."""
 SPARE = 2
-"""Times as many columns as neighbours at least, for a rule to be fitted."""
+"""Columns over neighbours, at least, for a fit."""
 WRONG = 0.1
-"""Share of the columns that need not follow it: readings that went wrong."""
+"""Share of the columns that may be outliers."""
 OVERSTATED = 3.0
-"""So many times what the readings leave is too large a noise, or a jitter of the beam."""
+"""Ratio to the estimate above which stated noise is too large, or includes beam jitter."""
 _MAD = 1.4826  # of a Gaussian
 
 
 class Places(NamedTuple):
-    """Where monitors and correctors stand, m, and the length of the ring."""
+    """Positions of monitors and correctors, m, and the length of the ring."""
 
     monitors: Array
     correctors: Array
@@ -37,7 +37,7 @@ class Places(NamedTuple):
 
 
 def places(ring: Ring, measured: OrbitResponse) -> Places:
-    """Of a measurement's monitors and correctors."""
+    """Return the positions of a measurement's monitors and correctors."""
     s = [
         np.array([ring[name].s for name in names])
         for names in (measured.monitors, measured.correctors)
@@ -45,13 +45,12 @@ def places(ring: Ring, measured: OrbitResponse) -> Places:
     return Places(s[0], s[1], ring.length)
 
 
-def learnt_noise(measured: OrbitResponse, where: Places) -> Array:
+def estimated_noise(measured: OrbitResponse, where: Places) -> Array:
     """rms of one orbit change, m, [monitor, 2], the same for all monitors of a plane.
 
     Args:
         measured: in beam order.
-        where: its monitors and correctors stand; one signal under two names counts once (see
-            `noise`).
+        where: positions; one signal under two names counts once (see `noise`).
 
     Raises:
         MeasurementError: too few monitors or columns.
@@ -65,23 +64,23 @@ def learnt_noise(measured: OrbitResponse, where: Places) -> Array:
         copied = (np.diff(read, axis=1) == 0).all(axis=0) & (np.diff(s) < SAME_PLACE)
         alone = ~np.append(False, copied)[: len(s)]
         kicked = where.correctors[planes == p]
-        found.append(_left(read[:, alone], s[alone], kicked, where.length))
+        found.append(_residual_noise(read[:, alone], s[alone], kicked, where.length))
     sizes = np.array(found)
     if not np.isfinite(sizes).any():
         raise MeasurementError(
-            "the noise of the readings is not stated, and too few columns or monitors tell it: "
-            "state it"
+            "the noise of the readings is not stated, and too few columns or monitors determine "
+            "it: state it"
         )
     sizes = np.where(np.isfinite(sizes), sizes, np.nanmax(sizes))
     return np.tile(sizes, (len(measured.monitors), 1))
 
 
 def completed(ring: Ring, measured: OrbitResponse) -> Array:
-    """The noise that is stated, m, [monitor, 2]; where a monitor has none, what is usual of its
-    plane, and where no monitor of a plane has, what the readings tell.
+    """Stated noise, m, [monitor, 2]; if missing, that of the plane's typical monitor, or an
+    estimate from the readings.
 
     Raises:
-        MeasurementError: they do not tell it either.
+        MeasurementError: the readings do not determine it.
     """
     shape = (len(measured.monitors), 2)
     noise = np.full(shape, np.nan) if measured.noise is None else np.asarray(measured.noise)
@@ -91,36 +90,36 @@ def completed(ring: Ring, measured: OrbitResponse) -> Array:
             blank = np.isnan(noise) & (np.arange(2) == p)
             noise = np.where(blank, np.median(noise[there, p]), noise)
     if np.isnan(noise).any():
-        noise = np.where(np.isnan(noise), learnt_noise(measured, places(ring, measured)), noise)
+        noise = np.where(np.isnan(noise), estimated_noise(measured, places(ring, measured)), noise)
     return noise
 
 
-def stated_and_shown(ring: Ring, measured: OrbitResponse) -> Array | None:
-    """The typical noise that is stated, and the one that neighbours leave of each other's readings,
-    m, [which, plane]; None where nothing is stated, or too few readings say it."""
+def stated_and_estimated(ring: Ring, measured: OrbitResponse) -> Array | None:
+    """Typical stated noise, and the noise estimated from neighbours, m, [which, plane]; None if
+    nothing is stated, or too few readings determine it."""
     if measured.noise is None:
         return None
     try:
-        shown = learnt_noise(measured, places(ring, measured))
+        shown = estimated_noise(measured, places(ring, measured))
     except MeasurementError:
         return None
     return np.stack([np.nanmedian(measured.noise, axis=0), shown[0]])
 
 
 def overstated(ring: Ring, measured: OrbitResponse) -> bool:
-    """Whether the noise is stated far larger, in one plane, than neighbours leave of each other's
-    readings: it has a jitter of the beam in it, which they share, or is wrong."""
-    both = stated_and_shown(ring, measured)
+    """Whether the noise stated in one plane is far above the estimate from neighbours: it includes
+    beam jitter, which neighbours share, or is wrong."""
+    both = stated_and_estimated(ring, measured)
     return both is not None and bool((both[0] > OVERSTATED * both[1]).any())
 
 
-def _left(read: Array, s: Array, kicked: Array, length: float) -> float:
-    """Of [column, monitor], in beam order; NaN where too few say it.
+def _residual_noise(read: Array, s: Array, kicked: Array, length: float) -> float:
+    """Noise of readings [column, monitor], in beam order; NaN with too few.
 
     Args:
-        read: m, NaN where nothing was read.
-        s: where the monitors stand, m.
-        kicked: where the columns' correctors stand, m.
+        read: m, NaN where missing.
+        s: positions of the monitors, m.
+        kicked: positions of the columns' correctors, m.
         length: of the ring, m.
     """
     left = []

@@ -1,10 +1,10 @@
-"""An orbit response as an inference sees it: few causes, each with its amount, and no nuisances.
+"""An orbit response as an inference problem: a sparse set of causes, and no nuisances.
 
 >>> problem = Response(base=Predicted(data, Errors.none(data)).bend(), used=rows.used, places={})
 >>> explain(Search(problem, hypotheses(data), unnamed=False), fit(problem, (), problem.first))
 
-A held-out corrector is not among the rows; the kick of a fitted one is known, so that its
-calibration is a cause like any other.
+A held-out corrector has no rows. The kick of a fitted one is known, so that its calibration is a
+cause like any other.
 """
 
 from collections.abc import Sequence
@@ -26,11 +26,12 @@ Flags = NDArray[np.bool_]
 
 
 def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> list[Hypothesis]:
-    """What may be wrong alone: effects that a response sees, at every place of the ring. It sees a
-    kick too, by the orbit that this makes in the sextupoles.
+    """Return hypotheses of single causes: effects on a response, at every place of the ring.
+
+    A kick is one of them, by its orbit in the sextupoles.
 
     Args:
-        data: monitors and correctors that were not measured are no places.
+        data: monitors and correctors that were not measured are excluded.
         effects: names; None: all usual ones.
 
     Raises:
@@ -52,18 +53,18 @@ def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> l
 
 @dataclass(frozen=True, kw_only=True)
 class Response(Steady):
-    """Measured orbit changes in a ring with what is known of it.
+    """Measured orbit changes in a ring with known errors.
 
     Attributes:
-        base: what is known, see `Predicted`.
-        used: readings that are fitted, [column, monitor, 2].
+        base: prediction with the known errors, see `Predicted`.
+        used: fitted readings, [column, monitor, 2].
     """
 
     base: Predicted = field(repr=False)
 
     @property
     def first(self) -> Array:
-        """There are no nuisances."""
+        """No nuisances."""
         return NOTHING
 
     @property
@@ -73,40 +74,40 @@ class Response(Steady):
 
     @property
     def sigma(self) -> Array:
-        """m, [monitor, 2]."""
+        """Noise, m, [monitor, 2]."""
         return self.base.data.noise
 
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """A closed orbit has no launch; of the beam it sees the energies."""
+        """Whether a cause acts on a closed orbit; of the beam's, the energies do."""
         effect = find(hypothesis[0])
         return effect.responds or not isinstance(effect, LaunchEffect)
 
     def view(self, causes: Sequence[Cause]) -> Predicted:
-        """What monitors read with these."""
+        """Return the prediction with these causes."""
         return self.base.with_causes(causes)
 
     def read(self, view: Predicted, nuisances: Array) -> Array:
-        """m, [column, monitor, 2]."""
+        """Predicted readings, m, [column, monitor, 2]."""
         return view.read
 
     def signatures(
         self, view: Predicted, nuisances: Array, hypotheses: Sequence[Hypothesis]
     ) -> Array:
-        """m, [hypothesis, column, monitor, 2]."""
+        """Signatures, m, [hypothesis, column, monitor, 2]."""
         out = np.empty((len(hypotheses), *self.used.shape))
         for row, slope in zip(out, view.signatures(hypotheses), strict=True):
             row[:] = slope
         return out
 
     def metric(self, point: Point) -> Metric:
-        """Through factors."""
+        """Return products from factors."""
         return ResponseMetric(self, point)
 
     @property
     def monitors(self) -> Sequence[str]:
-        """Of the measurement."""
+        """Monitors of the measurement."""
         return self.base.data.measured.monitors
 
     def owner(self) -> NDArray[np.int64]:
-        """The monitor of each reading."""
+        """Monitor of each reading."""
         return np.broadcast_to(np.arange(self.used.shape[1])[:, None], self.used.shape)

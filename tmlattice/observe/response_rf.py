@@ -1,7 +1,7 @@
-"""Whether an RF's orbit was read by monitors, or is what a model has for it.
+"""Whether an RF orbit was measured or computed by a model.
 
-A file of a response without a measured dispersion may carry the design's in its place: in a ring of
-equal cells it repeats from cell to cell, to the last digit, where readings have noise.
+A file of a response without a measured dispersion may contain the design's. In a ring of equal
+cells that repeats from cell to cell to the last digit, whereas readings have noise.
 """
 
 import numpy as np
@@ -12,18 +12,18 @@ from tmlattice.measurement import OrbitResponse
 Array = NDArray[np.float64]
 
 SAME = 1e-9
-"""Of the largest reading: what is nearer to another is the same number, computed twice."""
-FEW, ENOUGH = 0.5, 0.75
-"""Share of numbers that differ, at most, of what was computed; and at least of the correctors'
-orbits, which are read with the same digits."""
-NEARER = 0.05
-"""Of the noise, rms: no reading is so near to a model."""
-LEAST = 6
-"""Monitors that it takes to say so."""
+"""Share of the largest reading within which two numbers are the same computed one."""
+MAX_DISTINCT, MIN_DISTINCT = 0.5, 0.75
+"""Share of distinct numbers: at most, in a computed orbit; at least, in the correctors' orbits,
+which have the same number of digits."""
+MAX_MISFIT = 0.05
+"""rms misfit over noise that no measured orbit reaches."""
+MIN_MONITORS = 6
+"""Monitors for a decision, at least."""
 
 
 def read(measured: OrbitResponse) -> bool:
-    """Whether monitors read an orbit of an RF step."""
+    """Whether an orbit of an RF step was measured."""
     if measured.rf is None or measured.rf.orbit is None:
         return False
     in_x = [plane == "x" for plane in measured.planes]
@@ -31,29 +31,29 @@ def read(measured: OrbitResponse) -> bool:
 
 
 def computed(orbit: Array, response: Array) -> bool:
-    """Whether the numbers of an RF's orbit repeat as no readings do.
+    """Whether the numbers of an RF orbit repeat as no readings do.
 
     Args:
-        orbit: in x, m, [monitor], NaN where nothing was read.
+        orbit: in x, m, [monitor], NaN where missing.
         response: of the correctors that kick in x, m, [column, monitor].
     """
     columns = [_differ(own) for own in response]
-    if np.isfinite(orbit).sum() < LEAST or not columns:
+    if np.isfinite(orbit).sum() < MIN_MONITORS or not columns:
         return False
-    return _differ(orbit) <= FEW and bool(np.median(columns) >= ENOUGH)
+    return _differ(orbit) <= MAX_DISTINCT and bool(np.median(columns) >= MIN_DISTINCT)
 
 
 def of_design(orbit: Array, design: Array, noise: Array) -> bool:
-    """Whether an RF's orbit is the design's own: nearer to it than readings are to the truth.
+    """Whether an RF orbit is the design's: nearer to it than readings are to the truth.
 
     Args:
-        orbit: m, [monitor, 2], NaN where nothing was read.
-        design: what the design makes of it, m, [monitor, 2].
+        orbit: m, [monitor, 2], NaN where missing.
+        design: orbit of the design, m, [monitor, 2].
         noise: of a reading, m, [monitor, 2].
     """
     apart = (orbit - design)[:, 0] / noise[:, 0]
     apart = apart[np.isfinite(apart)]
-    return len(apart) >= LEAST and bool(np.sqrt(np.mean(apart**2)) < NEARER)
+    return len(apart) >= MIN_MONITORS and bool(np.sqrt(np.mean(apart**2)) < MAX_MISFIT)
 
 
 def _differ(read: Array) -> float:

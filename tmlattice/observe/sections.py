@@ -1,14 +1,12 @@
-"""A turn cut into sections, each with a trajectory of its own: what holds whatever is wrong
-elsewhere.
+"""Sections of a turn, each with its own trajectory, which isolate a fault.
 
 >>> sections = Sections(ring, measurement)
 >>> found = sections.fit(passes)
 >>> found.misfit                                  # chi-square of each section over its freedom
 
-A single fault spoils the section in which it sits, and the joint behind it; a wrong sign, unit or
-order spoils all. Launches are not needed: the first section tells what they were. Maps are composed
-from the layers' second-order ones, and truncated again: over a part of a turn the third order
-that is lost is far below any noise.
+A single fault spoils its section and the joint behind it; a wrong sign, unit or order spoils all.
+Launches are not needed: the first section determines them. Maps are composed from the layers'
+second-order ones, and truncated: over a part of a turn the lost third order is far below the noise.
 """
 
 from collections.abc import Sequence
@@ -29,22 +27,22 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
 
-_KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates; a pass without RF does not ask for tau
+_KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates, without tau
 WEAK = 1e-8
-"""Of the strongest direction: what a trajectory's directions that nobody reads are held with."""
+"""Weight of unmeasured directions of a trajectory, over the strongest direction's."""
 STEPS = 8
-"""Of Newton's method: the maps are nearly linear."""
+"""Newton steps at most: the maps are nearly linear."""
 TWO = 2
 """Coordinates of a trajectory in a plane, and so readings that determine it."""
-FAR_OFF = 1e15
-"""Sigma that stand for a trajectory which cannot be followed."""
+DIVERGED_SIGMA = 1e15
+"""Residual in sigma of a trajectory that diverges."""
 SETTLED = 1e-2
-"""Change of the typical reading, in units of its noise or of what is left of it, behind which there
-is no further step."""
+"""Change of the typical reading, in units of its noise or residual, below which no further step is
+made."""
 ENERGY = 5e-3
-"""Relative; rms of the energy deviations that a pass may have, in all its sections."""
+"""Relative; prior rms of a pass's energy deviation."""
 MOST = 8
-"""Monitors of a section; four coordinates leave three quarters of their readings to judge."""
+"""Monitors of a section; four coordinates leave three quarters of their readings as a test."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +58,13 @@ class Maps:
     c2: Array
 
     def __call__(self, x: Array) -> tuple[Array, Array]:
-        """Images [..., out] of states [..., 5], and their slopes [..., out, 5]."""
+        """Return images [..., out] of states [..., 5], and their slopes [..., out, 5]."""
         bent = np.einsum("...oij,...j->...oi", self.c2, x)
         image = self.c0 + np.einsum("...oi,...i->...o", self.c1 + bent, x)
         return image, self.c1 + 2 * bent
 
     def after(self, first: "Maps") -> "Maps":
-        """These after others, to second order."""
+        """Return these maps after others, to second order."""
         fed = np.einsum("...oij,...j->...oi", self.c2, first.c0)
         slope = self.c1 + 2 * fed
         bent = np.swapaxes(first.c1, -1, -2)[..., None, :, :] @ self.c2 @ first.c1[..., None, :, :]
@@ -83,7 +81,7 @@ class Maps:
 
 
 def _five(weights: Sequence[Array]) -> Maps:
-    """Stacked weights in six coordinates, as maps of five."""
+    """Stacked weights in six coordinates as maps of five."""
     W0, W1, W2 = weights
     n = W1.shape[-1]
     rows, columns = np.triu_indices(n)
@@ -101,14 +99,14 @@ def _stacked(several: Sequence[Maps]) -> Maps:
 
 @dataclass(frozen=True)
 class Passes:
-    """What was read, pass by pass: a turn of a shot each.
+    """Readings by pass: one turn of one shot each.
 
     Attributes:
-        readings: [pass, monitor, 2], m; NaN where nothing was read.
+        readings: [pass, monitor, 2], m; NaN where missing.
         sigma: noise of a reading, m, [monitor, 2].
-        delta: relative energy deviation, [pass]; it is fitted, and this is where it starts.
+        delta: first guess of the relative energy deviation, which is fitted, [pass].
         shot, turn: of each, [pass].
-        alone: whether each has an energy of its own; else all have what the first guess lacks.
+        alone: whether each pass has its own energy; else all share one correction.
     """
 
     readings: Array
@@ -120,22 +118,22 @@ class Passes:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The trajectories of all sections of all passes.
+class SectionFits:
+    """Trajectories of all sections of all passes.
 
     Attributes:
         left: readings less the trajectory, in units of the noise, [pass, section, reading]; 0 where
-            nothing was read.
-        owner: the monitor of each, [section, reading]; -1 where there is none.
-        there: whether it was read, [pass, section, reading].
-        free: share of its noise that the trajectory does not take up, [pass, section, reading].
+            missing.
+        owner: the monitor of each, [section, reading]; -1 for none.
+        there: whether it was measured, [pass, section, reading].
+        free: share of its noise that the trajectory does not absorb, [pass, section, reading].
         freedom: [pass, section].
         misfit: chi-square over the freedom, [pass, section].
         delta: relative energy deviation, [pass].
         start: trajectories at the sections' starts, [pass, section, 4].
         covariance: of these, [pass, section, 4, 4], at a known energy.
-        energy: what they change by an energy deviation's standard error, [pass, section, 4].
-        end, carried: the trajectories and covariances at the sections' ends.
+        energy: their change by the standard error of the energy, [pass, section, 4].
+        end, carried: trajectories and covariances at the sections' ends.
     """
 
     left: Array
@@ -153,8 +151,7 @@ class Found:
 
     @property
     def level(self) -> float:
-        """Mean square of the noise in units of the stated one, as most sections have it; NaN where
-        none can tell."""
+        """Typical mean square of the noise in units of the stated one; NaN if undetermined."""
         there = self.freedom > 0
         if not there.any():
             return float("nan")
@@ -162,7 +159,7 @@ class Found:
         return float(np.median(self.misfit[there] / usual))
 
     def share(self, passes: Passes) -> float:
-        """What the typical trajectory leaves of its readings: 1 where the readings follow none."""
+        """Share of the readings' rms that the typical trajectory leaves: 1 if it explains none."""
         owner, plane = np.maximum(self.owner, 0), np.arange(self.owner.shape[1]) % 2
         read = np.where(self.there, passes.readings[:, owner, plane], 0.0)
         left = np.where(self.there, self.left * passes.sigma[owner, plane], 0.0)
@@ -176,34 +173,34 @@ class Found:
 
 
 def distance(miss: Array, covariance: Array) -> Array:
-    """Mean square of what is missed, in units of its covariance, [...]."""
+    """Mean square of a mismatch in units of its covariance, [...]."""
     size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), 1e-60))
     even = np.nan_to_num(covariance / size[..., None] / size[..., None, :], posinf=0, neginf=0)
-    miss = np.clip(np.nan_to_num(miss / size, nan=FAR_OFF), -FAR_OFF, FAR_OFF)
+    miss = np.clip(np.nan_to_num(miss / size, nan=DIVERGED_SIGMA), -DIVERGED_SIGMA, DIVERGED_SIGMA)
     solved = np.linalg.solve(even + 1e-9 * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
     return np.asarray(np.einsum("...i,...i->...", miss, solved) / miss.shape[-1])
 
 
-def openness(covariance: Array) -> float:
-    """Sum of the logs of their determinants' roots: how little is known, [..., n, n]."""
+def log_uncertainty(covariance: Array) -> float:
+    """Sum of the log root determinants of covariances [..., n, n]."""
     covariance = np.nan_to_num(covariance, nan=1e30, posinf=1e30, neginf=-1e30)
     sign, log = np.linalg.slogdet(covariance)
     diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), 1e-60)).sum(axis=-1)
-    return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: one direction hides all
+    return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: use the diagonal
 
 
 class Sections:
-    """The sections of a turn of a ring, with the settings of some shots.
+    """Sections of a turn of a ring, with the settings of some shots.
 
     Args:
         ring: the design.
         settings: of each shot.
-        monitors: places of those that were read among the ring's, rising.
-        known: causes that the model holds.
+        monitors: indices among the ring's of those with readings, rising.
+        known: causes in the model.
 
     Attributes:
         monitors: as given.
-        group: which settings each shot has, [shot].
+        group: index of each shot's settings, [shot].
     """
 
     def __init__(
@@ -231,7 +228,7 @@ class Sections:
         self._exits = exits
 
     def with_kicks(self, factor: float) -> "Sections":
-        """The same with what the settings change multiplied: maps are linear in kicks."""
+        """Return the sections with the settings' changes multiplied: maps are linear in kicks."""
         made = copy(self)
         made.__dict__.pop("_made", None)
         made._steps = Maps(*(
@@ -243,8 +240,8 @@ class Sections:
 
     @cached_property
     def _made(self) -> tuple[Maps, Maps]:
-        """From the start of each section to its monitors [group, monitor], and to its end [group,
-        section]: all sections side by side, step by step."""
+        """Maps from the start of each section to its monitors [group, monitor], and to its end
+        [group, section]; all sections at once, step by step."""
         groups, count = len(self._steps.c0), len(self._bounds)
         first = np.array([start for start, _ in self._bounds])
         length = np.array([end - start for start, end in self._bounds])
@@ -255,7 +252,7 @@ class Sections:
             np.zeros((groups, count, 5, 5, 5)),
         )
         section = np.concatenate([np.full(len(own), w) for w, own in enumerate(self._members)])
-        at = self._exits - first[section]  # steps into its section
+        at = self._exits - first[section]  # steps within the section
         seen = Maps(*(np.zeros_like(c) for c in (reads.c0, reads.c1, reads.c2)))
         for step in range(int(length.max()) + 1):
             here = np.flatnonzero(at == step)
@@ -270,8 +267,8 @@ class Sections:
                     getattr(way, name)[:, go] = getattr(moved, name)
         return seen, way
 
-    def fit(self, passes: Passes) -> Found:
-        """The trajectory of each section that its own readings ask for."""
+    def fit(self, passes: Passes) -> SectionFits:
+        """Fit the trajectory of each section to its own readings."""
         seen, way = self._made
         group = self.group[passes.shot]
         width = max(len(own) for own in self._members)
@@ -286,7 +283,7 @@ class Sections:
         sigma = np.where(there, passes.sigma[owner], np.inf)
         count = np.asarray(there.sum(axis=2), dtype=np.int64)  # [pass, section, plane]
         freedom = np.maximum(count - TWO, 0).sum(axis=2)
-        prior = _unread(passes, maps.c1, padded, count)
+        prior = _prior_precision(passes, maps.c1, padded, count)
         x = np.zeros((P, W, 5))
         x[..., 4] = passes.delta[:, None]
         moved, by_energy = np.inf, np.zeros((P, W, 4))
@@ -295,7 +292,7 @@ class Sections:
                 image, slope = maps(x[:, :, None])
                 left = np.where(there, (data - image) / sigma, 0.0).reshape(P, W, -1)
                 A = (slope[..., :4] / sigma[..., None]).reshape(P, W, -1, 4)
-                curvature = _held(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
+                curvature = _regularised(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
                 if step == STEPS - 1 or not moved > SETTLED:
                     break
                 own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
@@ -304,10 +301,12 @@ class Sections:
                 step_4 = (back @ left[..., None] - pull)[..., 0]
                 fitted = (A @ step_4[..., None])[..., 0]
                 drift = -(back @ own[..., None])[..., 0]  # of the trajectories, by the energy
-                inner = _told(left - fitted, own + (A @ drift[..., None])[..., 0], freedom)
+                inner = _energy_terms(left - fitted, own + (A @ drift[..., None])[..., 0], freedom)
                 ends = way[group[:, None], np.arange(W)](x)
                 outer = _joints(x[..., :4], ends, step_4, drift, _inverse(curvature))
-                change, known = _shared(inner, outer, passes.delta - x[:, 0, 4], passes.alone)
+                change, known = _common_energy(
+                    inner, outer, passes.delta - x[:, 0, 4], passes.alone
+                )
                 by_energy = drift / np.sqrt(known)[:, None, None]
                 moved = float(np.nanmedian(np.abs(fitted)))
                 moved = max(moved, float(np.nanmax(np.abs(change) * np.sqrt(known))))
@@ -319,7 +318,7 @@ class Sections:
         covariance = _inverse(curvature)
         end, slope = way[group[:, None], np.arange(W)](x)
         J = slope[..., :4, :4]
-        return Found(
+        return SectionFits(
             left=left,
             owner=np.repeat(owner, 2, axis=1),
             there=there.reshape(P, W, -1),
@@ -335,7 +334,7 @@ class Sections:
         )
 
     def carried(self, launches: Array, shot: Places, turns: int) -> tuple[Array, Array]:
-        """Launches [pass, 5] of shots, carried through whole turns, and the slopes [pass, 4, 4]."""
+        """Launches [pass, 5] of shots after whole turns, and the slopes [pass, 4, 4]."""
         _, way = self._made
         x, J = launches.copy(), np.tile(np.eye(4), (len(launches), 1, 1))
         for _ in range(turns):
@@ -346,21 +345,20 @@ class Sections:
         return x, J
 
 
-Told = tuple[Array, Array, Array]
-"""What some terms [pass, term] say of the energy: their misfit, and the right and the left side of
-the equation for it."""
+EnergyTerms = tuple[Array, Array, Array]
+"""Terms [pass, term] of the energy's equation: their misfit, right side and left side."""
 
 
-def _told(left: Array, slope: Array, freedom: NDArray[np.int64]) -> Told:
-    """Of readings, cleaned of the trajectories of their sections, [pass, section, reading]."""
+def _energy_terms(left: Array, slope: Array, freedom: NDArray[np.int64]) -> EnergyTerms:
+    """Terms of readings, projected off the trajectories of their sections."""
     misfit = np.where(freedom > 0, (left**2).sum(axis=2) / np.maximum(freedom, 1), np.inf)
     return misfit, (left * slope).sum(axis=2), (slope**2).sum(axis=2)
 
 
 def _joints(
     start: Array, ends: tuple[Array, Array], step: Array, drift: Array, covariance: Array
-) -> Told:
-    """Of the joints between sections, the trajectories' next step taken."""
+) -> EnergyTerms:
+    """Terms of the joints between sections, after the next step of the trajectories."""
     J = ends[1][..., :4, :4]
     end = ends[0][..., :4] + (J @ step[..., None])[..., 0]
     pushed = (J @ drift[..., None])[..., 0] + ends[1][..., :4, 4]
@@ -379,13 +377,15 @@ def _joints(
     )
 
 
-def _shared(inner: Told, outer: Told, prior: Array, alone: bool) -> tuple[Array, Array]:
-    """What sections and joints of a pass, or of all passes, say together of the energy, [pass], and
-    one over its variance; a term that a fault spoils says little.
+def _common_energy(
+    inner: EnergyTerms, outer: EnergyTerms, prior: Array, alone: bool
+) -> tuple[Array, Array]:
+    """Common energy of the sections and joints of a pass, or of all passes, [pass], and its inverse
+    variance; terms spoilt by a fault have little weight.
 
     Args:
         inner, outer: of sections, of joints.
-        prior: where the energy is expected to be, [pass].
+        prior: expected energy, [pass].
         alone: see `Passes`.
     """
     asked, known = prior / ENERGY**2, np.full(len(prior), 1 / ENERGY**2)
@@ -403,16 +403,18 @@ def _shared(inner: Told, outer: Told, prior: Array, alone: bool) -> tuple[Array,
     return np.full(count, asked.sum() / known.sum()), np.full(count, known.sum())
 
 
-def _unread(passes: Passes, slopes: Array, members: Flags, count: NDArray[np.int64]) -> Array:
-    """Precision of the prior of each coordinate, [pass, section, 4]; 0 in a plane that was read.
+def _prior_precision(
+    passes: Passes, slopes: Array, members: Flags, count: NDArray[np.int64]
+) -> Array:
+    """Prior precision of each coordinate, [pass, section, 4]; 0 in a plane with readings.
 
-    In a plane with fewer than two readings a trajectory is expected to be as large as what was read
-    of the turn. Sextupoles would else let it go anywhere for the sake of the other plane.
+    With fewer than two readings in a plane the prior is as large as the turn's readings. Without it
+    sextupoles would let the trajectory diverge to fit the other plane.
 
     Args:
-        passes: what was read.
+        passes: the readings.
         slopes: d readings / d coordinate of the design, [pass, section, monitor, 2, 5].
-        members: which of the monitors there are, [section, monitor].
+        members: which monitors exist, [section, monitor].
         count: of the readings, [pass, section, 2].
     """
     size = np.sqrt(np.nanmean(passes.readings**2, axis=(1, 2)))[:, None, None, None]
@@ -428,8 +430,8 @@ def _inverse(curvature: Array) -> Array:
     return np.asarray(np.linalg.inv(curvature), dtype=float)
 
 
-def _held(curvature: Array) -> Array:
-    """Normal equations [..., 4, 4] in which no direction is free."""
+def _regularised(curvature: Array) -> Array:
+    """Normal equations [..., 4, 4] regularised in every direction."""
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", curvature), 0.0))
     scale = np.where(np.isfinite(scale), scale, 0.0)
     largest = np.maximum(scale.max(axis=-1, keepdims=True), 1e-30)

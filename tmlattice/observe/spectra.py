@@ -1,16 +1,16 @@
-"""The betatron lines of a stored beam's turns: tunes, and each monitor's complex amplitudes.
+"""Betatron lines of a stored beam's turns: tunes, and each monitor's complex amplitudes.
 
 >>> found = lines(turns, near=optics.tunes % 1)
 >>> found.tune                                          # [shot, mode], fractions
 >>> found.amplitude                                     # [shot, monitor, plane, mode], complex, m
->>> found.said                                          # what could not be used, and why
+>>> found.warnings                                      # data that could not be used, and why
 
 The reading of turn t is offset + Re(A1 g1(t) exp(2 pi i Q1 t)) + Re(A2 g2(t) exp(2 pi i Q2 t)) +
-noise, with t counted from turn 0 of the measurement. The complex envelopes g are one for all
-monitors of a shot (see `line_fit`), with mean square 1 and mean phase 0: 1 for a steady line. What
-decoherence does is in g, and the ratios of A between monitors and planes are those of the
-eigenvector; one complex scale of each mode and shot remains, which nobody knows. Other lines
-(synchrotron motion, harmonics) are fitted beside and dropped.
+noise, with t counted from turn 0 of the measurement. The complex envelopes g are common to all
+monitors of a shot (see `line_fit`), with mean square 1 and mean phase 0: 1 for a steady line.
+Decoherence is in g. The ratios of A between monitors and planes are those of the eigenvector; one
+complex scale of each mode and shot is unknown. Other lines (synchrotron motion, harmonics) are
+fitted and dropped.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,40 +31,38 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
-APART = 2.2
-"""Of a bin of the spectrum (1 / turns): lines that are nearer are not parted."""
-NOT_ONE = 3.0
-"""Times the noise elsewhere, beside a line: more than that is another line."""
+RESOLUTION = 2.2
+"""Bins of the spectrum (1 / turns) within which two lines are not resolved."""
+MAX_SIDE_NOISE = 3.0
+"""Noise near a line over that elsewhere above which there is another line."""
 IMPURE = (
-    "what is left beside the line of mode {} is more than noise: it is not one mode, or two tunes "
+    "the residual near the line of mode {} exceeds the noise: it is not one mode, or two tunes "
     "are nearly equal"
 )
-SPIKE = 8.0
-"""Of the noise: a reading so far off is no reading."""
+OUTLIER = 8.0
+"""Residual over noise above which a reading is rejected."""
 
 
 @dataclass(frozen=True)
 class Lines:
     """Betatron lines of the turns of a stored beam.
 
-    Modes are (1, 2): the one nearer to x, and to y. Planes are (x, y). Everything is NaN where it
-    could not be had.
+    Modes are (1, 2): the one nearer to x, and to y. Planes are (x, y). Missing values are NaN.
 
     Attributes:
         monitors: names.
         shots: ids.
-        tune: fraction in [0, 1) where tunes were given to be near to, else in (0, 0.5), [shot,
-            mode].
+        tune: fraction in [0, 1) if tunes were given, else in (0, 0.5), [shot, mode].
         tune_error: its rms, from noise and drift, [shot, mode].
         amplitude: A, complex, m, [shot, monitor, plane, mode]. For 1 - Q instead of Q it is the
             complex conjugate.
-        error: rms of its real and of its imaginary part, but for the scale that all monitors
-            share, m, [shot, monitor, plane, mode]: from the noise where and when the line is, and
-            from how far ratios of monitors change while the beam decoheres.
-        noise: rms of one reading, from what no line explains, m, [monitor, plane].
+        error: rms of its real and of its imaginary part, without the common scale of all monitors,
+            m, [shot, monitor, plane, mode]: from the noise at the line, and from the change of
+            ratios between monitors while the beam decoheres.
+        noise: rms of one reading, from the residual, m, [monitor, plane].
         turns: used of each shot, [shot].
-        envelope: g, complex, [shot, mode, turn]; 0 behind the turns that were used.
-        said: a sentence for each thing that could not be used, or is doubtful.
+        envelope: g, complex, [shot, mode, turn]; 0 behind the used turns.
+        warnings: a sentence for all data that could not be used, or are doubtful.
     """
 
     monitors: tuple[str, ...]
@@ -76,33 +74,33 @@ class Lines:
     noise: Array
     turns: NDArray[np.int64]
     envelope: ComplexArray
-    said: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Lines:
-    """The betatron lines of every shot.
+    """Return the betatron lines of every shot.
 
     Args:
         turns: the measurement.
-        near: fractional tunes (x, y) in [0, 1) of a model: lines are looked for within 0.12 of
-            them, and they tell Q from 1 - Q, which no spectrum of positions does.
-        at: where in the turn each monitor stands, s / C, [monitor]: the envelope of a later one is
-            later. None: monitors stand evenly, in their order.
+        near: fractional tunes (x, y) in [0, 1) of a model: lines are sought within 0.12 of them,
+            and they distinguish Q from 1 - Q, which positions cannot.
+        at: position of each monitor in the turn, s / C, [monitor]: the envelope of a later one is
+            later. None: monitors are equidistant, in their order.
 
     Raises:
         TooFewTurnsError: no shot has 16 turns with a beam.
 
     Source: J. Laskar, Physica D 67 (1993) 257, for NAFF; C. Wang et al., Phys. Rev. ST Accel.
-    Beams 6 (2003) 104001, for what all monitors see in common.
+    Beams 6 (2003) 104001, for modes common to all monitors.
     """
     shots, _, monitors, _ = turns.readings.shape
     place = np.arange(monitors) / monitors if at is None else np.asarray(at, dtype=float)
     signals = np.moveaxis(turns.readings, 1, 3).reshape(shots, 2 * monitors, -1)
     found = _empty(turns)
-    said: Said = {}
+    warnings: Warnings = {}
     noise: list[Array] = []
     for i, shot in enumerate(turns.shots):
-        own = _shot(signals[i], near, partial(_say, said, shot))
+        own = _shot(signals[i], near, partial(_warn, warnings, shot))
         if own is None:
             continue
         fit, usable, modes = own
@@ -116,8 +114,8 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
             if line is None:
                 continue
             louder = noise_at(fit, line, quiet)
-            if louder > NOT_ONE:
-                _say(said, shot, IMPURE.format(mode + 1))
+            if louder > MAX_SIDE_NOISE:
+                _warn(warnings, shot, IMPURE.format(mode + 1))
             mirrored = near is not None and near[mode] % 1 > 0.5
             turned = np.conj if mirrored else np.asarray
             found.tune[i, mode] = abs(mirrored - fit.frequency[line])
@@ -131,16 +129,16 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
             errors[usable, mode] = np.hypot(own_error, change(fit, line, planes))
     if not noise:
         raise TooFewTurnsError(
-            f"no shot has {MIN_TURNS} turns with a beam: there is no tune in them; "
+            f"no shot has {MIN_TURNS} turns with a beam, too few for a tune; "
             "give them as first turns"
         )
     with np.errstate(invalid="ignore"):
         squares = np.array(noise) ** 2
         counted = np.isfinite(squares).sum(axis=0)
         found.noise[:] = np.sqrt(np.nansum(squares, axis=0) / counted).reshape(-1, 2)
-    sentences = [f"{_shots(own)}: {what}" for what, own in said.items()]
+    sentences = [f"{_shots(own)}: {what}" for what, own in warnings.items()]
     sentences += _silent(turns, found.noise) + _louder(turns, found.noise)
-    return replace(found, said=tuple(sentences))
+    return replace(found, warnings=tuple(sentences))
 
 
 def _empty(turns: TurnByTurn) -> Lines:
@@ -155,16 +153,16 @@ def _empty(turns: TurnByTurn) -> Lines:
         noise=np.full((monitors, 2), np.nan),
         turns=np.zeros(shots, dtype=np.int64),
         envelope=np.zeros((shots, 2, number), dtype=complex),
-        said=(),
+        warnings=(),
     )
 
 
-Said = dict[str, list[int]]
-"""Sentences with the shots that they are said of."""
+Warnings = dict[str, list[int]]
+"""Warnings, with the shots that they concern."""
 
 
-def _say(said: Said, shot: int, sentence: str) -> None:
-    said.setdefault(sentence, []).append(shot)
+def _warn(warnings: Warnings, shot: int, sentence: str) -> None:
+    warnings.setdefault(sentence, []).append(shot)
 
 
 def _shots(ids: Sequence[int]) -> str:
@@ -172,38 +170,41 @@ def _shots(ids: Sequence[int]) -> str:
 
 
 def _shot(
-    signals: Array, near: Near, say: Callable[[str], None]
+    signals: Array, near: Near, warn: Callable[[str], None]
 ) -> tuple[LineFit, Mask, Modes] | None:
-    """Lines of one shot [signal, turn], the signals that have any, and which line is which mode."""
+    """Lines of one shot [signal, turn], the signals that have any, and the line of each mode."""
     there = np.isfinite(signals)
     with_beam = there.sum(axis=0) >= 0.5 * there.sum(axis=0).max()
     last = len(with_beam) - int(with_beam[::-1].argmax()) if with_beam.any() else 0
     if last < len(with_beam):
-        say(f"the beam is read for {last} turns of {len(with_beam)}: those are used")
+        warn(f"the beam is read for {last} turns of {len(with_beam)}: these are used")
     if last < MIN_TURNS:
-        say(f"{last} turns are too few for a tune; {MIN_TURNS} at least do")
+        warn(f"{last} turns are too few for a tune; at least {MIN_TURNS} are needed")
         return None
     there, signals = there[:, :last], signals[:, :last]
     usable = (there.sum(axis=1) >= max(MIN_TURNS, last // 4)) & _moves(signals, there)
     if not usable.any():
-        say(f"no monitor has {MIN_TURNS} turns of a beam that moves")
+        warn(f"no monitor has {MIN_TURNS} turns of a beam that moves")
         return None
     there = there[usable]
     data = np.where(there, signals[usable], 0.0)
     planes = np.tile([0, 1], len(signals) // 2)[usable]
     fit = betatron_lines(data, there, planes, near)
     off = np.abs(fit.residual) / _robust(fit.residual, there)[:, None]
-    wild = off > SPIKE * np.maximum(1.0, np.median(off, axis=0))  # not what all monitors see
-    if wild.any() and wild.mean() < 0.05:
-        say(f"readings more than {SPIKE:g} times the noise off what was fitted are left out")
-        there = there & ~wild
+    outlier = off > OUTLIER * np.maximum(1.0, np.median(off, axis=0))  # not of all monitors
+    if outlier.any() and outlier.mean() < 0.05:
+        warn(f"readings more than {OUTLIER:g} times the noise from the fit are rejected")
+        there = there & ~outlier
         fit = betatron_lines(data * there, there, planes, near)
     modes = which(fit, planes, near)
     apart = np.abs(np.diff(fit.frequency[:2]))
-    if None not in modes and apart < APART / last:
-        say(f"the tunes are closer than {APART / last:.2g}: {last} turns do not part their lines")
+    if None not in modes and apart < RESOLUTION / last:
+        warn(
+            f"the tunes are closer than {RESOLUTION / last:.2g}: "
+            f"{last} turns do not resolve their lines"
+        )
         return fit, usable, (None, None)
-    _doubts(fit, planes, modes, say)
+    _doubts(fit, planes, modes, warn)
     return fit, usable, modes
 
 
@@ -215,7 +216,7 @@ def _moves(signals: Array, there: Mask) -> Mask:
 
 
 def _robust(residual: Array, there: Mask) -> Array:
-    """Rms of what is left of each signal, by its median: spikes do not count."""
+    """Robust rms of the residual of each signal, from its median."""
     size = np.abs(residual)
     middle = np.median(size, axis=1)
     for i in np.flatnonzero(~there.all(axis=1)):
@@ -224,29 +225,29 @@ def _robust(residual: Array, there: Mask) -> Array:
 
 
 # --- what is said of it ---------------------------------------------------------------------------
-def _doubts(fit: LineFit, planes: Planes, modes: Modes, say: Callable[[str], None]) -> None:
+def _doubts(fit: LineFit, planes: Planes, modes: Modes, warn: Callable[[str], None]) -> None:
     turns = fit.envelope.shape[1]
     there = [line for line in modes if line is not None]
     for plane in (0, 1):
         if not (planes == plane).any():
-            say(f"no monitor reads {'xy'[plane]}")
+            warn(f"no monitor reads {'xy'[plane]}")
     if not there:
-        say("no betatron line stands above the noise")
+        warn("no betatron line exceeds the noise")
     if len(there) != 1:
         return
     own = share(fit, planes, there[0])
-    missing = f"no line of the mode nearer to {'xy'[1 - modes.index(there[0])]} is seen"
+    missing = f"no line of the mode nearer to {'xy'[1 - modes.index(there[0])]} is found"
     if 0.2 < own < 0.8:
-        say(
+        warn(
             f"{missing}, and that of the other is in both planes: the tunes are closer than "
-            f"{APART / turns:.2g}, or one mode was not kicked"
+            f"{RESOLUTION / turns:.2g}, or one mode was not kicked"
         )
     else:
-        say(f"{missing}: it was not kicked, or is lost in the noise")
+        warn(f"{missing}: it was not kicked, or is lost in the noise")
 
 
 def _silent(turns: TurnByTurn, noise: Array) -> list[str]:
-    """Monitors of which nothing is used."""
+    """Return a warning of unused monitors."""
     flat = np.isnan(noise)
     read = np.isfinite(turns.readings).any(axis=(0, 1))
     names = [turns.monitors[i] for i in np.flatnonzero((flat & read).any(axis=1))]
@@ -261,7 +262,7 @@ def _silent(turns: TurnByTurn, noise: Array) -> list[str]:
 
 
 def _louder(turns: TurnByTurn, noise: Array) -> list[str]:
-    """The noise that is stated, where it is another one."""
+    """Return a warning if the stated noise differs from the residual."""
     if turns.noise is None:
         return []
     with np.errstate(invalid="ignore"):
@@ -271,4 +272,4 @@ def _louder(turns: TurnByTurn, noise: Array) -> list[str]:
     typical = float(np.nanmedian(ratio))
     if 0.5 < typical < 2:
         return []
-    return [f"what no line explains is {typical:.2g} times the stated noise at a typical monitor"]
+    return [f"the residual noise is {typical:.2g} times the stated noise at a typical monitor"]

@@ -1,7 +1,7 @@
-"""Which readings of an orbit response fit, which choose, and which judge.
+"""Split of an orbit response: readings to fit, to select families, and to validate.
 
 >>> split = split_columns(data, 0.2, np.random.default_rng(0))
->>> split.held.sum()                               # correctors that are never fitted
+>>> split.held.sum()                               # number of held-out correctors
 """
 
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 INNER = 0.2
-"""Share of the fitted correctors, and of the RF's fitted monitors, that choose the steps."""
+"""Share of the fitted correctors, and of the RF's fitted monitors, that select families."""
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Who is fitted, who chooses, who judges.
+    """Fitted, selecting and validating readings.
 
     Attributes:
-        held: correctors that are never fitted, [column].
-        inner: correctors that choose among families of errors, [column].
-        half: monitors that give a corrector its kick, or fit the RF, [column, monitor].
-        inner_rf: of the RF's fitted monitors those that choose, [monitor].
+        held: held-out correctors, [column].
+        inner: correctors that select families of errors, [column].
+        half: monitors that determine a corrector's kick, or fit the RF, [column, monitor].
+        inner_rf: those of the RF's fitted monitors that select, [monitor].
     """
 
     held: Flags
@@ -37,7 +37,7 @@ class Split:
 
 
 def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) -> Split:
-    """Draw them among the correctors that are read in the plane that they kick in.
+    """Draw a split of the correctors that are read in the plane of their kick.
 
     Raises:
         MeasurementError: too few correctors.
@@ -49,12 +49,12 @@ def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) 
     inner = round(INNER * (some - count))
     if not (count > 0 and inner > 0 and count + inner < some - 1):
         raise MeasurementError(
-            f"{some} correctors that are read in the plane that they kick in cannot be split; "
+            f"{some} correctors that are read in the plane of their kick cannot be split; "
             "measure more"
         )
     held, chooses = np.zeros((2, columns), dtype=bool)
     drawn = rng.permutation(columns - 1)
-    drawn = drawn[np.argsort(~read[drawn], kind="stable")]  # others judge nothing
+    drawn = drawn[np.argsort(~read[drawn], kind="stable")]  # others validate nothing
     held[drawn[:count]] = True
     chooses[drawn[count : count + inner]] = True
     half = np.zeros((columns, monitors), dtype=bool)

@@ -1,7 +1,7 @@
-"""What a stored beam tells: readings that are predicted at once, whatever made them.
+"""Readings of a stored beam, predicted all at once.
 
-A kind of measurement says what it reads of a ring with causes (`view`, `read`), what one cause more
-would do (`signatures`), and which nuisances it has (`directions`). The rest of a `Problem` is here.
+A kind of measurement gives its readings of a ring with causes (`view`, `read`), their derivatives
+(`signatures`), and its nuisances (`directions`). The rest of a `Problem` is here.
 """
 
 from abc import abstractmethod
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
-from tmlattice.effects.effect import LEAST_LEFT
+from tmlattice.effects.effect import MIN_STRENGTH
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
@@ -23,10 +23,10 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 NOTHING = np.zeros(0)
-"""The nuisances of a kind that has none."""
+"""Nuisances of a kind without any."""
 
-ROOM = 2**24
-"""Numbers of signatures at a time."""
+MAX_NUMBERS = 2**24
+"""Numbers of signatures in memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class Steady(Problem):
     """Readings of a stored beam.
 
     Attributes:
-        used: those that are fitted, of the kind's own shape.
+        used: fitted readings, of the kind's own shape.
     """
 
     used: Flags = field(repr=False)
@@ -42,16 +42,16 @@ class Steady(Problem):
     @property
     @abstractmethod
     def values(self) -> Array:
-        """What was read, of the kind's shape."""
+        """Measured readings, of the kind's shape."""
 
     @property
     @abstractmethod
     def sigma(self) -> Array:
-        """Noise of each, of a shape that fits."""
+        """Noise of each reading, of a compatible shape."""
 
     @abstractmethod
     def view(self, causes: Sequence[Cause]) -> Any:
-        """The ring with these.
+        """Return the ring with these causes.
 
         Raises:
             UnstableRingError: no stored beam.
@@ -59,20 +59,20 @@ class Steady(Problem):
 
     @abstractmethod
     def read(self, view: Any, nuisances: Array) -> Array:
-        """What the monitors tell there, of the kind's shape."""
+        """Predicted readings, of the kind's shape."""
 
     @abstractmethod
     def signatures(self, view: Any, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
-        """d readings / d amount ** power of one cause more, [hypothesis, ...]; of what is discrete
-        the whole change; zero of what the kind does not see."""
+        """d readings / d amount ** power of one cause more, [hypothesis, ...]; of a discrete effect
+        its change, of an invisible one zero."""
 
     def directions(self, view: Any, nuisances: Array) -> Array:
-        """d readings / d nuisance, [nuisance, ...]; here there are none."""
+        """d readings / d nuisance, [nuisance, ...]; here none."""
         return np.zeros((0, *self.used.shape))
 
     # --- the model ------------------------------------------------------------------------------
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
-        """Without a stored beam the point is lost."""
+        """Return the model's point, lost without a stored beam."""
         count = int(self.used.sum())
         view, read, lost = None, np.zeros(self.used.shape), ""
         residual = np.full(count, np.nan)
@@ -87,11 +87,11 @@ class Steady(Problem):
         return Point(tuple(causes), nuisances, dict(kicks), residual, projection, read, view, lost)
 
     def slope(self, point: Point, cause: int) -> Array:
-        """In closed form: the signature is of the same effect on top of what is there."""
+        """Slope in closed form: the signature of the same effect on top of the present amount."""
         own = point.causes[cause]
         effect, amount = find(own.effect), own.amount
-        if effect.multiplies and abs(1 + amount) < LEAST_LEFT:
-            return self._difference(point, cause, LEAST_LEFT)
+        if effect.multiplies and abs(1 + amount) < MIN_STRENGTH:
+            return self._difference(point, cause, MIN_STRENGTH)
         (slope,) = self.signatures(point.view, point.nuisances, [(own.effect, own.element)])
         return self.as_rows(effect.chain(amount) * slope)
 
@@ -107,50 +107,50 @@ class Steady(Problem):
         return np.asarray((ends[1] - ends[0]) / (2 * h))
 
     def moved(self, nuisances: Array, change: Array) -> Array:
-        """They are linear."""
+        """Return the nuisances after a change; they are linear."""
         return nuisances + change.reshape(nuisances.shape)
 
     def metric(self, point: Point) -> Metric:
-        """Every signature in closed form."""
+        """Return products of closed-form signatures."""
         return SteadyMetric(self, point)
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """A stored beam is linear enough in all of them."""
+        """Return no neighbours: a stored beam is linear enough in all of them."""
         return []
 
     # --- readings -------------------------------------------------------------------------------
     @property
     def valid(self) -> Flags:
-        """Of the kind's shape."""
+        """Fitted readings, of the kind's shape."""
         return self.used
 
     def as_rows(self, readings: Array) -> Array:
-        """In units of the noise, what is not used left out."""
+        """Rows of the fitted readings, in units of the noise."""
         scaled = readings / self.sigma
         if self.used.all():
             return np.asarray(scaled.reshape(*scaled.shape[: -self.used.ndim], self.used.size))
         return np.asarray(scaled[..., self.used])
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """What nuisances take is a small share of any reading."""
+        """Residuals over noise and variances of 1: nuisances absorb a small share of a reading."""
         assert point.projection is not None
         rows = np.zeros(self.used.shape)
         rows[self.used] = point.projection.out(point.residual)
         return rows, np.ones(self.used.shape)
 
     def without(self, dropped: Flags) -> Self:
-        """The same with these missing."""
+        """Return the problem without some readings."""
         return replace(self, used=self.used & ~dropped)
 
 
 class SteadyMetric(Metric):
-    """Products about one point, signatures as the kind gives them."""
+    """Products at one point, with the kind's signatures."""
 
     def __init__(self, problem: Steady, point: Point) -> None:
         assert point.projection is not None
         super().__init__(point.projection)
         self.problem, self.point = problem, point
-        self.chunk = int(np.clip(ROOM // max(problem.used.size, 1), 1, 512))
+        self.chunk = int(np.clip(MAX_NUMBERS // max(problem.used.size, 1), 1, 512))
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
         """See `Metric.rows`."""
@@ -160,7 +160,7 @@ class SteadyMetric(Metric):
         )
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """All readings of a monitor free: information, and product with data."""
+        """Information of all readings of each monitor, and product with data."""
         owner = self.problem.owner()[self.problem.used]
         count = len(self.problem.monitors)
         most = int(np.bincount(owner[owner >= 0], minlength=count).max(initial=1))

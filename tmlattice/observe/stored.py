@@ -1,8 +1,8 @@
-"""Kinds of measurement of a stored beam: each reads closed orbits, tunes and modes in its own way.
+"""Measurements of a stored beam: each kind reads closed orbits, tunes and modes in its own way.
 
-A measurement sees the ring in some states (settings of a shot, steps of the RF). In each the beam
-has a closed orbit, two tunes and two modes; what the monitors show of these is linear in them, and
-so `told` is prediction and derivative in one. A new kind is a class with `told` and its data.
+A measurement has states of the ring (settings of a shot, steps of the RF). In each the beam has a
+closed orbit, two tunes and two modes. Readings are linear in these, so that `readings_of` gives
+prediction and derivatives. A new kind is a class with `readings_of` and its data.
 """
 
 from abc import abstractmethod
@@ -37,23 +37,23 @@ from tmlattice.observe.steady import Steady
 Array = NDArray[np.float64]
 
 SMALL = 1e-3
-"""Of a monitor's largest error: the step of the differences."""
+"""Step of the differences, as a share of a monitor's largest error."""
 
-FEW = 10
-"""Causes with which a model is made from the one without; of more it is kept."""
+MAX_CHANGES = 10
+"""Causes up to which a model is changed from the one without; with more it is cached."""
 
-BEAMS = 6
-"""Stored beams that are remembered: some megabytes each."""
+MAX_BEAMS = 6
+"""Stored beams in memory: some megabytes each."""
 
 
-class Kept:
-    """Models made a moment ago: measurements of one machine ask for the same ones, and most causes
-    are the same from one call to the next."""
+class ModelCache:
+    """Cache of models: measurements of one machine share them, and most causes stay the same from
+    one call to the next."""
 
     def __init__(self) -> None:
         self._bases: dict[str, tuple[tuple[Cause, ...], ResponseModel]] = {}
         self._beams: deque[tuple[str, tuple[float, bool], tuple[Cause, ...], StoredBeam]] = deque(
-            maxlen=BEAMS
+            maxlen=MAX_BEAMS
         )
 
     def beam(
@@ -64,16 +64,16 @@ class Kept:
         causes: tuple[Cause, ...],
         feels_rf: bool = False,
     ) -> StoredBeam:
-        """The stored beam of a ring with settings and causes.
+        """Return the stored beam of a ring with settings and causes.
 
         Args:
             ring: the design.
             settings, causes: of the state.
             frequency: of the RF, relative.
-            feels_rf: its oscillation does, turn by turn; where the RF is on, see `Rf.on`.
+            feels_rf: whether the oscillation includes the RF turn by turn, see `Rf.on`.
 
         Raises:
-            UnstableRingError: there is none.
+            UnstableRingError: no stored beam.
         """
         key, near, state = repr(settings), None, (frequency, feels_rf)
         for own, at, known, beam in self._beams:
@@ -94,8 +94,8 @@ class Kept:
         if base is None or causes[: len(known)] != known:
             pairs = enumerate(zip(causes, known, strict=False))
             same = next((i for i, (a, b) in pairs if a != b), min(len(causes), len(known)))
-            many = same if same > FEW else len(causes)
-            known = causes[:many] if len(causes) > FEW else ()
+            many = same if same > MAX_CHANGES else len(causes)
+            known = causes[:many] if len(causes) > MAX_CHANGES else ()
             base = ResponseModel(apply(ring, known, settings))
             self._bases[key] = (known, base)
         rest = [c for c in causes[len(known) :] if isinstance(find(c.effect), RingEffect)]
@@ -103,14 +103,14 @@ class Kept:
 
 
 def cavities_of(ring: Ring, model: ResponseModel) -> Cavities:
-    """The RF that turns of a stored beam feel.
+    """Return the RF that acts on turns of a stored beam.
 
     Args:
         ring: the design.
-        model: of it with what is wrong.
+        model: of the ring with its errors.
 
     Raises:
-        UnstableRingError: the RF cannot make good what the beam loses.
+        UnstableRingError: the RF cannot replace the energy loss.
     """
     rf = ring.memory.setdefault("rf", rf_in(ring))
     loss = sum(element.errors.loss for element in model.ring.elements)
@@ -122,7 +122,7 @@ def cavities_of(ring: Ring, model: ResponseModel) -> Cavities:
 
 @dataclass(frozen=True)
 class Beams:
-    """What there is at some causes.
+    """Stored beams at some causes.
 
     Attributes:
         beams: the stored beam of each state.
@@ -140,10 +140,10 @@ class Stored(Steady):
     Attributes:
         ring: the design.
         states: settings and relative RF frequency of each.
-        data, errors: what was read and its noise, of the kind's shape.
+        data, errors: readings and their noise, of the kind's shape.
         read_by: the monitor of each reading, -1 for none, of the kind's shape.
-        kept: models made a moment ago; those of the same ring may share one.
-        counts: whether turn by turn is read.
+        cache: of models; measurements of the same ring may share one.
+        counts: whether readings are turn by turn.
     """
 
     counts: ClassVar[bool] = False
@@ -153,66 +153,66 @@ class Stored(Steady):
     data: Array = field(repr=False)
     errors: Array = field(repr=False)
     read_by: NDArray[np.int64] = field(repr=False)
-    kept: Kept = field(default_factory=Kept, repr=False, compare=False)
+    cache: ModelCache = field(default_factory=ModelCache, repr=False, compare=False)
 
     @abstractmethod
-    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
-        """The kind's readings [..., *shape] of what each state shows, or of changes of that, with
-        any axes in front; linear."""
+    def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """Readings [..., *shape] of the states' orbits, tunes and modes, or of changes of these,
+        with any leading axes; linear."""
 
-    def counted(self, states: Sequence[Moved], late: Array) -> list[Moved]:
-        """What is shown, or changes of it, where monitors [monitor] count turns from later ones."""
+    def with_turn_offsets(self, states: Sequence[Moved], late: Array) -> list[Moved]:
+        """Return the states, or their changes, with turn offsets of the monitors [monitor]."""
         return list(states)
 
-    def a_turn_on(self, states: Sequence[Moved]) -> list[Moved]:
-        """What a turn later at every monitor changes of that, to first order."""
+    def one_turn_later(self, states: Sequence[Moved]) -> list[Moved]:
+        """Return their change, to first order, by one turn later at every monitor."""
         raise NotImplementedError("this kind of measurement has no turns")
 
     @property
     def values(self) -> Array:
-        """As read."""
+        """Measured readings."""
         return self.data
 
     @property
     def sigma(self) -> Array:
-        """Of each reading."""
+        """Noise of each reading."""
         return self.errors
 
     @property
     def monitors(self) -> Sequence[str]:
-        """All of the ring."""
+        """All monitors of the ring."""
         return [monitor.name for monitor in self.ring.monitors]
 
     def owner(self) -> NDArray[np.int64]:
-        """The monitor of each reading; -1: what no monitor tells alone."""
+        """Monitor of each reading; -1: of no single monitor."""
         return self.read_by
 
     # --- the model ------------------------------------------------------------------------------
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """A stored beam has no launch, and only where turns are read their count."""
+        """Whether a stored beam shows the cause: no launch, and turn offsets in turns alone."""
         effect = find(hypothesis[0])
         return not isinstance(effect, LaunchEffect) and (self.counts or not effect.of_turns)
 
     def view(self, causes: Sequence[Cause]) -> Beams:
-        """A closed orbit for each state."""
+        """Return the stored beam of each state."""
         there = tuple(causes)
         beams = tuple(
-            self.kept.beam(self.ring, *state, there, self.counts) for state in self.states
+            self.cache.beam(self.ring, *state, there, self.counts) for state in self.states
         )
         return Beams(beams, monitors_with(self.ring, causes))
 
     def shown(self, view: Beams, nuisances: Array) -> list[Moved]:
-        """What the beam of each state shows."""
+        """Return orbit, tunes and modes of each state."""
         return [beam.shown for beam in view.beams]
 
     def read(self, view: Beams, nuisances: Array) -> Array:
-        """Monitors' errors and all."""
+        """Predicted readings with the monitors' errors."""
         matrix, constant = view.monitors.matrix(), view.monitors.constant()
-        shown = self.counted(self.shown(view, nuisances), view.monitors.late)
-        return self.told([seen_by(one, matrix, constant) for one in shown], nuisances)
+        shown = self.with_turn_offsets(self.shown(view, nuisances), view.monitors.late)
+        return self.readings_of([seen_by(one, matrix, constant) for one in shown], nuisances)
 
     def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
-        """Effects on the ring in closed form, those of monitors by differences."""
+        """Signatures: effects on the ring in closed form, those on monitors by differences."""
         out = np.zeros((len(hypotheses), *self.used.shape))
         kinds = [find(name) for name, _ in hypotheses]
         on_ring = [i for i, kind in enumerate(kinds) if isinstance(kind, RingEffect)]
@@ -223,8 +223,10 @@ class Stored(Steady):
             for beam in view.beams:
                 if id(beam) not in known:
                     known[id(beam)] = seen_by(beam.moved(some), matrix)
-            moved = self.counted([known[id(beam)] for beam in view.beams], view.monitors.late)
-            out[on_ring] = self.told(moved, nuisances)
+            moved = self.with_turn_offsets(
+                [known[id(beam)] for beam in view.beams], view.monitors.late
+            )
+            out[on_ring] = self.readings_of(moved, nuisances)
         place = {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
         for name in dict.fromkeys(name for name, _ in hypotheses):
             effect = find(name)
@@ -237,11 +239,13 @@ class Stored(Steady):
         return out
 
     def of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:
-        """d readings / d amount of an effect on top, every monitor's own."""
-        own = self.counted(self.shown(view, nuisances), view.monitors.late)
+        """d readings / d amount of a further effect, for every monitor."""
+        own = self.with_turn_offsets(self.shown(view, nuisances), view.monitors.late)
         if effect.of_turns:
             matrix = view.monitors.matrix()
-            return self.told([seen_by(one, matrix) for one in self.a_turn_on(own)], nuisances)
+            return self.readings_of(
+                [seen_by(one, matrix) for one in self.one_turn_later(own)], nuisances
+            )
         high = 1.0 if effect.discrete else SMALL * effect.largest
         low = 0.0 if effect.discrete else -high
         ends = []
@@ -252,13 +256,15 @@ class Stored(Steady):
             ends.append((monitors.matrix(), monitors.constant()))
         (upper, up), (lower, down) = ends
         slope, constant = ((a - b) / (high - low) for a, b in ((upper, lower), (up, down)))
-        return self.told([seen_by(one, slope, constant, tunes=0.0) for one in own], nuisances)
+        return self.readings_of(
+            [seen_by(one, slope, constant, tunes=0.0) for one in own], nuisances
+        )
 
 
 def seen_by(
     shown: Moved, matrix: Array, constant: Array | float = 0.0, tunes: float = 1.0
 ) -> Moved:
-    """What monitors make of it."""
+    """Return the states as read by monitors with errors."""
     orbit, modes = shown.orbit + constant, shown.modes
     wrong = np.flatnonzero((matrix != np.eye(2)).any(axis=(1, 2)))
     if len(wrong):
@@ -273,12 +279,12 @@ def seen_by(
 
 
 def rf_of(settings: Settings) -> float:
-    """Relative RF frequency that a shot was set to."""
+    """Relative RF frequency of a shot's settings."""
     return float(settings.get("rf", {}).get("frequency_relative", 0.0))
 
 
 def stacked(states: Sequence[Moved], name: str) -> Array:
-    """One quantity of all states, [..., state, *its own]: "orbit" behind the axes in front."""
+    """One quantity of all states, [..., state, *its own axes]; "orbit" behind leading axes."""
     depth = {"orbit": 2, "tunes": 1, "modes": 3}[name]
     parts = [getattr(state, name) for state in states]
     return np.stack(parts, axis=parts[0].ndim - depth)

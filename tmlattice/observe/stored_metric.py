@@ -1,8 +1,8 @@
-"""Products of a stored beam's signatures where they need not be written out.
+"""Products of a stored beam's signatures without forming them.
 
-An error of a monitor is in that monitor's readings alone. What an error of the ring does to turns
-is one change of the modes, which every shot shows times its own complex amplitude: sums over the
-shots are taken once, and a signature is as long as the modes are, however many shots there are.
+An error of a monitor affects that monitor's readings alone. An error of the ring changes the modes,
+which every shot shows times its complex amplitude: sums over the shots are formed once, so that a
+signature is as long as the modes, whatever the number of shots.
 """
 
 from collections.abc import Sequence
@@ -20,18 +20,18 @@ from tmlattice.observe.stored import Stored, seen_by
 Array = NDArray[np.float64]
 
 LINES = -4
-"""Where the lines end among the data of a shot: see `ManyTurns`."""
+"""End of the lines among the data of a shot: see `ManyTurns`."""
 AT_ONCE = 256
-"""Changes of modes that are held at a time: 4 MB for 246 monitors."""
+"""Changes of modes in memory: 4 MB for 246 monitors."""
 
 
 class StoredMetric(SteadyMetric):
-    """About one point of a `Stored`: errors of monitors by their own readings."""
+    """Products at one point of a `Stored` problem; errors of monitors from their own readings."""
 
     problem: Stored
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Effect by effect: every monitor has its own."""
+        """Put in products of monitor errors, by effect; return their indices."""
         problem, done = self.problem, [np.zeros(0, dtype=np.intp)]
         owner = problem.owner()[problem.used]
         place = {name: i for i, name in enumerate(problem.monitors)}
@@ -58,16 +58,16 @@ class StoredMetric(SteadyMetric):
         return np.concatenate([data, self.projection.Q[0].T])
 
     def put(self, which: Indices, whole: Array, along: Array, found: Products) -> None:
-        """Squares [hypothesis], and products with `vectors` [hypothesis, vector]."""
+        """Set squares [hypothesis], and products with `vectors` [hypothesis, vector]."""
         data = found.inner.shape[1]
         found.put(which, whole, (along[:, data:] ** 2).sum(axis=1), along[:, :data])
 
 
 class TurnsMetric(StoredMetric):
-    """About one point of many turns."""
+    """Products at one point of turn-by-turn data."""
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Errors of the ring, too."""
+        """Put in products of errors of the ring and of monitors; return their indices."""
         done = super().quick(hypotheses, data, found)
         ring = [i for i, (name, _) in enumerate(hypotheses) if isinstance(find(name), RingEffect)]
         which = np.array(ring, dtype=np.intp)
@@ -76,7 +76,7 @@ class TurnsMetric(StoredMetric):
         return np.concatenate([done, which])
 
     def _on_ring(self, hypotheses: Sequence[Hypothesis], vectors: Array) -> tuple[Array, Array]:
-        """Squares, and products with vectors, shots of the same beam together."""
+        """Squares, and products with vectors; shots of the same beam together."""
         problem, view = self.problem, self.point.view
         weight = problem.used / problem.sigma**2
         told = np.zeros((len(vectors), *problem.used.shape))
@@ -107,12 +107,12 @@ class TurnsMetric(StoredMetric):
         return whole, along
 
     def _amplitudes(self) -> NDArray[np.complex128]:
-        """By which each shot shows the modes' entries, [shot, monitor * 2 * mode]."""
+        """Amplitude with which each shot shows the modes' entries, [shot, monitor * 2 * mode]."""
         nuisances, view = self.point.nuisances, self.point.view
         size = nuisances[..., 0] + 1j * nuisances[..., 1]
         ones = [
             Moved(np.zeros(0), np.zeros(0), np.ones_like(beam.modes) * own)
             for beam, own in zip(view.beams, size, strict=True)
         ]
-        shown = self.problem.counted(ones, view.monitors.late)
+        shown = self.problem.with_turn_offsets(ones, view.monitors.late)
         return np.stack([own.modes.ravel() for own in shown])

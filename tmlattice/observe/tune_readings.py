@@ -1,4 +1,4 @@
-"""Tunes and chromaticities that were read: few numbers, which no monitor's error touches."""
+"""Measured tunes and chromaticities, which no monitor's error affects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,15 +17,14 @@ from tmlattice.observe.stored import Stored, rf_of, stacked
 Array = NDArray[np.float64]
 
 DELTA = 5e-4
-"""Energy deviation dE / p0 c on both sides of the nominal one, of the difference that is the
-chromaticity."""
+"""Energy deviation dE / p0 c on both sides of the nominal one, for the chromaticity."""
 
 TUNE, CHROMATICITY = 1e-4, 0.1
-"""Errors where none is stated: a tune's by what currents drift in minutes, a chromaticity's by what
-that makes of steps of a per mil."""
+"""Errors if none is stated: a tune's from drifts of currents in minutes, a chromaticity's from
+these over steps of a per mil."""
 
 WIDER = 0.01
-"""Relative change of all gaps of bends, of the difference that is the tunes' slope."""
+"""Relative change of all gaps of bends, for the slope of the tunes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,15 +42,15 @@ class TuneReadings(Stored):
         """No nuisances."""
         return NOTHING
 
-    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
-        """Each shot at its frequency, and at one above and one below."""
+    def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """Return the tunes, and the chromaticities from the two outer states of each shot."""
         tunes = stacked(states, "tunes")
         slope = (tunes[..., 1::3, :] - tunes[..., 2::3, :] + 0.5) % 1.0 - 0.5
         return np.concatenate([tunes[..., ::3, :], slope / self.energies], axis=-1)
 
 
 def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]) -> TuneReadings:
-    """What measured tunes are for an inference: each is taken by the mode nearer to its plane."""
+    """Return the problem of measured tunes, each of the mode nearer to its plane."""
     shots = len(measured.tune)
     settings: tuple[Settings, ...] = measured.settings or ({},) * shots
     model = ResponseModel(ring)
@@ -85,7 +84,7 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
 
 
 def fringe_uncertainty(ring: Ring) -> Array:
-    """Return by how much the model's chromaticities are uncertain for fringe fields, [mode].
+    """Return the uncertainty of the model's chromaticities by fringe fields, [mode].
 
     The extent of a bend's fringe field (gap g, field integral K, curvature h) changes the vertical
     focusing of an edge by K g h^2. By the equations of motion that share falls with the momentum.

@@ -1,11 +1,11 @@
-"""Turn by turn of a stored beam: its betatron lines at every monitor, and its tunes.
+"""Turn-by-turn readings of a stored beam: its betatron lines at every monitor, and its tunes.
 
-A kicked beam oscillates in two modes; each is a line in the spectrum of every monitor, whose
+A kicked beam oscillates in two modes. Each is a line in the spectrum of every monitor, whose
 complex amplitude is the mode's vector there times one complex number of the shot. That number is a
-nuisance (nobody knows the kick's size and phase so well), all else is optics: phases, which no gain
-touches, ratios of amplitudes, and in the other plane coupling. The amplitude shifts them, see
-`amplitude`; how far this machine's differs from the design's is a nuisance, too, which is 0 within
-the stated error.
+nuisance, as the size and phase of the kick are not known well enough. The rest is optics: phases,
+which are independent of gains, ratios of amplitudes, and betatron coupling. The amplitude shifts
+the lines, see `amplitude`; the deviation of this shift from the design's is a nuisance too, zero
+within the stated error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,11 +31,11 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 TUNE = 3e-4
-"""Below this a tune is not believed: it moves with the energy, which nobody states."""
+"""Smallest error of a tune: it moves with the unknown energy."""
 
 FLOOR = 1e-4
-"""Share of a line below which its error is not believed: what decoherence does to the ratio of two
-monitors, which the model leaves out."""
+"""Smallest relative error of a line: the unmodelled effect of decoherence on the ratio of two
+monitors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,16 +47,16 @@ class ManyTurns(Stored):
 
     Attributes:
         shift: by the amplitude of each shot.
-        said: what could not be used of the turns, a sentence each.
+        warnings: a sentence for all data that could not be used.
     """
 
     counts: ClassVar[bool] = True
     shift: Shift = field(repr=False)
-    said: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """What is wrong with a monitor may be its count of turns; and all that is seen may be what
-        the RF does, which is on where the beam loses energy."""
+        """Return alternatives: of a monitor's error its turn offset; of others the RF, where the
+        beam loses energy."""
         return [
             (name, place) for name, place in among
             if place is None or (find(name).of_turns and place == hypothesis[1])
@@ -64,20 +64,19 @@ class ManyTurns(Stored):
 
     @property
     def _turn(self) -> Array:
-        """Phase of both lines in a turn, [shot, mode], rad, as it was read: the amplitude moves it.
-        The nearer way round: that is what stands between two whole turns."""
+        """Measured phase advance of both lines per turn, [shot, mode], rad, in (-pi, pi)."""
         return np.asarray(2 * np.pi * ((self.data[:, -2:] + 0.5) % 1 - 0.5))
 
-    def counted(self, states: Sequence[Moved], late: Array) -> list[Moved]:
-        """By the phase of so many turns."""
+    def with_turn_offsets(self, states: Sequence[Moved], late: Array) -> list[Moved]:
+        """Return the states after the phase of each monitor's turn offset."""
         if not late.any():
             return list(states)
         turned = np.exp(1j * late[:, None, None] * self._turn[:, None, None, :])
         own = zip(states, turned, strict=True)
         return [replace(state, modes=state.modes * by) for state, by in own]
 
-    def a_turn_on(self, states: Sequence[Moved]) -> list[Moved]:
-        """Its phase, in every mode."""
+    def one_turn_later(self, states: Sequence[Moved]) -> list[Moved]:
+        """Return the change by one turn of phase, in every mode."""
         return [
             Moved(np.zeros_like(one.orbit), np.zeros_like(one.tunes), 1j * phase * one.modes)
             for one, phase in zip(states, self._turn, strict=True)
@@ -85,7 +84,7 @@ class ManyTurns(Stored):
 
     @property
     def first(self) -> Array:
-        """The amplitudes that fit the ring as it is known best."""
+        """Amplitudes that fit the known ring."""
         shots = len(self.data)
         view = self.view(self.fixed)
         nothing = np.zeros((shots, 2, 3))
@@ -95,21 +94,21 @@ class ManyTurns(Stored):
         return np.asarray(solved.reshape(nothing.shape))
 
     def metric(self, point: Point) -> Metric:
-        """By changes of the modes."""
+        """Return products from changes of the modes."""
         return TurnsMetric(self, point)
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """A line is no single reading: none is left out alone."""
+        """Return no single residuals: a line is no single reading."""
         return np.zeros(self.used.shape), np.ones(self.used.shape)
 
     def without(self, dropped: NDArray[np.bool_]) -> Self:
-        """What is known of the shifts stays."""
+        """Return the problem without some readings; priors of the shifts stay."""
         dropped = dropped.copy()
         dropped[:, LINES:-2] = False
         return super().without(dropped)
 
     def shown(self, view: Beams, nuisances: Array) -> list[Moved]:
-        """Shifted by the amplitude."""
+        """Return the states, shifted by the amplitude."""
         own = zip(view.beams, self.shift.modes, self.shift.tunes, nuisances, strict=True)
         return [
             replace(
@@ -120,13 +119,13 @@ class ManyTurns(Stored):
         ]  # fmt: skip
 
     def read(self, view: Beams, nuisances: Array) -> Array:
-        """With the errors of the shifts."""
+        """Predicted readings with the errors of the shifts."""
         readings = super().read(view, nuisances)
         readings[:, LINES:-2] = nuisances[..., 2]
         return readings
 
-    def told(self, states: Sequence[Moved], nuisances: Array) -> Array:
-        """A shot is a state."""
+    def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
+        """Return the readings; a shot is a state."""
         size = nuisances[..., 0] + 1j * nuisances[..., 1]
         seen = np.ascontiguousarray(stacked(states, "modes") * size[:, None, None, :])
         flat = seen.view(float).reshape(*seen.shape[:-3], -1)
@@ -134,7 +133,7 @@ class ManyTurns(Stored):
         return np.concatenate([flat, np.zeros_like(tunes), tunes], axis=-1)
 
     def directions(self, view: Beams, nuisances: Array) -> Array:
-        """Of amplitudes in the lines; of the shifts in these and the tunes."""
+        """Directions of the amplitudes in the lines, and of the shifts in lines and tunes."""
         ones = nuisances.copy()
         ones[..., :2] = 1.0, 0.0
         shots = len(ones)
@@ -161,19 +160,19 @@ class ManyTurns(Stored):
 def many_turns(
     ring: Ring, measured: TurnByTurn, places: Mapping[str, float], spectrum: Lines | None = None
 ) -> ManyTurns:
-    """What turns of a stored beam are for an inference.
+    """Return the problem of the turns of a stored beam.
 
-    A real signal does not tell Q from 1 - Q: lines are looked for near to the design's tunes.
+    A real signal does not distinguish Q from 1 - Q: lines are sought near the design's tunes.
 
     Args:
         ring: the design.
         measured: readings.
         places: of each effect, for the prior.
-        spectrum: their lines, where they are known already.
+        spectrum: their lines, if known.
 
     Raises:
         MeasurementError: no line can be used.
-        UnknownNameError: a monitor that the ring does not have.
+        UnknownNameError: a monitor that is not in the ring.
     """
     names = [monitor.name for monitor in ring.monitors]
     settings: tuple[Settings, ...] = measured.settings or ({},) * len(measured.shots)
@@ -196,11 +195,11 @@ def many_turns(
         at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
         found = lines(measured.in_order_of(names), near=design[0], at=at)
         shift = shift_of(ring, beams, found, at)
-    # what the model leaves out goes with the line of the mode in its own plane
+    # the model's error is proportional to the line of the mode in its own plane
     size = np.nan_to_num(np.abs(found.amplitude)).max(axis=2, keepdims=True)
     error = np.sqrt(found.error**2 + (FLOOR * size) ** 2 + shift.mode_error**2).reshape(shots, -1)
     both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
-    # the shifts' errors of all shots are one machine's: their mean is known no better than one
+    # shift errors are common to all shots: their mean is known no better than one
     known = shift.error * np.sqrt(shots)
     tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
     data = np.concatenate([both.reshape(shots, -1), np.zeros((shots, 2)), tunes], axis=1)
@@ -213,8 +212,8 @@ def many_turns(
         raise MeasurementError(
             large[0]
             if large
-            else "no betatron line stands out of the noise"
-            + (f": {'; '.join(found.said)}" if found.said else "; kick the beam harder")
+            else "no betatron line is significant"
+            + (f": {'; '.join(found.warnings)}" if found.warnings else "; kick the beam harder")
         )
     return replace(
         blank,
@@ -222,5 +221,5 @@ def many_turns(
         errors=np.where(there, errors, 1.0),
         used=there,
         shift=shift,
-        said=(*found.said, *large),
+        warnings=(*found.warnings, *large),
     )

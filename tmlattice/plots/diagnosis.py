@@ -57,6 +57,18 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
 
 
 def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
+    if not diagnosis.stored:
+        yield from _of_readings(diagnosis)
+    if diagnosis.heldout is not None:
+        ax = plot_gap(diagnosis, gap_axes(diagnosis))
+        yield (
+            "gap",
+            "Readings of shots that the fit never saw less the model, as findings are added.",
+            _figure(ax),
+        )
+
+
+def _of_readings(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     if not diagnosis.parts:
         yield "readings", readings_caption(diagnosis), plot_readings(diagnosis)
     elif any(np.isfinite(part.left).any() for part in diagnosis.parts):
@@ -80,13 +92,6 @@ def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]
             "The same scan around the clearest finding, linear, with the monitors. Later findings "
             "show only once this one is in the model.",
             plot_scan_near(diagnosis, first),
-        )
-    if diagnosis.heldout is not None:
-        ax = plot_gap(diagnosis, gap_axes(diagnosis))
-        yield (
-            "gap",
-            "Readings of shots that the fit never saw less the model, as findings are added.",
-            _figure(ax),
         )
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tmlattice.beam.chain import Chain
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.optics import twiss
 from tmlattice.plots.strip import lattice_strip, plain_log
@@ -15,12 +14,13 @@ from tmlattice.plots.strip import lattice_strip, plain_log
 
 def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure: (name, caption, figure); close each after use."""
-    yield (
-        "maps",
-        "Orbit change by corrector and monitor, each corrector in its own plane: measured, what "
-        f"the {_before(result)} leaves of it and what the result does. Grey: left out.",
-        plot_maps(result),
-    )
+    if not result.stored:
+        yield (
+            "maps",
+            "Orbit change by corrector and monitor, each corrector in its own plane: measured, "
+            f"what the {_before(result)} leaves of it and what the result does. Grey: left out.",
+            plot_maps(result),
+        )
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
     plot_steps(result, ax)
     yield "steps", "The gap on held-out readings, before and after.", figure
@@ -149,7 +149,7 @@ def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Beta of the result relative to the design, above the lattice."""
     figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
     ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
-    before, after = (twiss(Chain.from_ring(r)) for r in (result.ring, result.corrected))
+    before, after = (twiss(r) for r in (result.ring, result.corrected))
     for plane, colour in enumerate(("C0", "C3")):
         beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
         ax.plot(before.s, beat, color=colour, linewidth=0.8, label="xy"[plane])

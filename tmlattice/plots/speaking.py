@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tmlattice.beam.chain import Chain
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.errors import unknown_choice
 from tmlattice.lattice import Ring, load_ring
@@ -42,7 +41,7 @@ def plot_ring(ring: Ring, span: tuple[float, float] | None = None) -> Figure:
     Raises:
         UnstableRingError: it has no betas.
     """
-    figure = plot_betas(ring, twiss(Chain.from_ring(ring)), span=span)
+    figure = plot_betas(ring, twiss(ring), span=span)
     figure.axes[0].set_title(ring.name, loc="right", fontsize="medium")
     return figure
 
@@ -79,9 +78,10 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
 
     Args:
         measured: of any kind.
-        ring: along which, with its lattice below; else by the number of the monitor.
+        ring: along which, with its lattice below (all that `load_ring` takes); else by the number
+            of the monitor.
     """
-    known = ring if ring is None or isinstance(ring, Ring) else load_ring(ring)  # type: ignore[arg-type]
+    known = None if ring is None else load_ring(ring)
     if isinstance(measured, TuneReading):
         return _tunes(measured, known)
     heights = [3, 3, 0.8] if known is not None else [3, 3]
@@ -141,7 +141,7 @@ def _tunes(measured: TuneReading, ring: Ring | None) -> Figure:
         2, len(told), figsize=(4.5 + 3.5 * len(told), 5), sharex=True, squeeze=False,
         layout="constrained",
     )  # fmt: skip
-    design = None if ring is None else np.mod(twiss(Chain.from_ring(ring)).total_tunes, 1.0)
+    design = None if ring is None else np.mod(twiss(ring).total_tunes, 1.0)
     shots = np.arange(len(measured.tune))
     for column, (name, values, error) in enumerate(told):
         for plane, ax in enumerate(axes[:, column]):

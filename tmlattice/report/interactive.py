@@ -47,19 +47,25 @@ def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """Figure functions by the name of the picture in `plots.diagnosis.figures`."""
     made = {"plan": plan(diagnosis)}
     if not diagnosis.by_steps:
-        left = [part for part in diagnosis.parts if np.isfinite(part.left).any()]
-        if left or not diagnosis.parts:
-            made["readings"] = parts(diagnosis, left) if left else readings(diagnosis)
-        made["scan"] = scan(diagnosis)
-        first = clearest(diagnosis)
-        if first is not None:
-            made["scan-near"] = scan(diagnosis, around(diagnosis, first))
+        if not diagnosis.stored:
+            made |= _of_readings(diagnosis)
         if diagnosis.heldout is not None:
             made["gap"] = gap(diagnosis)
         return made
     made["steps"] = steps(diagnosis)
     if any(cause.effect == "quadrupole_gradient" for cause in diagnosis.causes):
         made |= {"gradients": gradients(diagnosis), "beta-beat": beta_beat(diagnosis)}
+    return made
+
+
+def _of_readings(diagnosis: Diagnosis) -> dict[str, Figure]:
+    left = [part for part in diagnosis.parts if np.isfinite(part.left).any()]
+    made = {"scan": scan(diagnosis)}
+    if left or not diagnosis.parts:
+        made["readings"] = parts(diagnosis, left) if left else readings(diagnosis)
+    first = clearest(diagnosis)
+    if first is not None:
+        made["scan-near"] = scan(diagnosis, around(diagnosis, first))
     return made
 
 

@@ -70,7 +70,7 @@ def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Pic
         _no_formulas(figure)
         figure.savefig(path, dpi=DPI)
         plt.close(figure)
-        shrink(path)
+        shrink(path, caption)
         pictures.append(Picture(name, caption, path))
     return pictures
 
@@ -89,15 +89,38 @@ def _no_formulas(figure: "Figure") -> None:
             formatter.seq = [str(text).replace("$", r"\$") for text in formatter.seq]
 
 
-def shrink(path: Path) -> None:
-    """Write a PNG file with a palette, a third as large; rare colours are kept."""
+def shrink(path: Path, caption: str) -> None:
+    """Write a PNG file with a palette, a third as large, with its caption inside.
+
+    Rare colours are kept. The caption is for a report that is rendered again.
+    """
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    about = PngInfo()
+    about.add_itxt("Description", caption)
 
     with Image.open(path) as picture:
         few = picture.convert("RGB").quantize(
             method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
-    few.save(path, optimize=True)
+    few.save(path, optimize=True, pnginfo=about)
+
+
+def pictures_in(folder: Path) -> list[Picture]:
+    """The figures of an earlier report that a folder holds."""
+    from PIL import Image, UnidentifiedImageError
+
+    found = []
+    for path in sorted(folder.glob("*.png")):
+        try:
+            with Image.open(path) as picture:
+                caption = picture.info.get("Description")
+        except (UnidentifiedImageError, OSError, ValueError):
+            continue
+        if isinstance(caption, str):
+            found.append(Picture(path.stem, caption, path))
+    return found
 
 
 def draw(diagnosis: Diagnosis, folder: Path, correction: Correction | None = None) -> list[Picture]:

@@ -1,14 +1,18 @@
 """Report and files of a diagnosis: `diagnosis.report()`, `diagnosis.save(folder)`."""
 
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from tmlattice.correction import Correction
+from tmlattice.diagnosis.load import DOCUMENT, LATTICE, load
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.errors import LatticeError
 from tmlattice.files import output_folder, write_json
+from tmlattice.lattice import save_ring
 from tmlattice.report.correction_texts import correction_text
-from tmlattice.report.page import correction_page, draw, page
+from tmlattice.report.page import correction_page, draw, page, pictures_in
 from tmlattice.report.plain import WIDTH, report_text
 
 
@@ -18,7 +22,7 @@ def report(diagnosis: Diagnosis, width: int = WIDTH) -> str:
 
 
 def save(diagnosis: Diagnosis, folder: str | PathLike[str]) -> Path:
-    """Write `report.html`, `report.txt`, `diagnosis.json` and the figures.
+    """Write `report.html`, `report.txt`, `diagnosis.json` with its lattice, and the figures.
 
     Args:
         diagnosis: of `diagnose`.
@@ -49,7 +53,38 @@ def write_files(
         write_settings(correction, folder)
     (folder / "report.html").write_text(html, encoding="utf-8")
     (folder / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
-    write_json(folder / "diagnosis.json", document)
+    write_json(folder / DOCUMENT, document)
+    with suppress(LatticeError):  # an element that no file holds: `load` then asks for the ring
+        save_ring(diagnosis.ring, folder / LATTICE)
+
+
+def render(path: str | PathLike[str], out: str | PathLike[str] | None = None) -> Diagnosis:
+    """Write report.html and report.txt of a diagnosis.json anew.
+
+    Figures of the readings and of the scan are those that the folder holds: diagnosis.json does
+    not hold what they show.
+
+    Args:
+        path: a folder of `save`, or its diagnosis.json.
+        out: the folder to write to; None: the same.
+
+    Returns:
+        The diagnosis, see `Diagnosis.load`.
+
+    Raises:
+        MeasurementError, LatticeError: see `Diagnosis.load`.
+        OutputError: it cannot be written.
+    """
+    diagnosis = load(Diagnosis, path)
+    folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    with output_folder(folder if out is None else Path(out)) as temporary:
+        pictures = draw(diagnosis, temporary)
+        drawn = {picture.name for picture in pictures}
+        pictures += [kept for kept in pictures_in(folder) if kept.name not in drawn]
+        html = page(diagnosis, pictures)
+        (temporary / "report.html").write_text(html, encoding="utf-8")
+        (temporary / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
+    return diagnosis
 
 
 def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path:

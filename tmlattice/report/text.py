@@ -12,7 +12,7 @@ from tmlattice.diagnosis.assessment import chance_text
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.effects import CATALOGUE, find
-from tmlattice.inference.judge import Misfit
+from tmlattice.inference.validation import Misfit
 from tmlattice.report.action_texts import (
     action_text,
     consequence_text,
@@ -291,7 +291,7 @@ def gap_head(diagnosis: Diagnosis) -> tuple[str, str, str]:
     model, gap = diagnosis.ring.model, diagnosis.heldout
     if diagnosis.since_reference:
         model = "reference"
-    elif gap is not None and gap.since:
+    elif gap is not None and gap.baseline:
         model = f"{model} with distributed errors" if diagnosis.priors else "before"
     return "readings less model, rms", model, "with the findings"
 
@@ -306,7 +306,7 @@ def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     gap = diagnosis.heldout
     if gap is not None:
         rows.append(
-            (f"held out ({heldout_text(diagnosis)})", gap.misfits[gap.since], gap.misfits[-1])
+            (f"held out ({heldout_text(diagnosis)})", gap.misfits[gap.baseline], gap.misfits[-1])
         )
     return [
         (name, *(_misfit_text(m) for m in (before, after)))  # type: ignore[misc]
@@ -325,7 +325,7 @@ def heldout_text(diagnosis: Diagnosis) -> str:
         return f"shots {', '.join(map(str, diagnosis.heldout_shots))}"
     if not diagnosis.by_steps:
         return "at half of the BPMs"
-    return f"{int(diagnosis.response.held.sum())} correctors"
+    return f"{diagnosis.correctors_held_out} correctors"
 
 
 def _chi2(value: float) -> str:

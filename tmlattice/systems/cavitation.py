@@ -261,7 +261,7 @@ def learn(radii: ArrayLike, model: Bubble) -> LearnedBubble:
 
 @dataclass(frozen=True)
 class CavitationStudy:
-    """Everything of `tmlattice reproduce cavitation`."""
+    """Everything of `tmlattice dev reproduce cavitation`."""
 
     bubble: Bubble
     run: Run

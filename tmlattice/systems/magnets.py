@@ -234,7 +234,7 @@ def _readings(ring: "Ring", x: Array, order: int) -> Array:
 
 @dataclass(frozen=True)
 class MagnetStudy:
-    """Everything of `tmlattice reproduce magnets`."""
+    """Everything of `tmlattice dev reproduce magnets`."""
 
     agreements: list[Agreement]
     turns: list[ThirdOrderTurn]

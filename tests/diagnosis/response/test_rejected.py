@@ -89,7 +89,7 @@ def test_prediction_of_the_written_files_reproduces_the_held_out_figure(day):
     ring, measured, folder = day
     told = json.loads((folder / "found.diagnosis.json").read_text())
     figure = told["steps"][-1]["heldout_rms_in_plane"]
-    gone = {own["element"] for own in told["rejected"] if own["plane"] is None}
+    gone = {own["element"] for own in told["rejected_channels"] if own["plane"] is None}
     kept = measured.select(correctors=[c for c in measured.correctors if c not in gone])
     options = told["provenance"]
     rng = np.random.default_rng(options["seed"])
@@ -109,7 +109,7 @@ def test_prediction_of_the_written_files_reproduces_the_held_out_figure(day):
 def test_rejected_channels_are_empty_in_the_prediction_and_no_others(day):
     _, measured, folder = day
     told = json.loads((folder / "found.diagnosis.json").read_text())
-    rejected = {(own["element"], own["plane"]) for own in told["rejected"]}
+    rejected = {(own["element"], own["plane"]) for own in told["rejected_channels"]}
     assert (ONE, "y") in rejected
     assert (CORRECTOR, None) in rejected
     assert len(rejected) < 8

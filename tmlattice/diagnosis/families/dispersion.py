@@ -166,19 +166,19 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
             )
 
 
-def kicks_astray(at: Predicted) -> Array | None:
+def fitted_orbit_kicks(at: Predicted) -> Array | None:
     """What makes the dispersion that the errors have beside the ring's, as kicks behind each magnet
     in x and y, rad, [magnet, 2]: see `ResponseModel`. In the ring with its errors, in which other
     kicks make it than in the design. None where there is no such dispersion.
     """
-    ring, astray = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
+    ring, orbit_kicks = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
     beside = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))
     for plane in (0, 1):
         if beside[:, plane].any():
             patterns = patterns_of_kicks(at, plane)
             amounts = np.linalg.lstsq(patterns.rf.T, beside[:, plane], rcond=None)[0]
-            astray[kicking(ring, plane), plane] = amounts @ patterns.kicks
-    return astray if astray.any() else None
+            orbit_kicks[kicking(ring, plane), plane] = amounts @ patterns.kicks
+    return orbit_kicks if orbit_kicks.any() else None
 
 
 def dispersion_beside(

@@ -7,7 +7,7 @@ import numpy as np
 
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.response_noise import OVERSTATED, stated_and_shown
+from tmlattice.observe.response_noise import OVERSTATED, stated_and_estimated
 
 UNDERSTATED = 2.0
 """So many times the stated noise is told, where the readings show it."""
@@ -54,7 +54,7 @@ def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
 
 def _misstated(data: ResponseData) -> list[str]:
     """Where the readings scatter by far more, or less, than the noise that is stated."""
-    both = stated_and_shown(data.ring, data.measured)
+    both = stated_and_estimated(data.ring, data.measured)
     if both is None:
         return []
     messages = []

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
-from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, kicks_astray
+from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
 from tmlattice.diagnosis.families.energy import EnergyOffset
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
@@ -125,12 +125,12 @@ def diagnose_change(
     rng = np.random.default_rng(seed)
     open_families = () if same else FAMILIES
     fitted, more = _reference(first, split_columns(first, holdout, rng), open_families, progress)
-    astray = kicks_astray(fitted.at)
+    orbit_kicks = fitted_orbit_kicks(fitted.at)
     said += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]
     first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
 
     def change(measured: OrbitResponse) -> ResponseData:
-        return response_change(first, errors, response_data(ring, measured), astray)
+        return response_change(first, errors, response_data(ring, measured), orbit_kicks)
 
     _, data, swaps_after = all_right(change, second.measured, holdout)
     there = data.ring

@@ -24,10 +24,10 @@ from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, strong
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference.alternatives import Detection
+from tmlattice.inference.common_factors import CommonFactor, FactorModel, GivenOthers
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.levels import BesideOthers, Levels, Reason
 from tmlattice.inference.normal import solve
-from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -67,7 +67,7 @@ class _Weighed:
     """Candidates beside some scatter, those that are there, and the log evidence of all that."""
 
     among: _Candidates
-    there: BesideOthers
+    there: GivenOthers
     evidence: float
 
 
@@ -148,12 +148,12 @@ def _by_evidence(
     def weighed(scatter: Mapping[str, float]) -> _Weighed:
         among = _candidates(state, fitted.values(), scatter)
         odds = [0.0 if name == FamilyGradient.name else ALONE for name, _ in among.causes]
-        levels = Levels(
+        levels = FactorModel(
             information / wider**2, pull / wider**2, among.members, among.scatter,
             np.full(len(odds), USUAL), np.array(odds),
         )  # fmt: skip
         supplies = [i for i, (name, _) in enumerate(among.causes) if name == FamilyGradient.name]
-        there = levels.beside_others(levels.choose(MOST), supplies, OTHERS)
+        there = levels.given_others(levels.choose(MOST), supplies, OTHERS)
         evidence = there.levels.background + there.levels.log_evidence(there.chosen)
         return _Weighed(among, there, evidence)
 
@@ -205,10 +205,10 @@ def _widened(state: State, block: int, there: Linear) -> float:
 
 
 def _finding(
-    ring: Ring, names: Sequence[tuple[str, str]], own: Reason, judgement: Judgement
+    ring: Ring, names: Sequence[tuple[str, str]], own: CommonFactor, judgement: Judgement
 ) -> Finding:
-    chance = np.array([p for _, p in own.rivals])
-    causes = [Cause(*names[c], own.amount) for c, _ in own.rivals]
+    chance = np.array([p for _, p in own.alternatives])
+    causes = [Cause(*names[c], own.amount) for c, _ in own.alternatives]
     shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
     seen = Detection.among(own.statistic, len(names))
     return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)

@@ -23,7 +23,7 @@ from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes
 from tmlattice.diagnosis.support import share_from_data
-from tmlattice.inference.levels import CLEAR, Levels
+from tmlattice.inference.common_factors import MIN_CHI2, FactorModel
 from tmlattice.inference.normal import solve
 from tmlattice.inference.sets import LikelySet, likely_sets, over_sets
 from tmlattice.lattice.supplies import magnets
@@ -204,7 +204,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
     found = [
         (one, chance)
         for one, chance in over_sets(levels, sets)
-        if one.statistic >= CLEAR  # families that do not stand out are in the sets all the same
+        if one.statistic >= MIN_CHI2  # families that do not stand out are in the sets all the same
     ]
     places = [pieces[0].name for pieces in own]
     common_factors = tuple(
@@ -212,7 +212,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
             kinds[one.candidate], names[one.candidate],
             tuple(places[i] for i in np.flatnonzero(members[:, one.candidate])),
             one.amount, one.sigma, chance, one.statistic, MAKES[kinds[one.candidate]],
-            tuple((names[c], p) for c, p in one.rivals[1:]),
+            tuple((names[c], p) for c, p in one.alternatives[1:]),
             share_from_data(one.sigma, float(levels.slab[one.candidate])),
         )
         for one, chance in found
@@ -226,7 +226,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
         Instead(one.probability, tuple(
             (names[c], one.amount(c), float(np.sqrt(one.variance(c))))
             for c, square in zip(one.chosen, levels.squares(one.chosen), strict=True)
-            if square >= CLEAR
+            if square >= MIN_CHI2
         ))
         for one in sets[1 : SETS + 1] if one.probability > LIKELY
     )  # fmt: skip
@@ -249,7 +249,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
 
 def weighed(
     information: Array, pull: Array, among: Candidates, beside: Array
-) -> tuple[float, Levels, list[LikelySet]]:
+) -> tuple[float, FactorModel, list[LikelySet]]:
     """How much families differ, by evidence, and the sets of reasons beside that.
 
     Where families differ by no more than their magnets, one that is off is a reason as others are.
@@ -271,11 +271,11 @@ def weighed(
     families, others = np.flatnonzero(among.families), np.flatnonzero(~among.families)
     alone = np.diag(1.0 - np.minimum(among.members[:, families].sum(axis=1), 1.0))
 
-    def levels(at: NDArray[np.int64], between: float) -> Levels:
+    def levels(at: NDArray[np.int64], between: float) -> FactorModel:
         share = among.members[:, families] * between
         scatter = beside + share @ share.T + between**2 * alone
         slab = np.full(len(at), max(USUAL, between))
-        return Levels(information, pull, among.members[:, at], scatter, slab, cost[at])
+        return FactorModel(information, pull, among.members[:, at], scatter, slab, cost[at])
 
     alike = levels(np.arange(len(cost)), 0.0)
     best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + MORE
@@ -288,7 +288,7 @@ def weighed(
         return 0.0, alike, likely_sets(alike, MOST)
     slab = np.full(len(cost), max(USUAL, best))
     slab[families] = best
-    whole = Levels(information, pull, among.members, beside + best**2 * alone, slab, cost)
+    whole = FactorModel(information, pull, among.members, beside + best**2 * alone, slab, cost)
     sets = []
     for one in likely_sets(levels(others, best), MOST):
         chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())

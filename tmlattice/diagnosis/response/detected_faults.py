@@ -32,11 +32,11 @@ from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspe
 from tmlattice.diagnosis.response.validation import Chi2, score
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
+from tmlattice.inference.alternatives import linear_evidence
+from tmlattice.inference.common_factors import MIN_CHI2
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.levels import CLEAR
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
-from tmlattice.inference.rivals import linear_evidence
 from tmlattice.inference.scan import Scan
 from tmlattice.observe.orbit_response import Hypothesis
 from tmlattice.observe.response_data import ResponseData
@@ -250,7 +250,7 @@ class _Search:
         while len(state.apart) > 1:
             seen = self.seen(state)
             worth = [_shown(seen, one)[0] for one in state.apart]
-            if min(worth) > CLEAR:
+            if min(worth) > MIN_CHI2:
                 break
             least = state.apart[int(np.argmin(worth))]
             fewer = _settled(_without(state, least))
@@ -279,7 +279,9 @@ class _Search:
         statistic, cause, _ = _shown(seen, one)
         if not abs(cause.amount) < BEYOND * find(cause.effect).largest:
             return False
-        return statistic > CLEAR and self.p_value(seen, statistic, one) < self.judgement.false_alarm
+        return (
+            statistic > MIN_CHI2 and self.p_value(seen, statistic, one) < self.judgement.false_alarm
+        )
 
     def fault(self, seen: Seen, one: Apart) -> Fault:
         """With its amount, its error and its rivals."""

@@ -15,9 +15,9 @@ from tmlattice.diagnosis.response.stated import unwidened
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.support import Support
 from tmlattice.effects import Cause
+from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.normal import solve
-from tmlattice.inference.rivals import Detection
 
 DRIFT, OUTSTANDING = 0.03, 8.0
 """A monitor or a corrector is told where it changed by more than this, and by so many times as much

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
+from tmlattice.inference.alternatives import Detection
+from tmlattice.inference.common_factors import MIN_CHI2
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.levels import CLEAR
-from tmlattice.inference.rivals import Detection
 from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors
 from tmlattice.observe.response_data import ResponseData
@@ -42,7 +42,7 @@ class Fault:
         chance = np.exp(self.evidence - self.evidence.max())
         chance /= chance.sum()
         shown = self.rivals[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
-        seen = Detection(self.statistic, CLEAR, self.p_value)
+        seen = Detection(self.statistic, MIN_CHI2, self.p_value)
         return finding_of(ring, self.rivals, chance, shown, self.sigma, seen, judgement.mass)
 
 

@@ -1,10 +1,11 @@
 """What a hierarchical fit of an orbit response found, as causes with errors."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from tmlattice.diagnosis.correlations import Correlation, correlations_of
 from tmlattice.diagnosis.families.family import Family, StatedCause
@@ -23,13 +24,15 @@ AGAINST, SHOWN = 0.4, 3
 
 def fitted_causes(
     state: State,
-) -> tuple[list[StatedCause], tuple[Support, ...], tuple[str, ...], tuple[Correlation, ...]]:
+) -> tuple[list[StatedCause], tuple[Support, ...], tuple[str, ...], tuple[Correlation, ...], Array]:
     """Causes with stated errors; how much of each comes from the data; what the data alone do not
-    settle, in words; and the amounts that they hardly separate."""
+    settle, in words; the amounts that they hardly separate; and the covariance of the stated
+    errors, [cause, cause]: of one plane with the other none is taken."""
     found: list[StatedCause] = []
     supports: list[Support] = []
     messages: tuple[str, ...] = ()
     pairs: list[Correlation] = []
+    blocks: list[Array] = []
     for block in (0, 1):
         families = {f.variable: f for f in state.of_block(block)}
         if not families:
@@ -37,14 +40,33 @@ def fitted_causes(
         there = linear(state, block)
         posterior = solve(there.normal, there.groups, there.start, rounds=0)
         known = stated(state, block, there, posterior)
+        own: list[StatedCause] = []
         for row, support in with_support(state, families.values(), there, known):
             if row[0].amount != 0 or row[1] != 0:
-                found.append(row)
+                own.append(row)
                 supports.append(support)
+        blocks.append(_covariance(own, _numbers(state, families.values(), there), known.covariance))
+        found += own
         pairs += _correlated(state, families.values(), there, known.covariance)
         if block == 0:
             messages = _degenerate(state, there, posterior)
-    return found, tuple(supports), messages, tuple(pairs)
+    return found, tuple(supports), messages, tuple(pairs), block_diag(*blocks)
+
+
+def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: Array) -> Array:
+    """Of the causes of a block: correlations of the fit's numbers, and the stated errors."""
+    place = {(cause.effect, cause.element): i for i, (cause, _) in enumerate(rows)}
+    slopes = np.zeros((len(rows), len(covariance)))
+    for number, moves in numbers.items():
+        for hypothesis, amount in moves.items():
+            if hypothesis in place:
+                slopes[place[hypothesis], number] = amount
+    both = slopes @ covariance @ slopes.T
+    width = np.sqrt(np.maximum(np.diag(both), 1e-300))
+    correlation = both / width[:, None] / width
+    np.fill_diagonal(correlation, 1.0)
+    sigma = np.array([own for _, own in rows])
+    return np.asarray(sigma[:, None] * correlation * sigma)
 
 
 def _correlated(

@@ -266,7 +266,7 @@ def _monitor_position(state: State) -> Hypothesis:
     model = state.at.model
     columns = model.columns(state.data.measured.correctors)
     start = np.vstack([columns.start, model.rf_start])
-    behind = np.vstack([columns.pulled * 1.0, np.zeros(model.dimension)])
+    behind = np.vstack([columns.launch_kick * 1.0, np.zeros(model.dimension)])
     after = np.vstack([model.downstream(columns), np.zeros((1, len(model.monitors)), bool)])
     slopes = model.tangents[model.maps.at][:, [1, 3]]
     angle = np.einsum("mai,ci->cma", slopes, start)

@@ -15,7 +15,7 @@ from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.response.misplaced import Misplaced, moved_text
 from tmlattice.diagnosis.response.swaps import Swaps
 from tmlattice.diagnosis.result import Finding
-from tmlattice.inference.rivals import Detection
+from tmlattice.inference.alternatives import Detection
 from tmlattice.lattice import Ring
 
 NEAR = 0.25

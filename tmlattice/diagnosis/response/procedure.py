@@ -62,8 +62,8 @@ from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
-from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import response_data
@@ -132,7 +132,8 @@ def diagnose_response(
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
-    if sparse is None or overstated(ring, data.measured):  # to such a noise a few explain anything
+    # a few causes explain anything to an overstated noise
+    if sparse is None or overstated(ring, data.measured):
         whole = _families(ring, measured, families, holdout, seed, progress)
         sparse = None if sparse is None or outperforms(whole[0], sparse.fit) else sparse
     rejected: tuple[tuple[str, str | None], ...] = ()
@@ -141,10 +142,11 @@ def diagnose_response(
         said += unlike if measured.response.size <= LARGE else [*unlike, TOO_LARGE]
         rejected = tuple(swaps.rejected)
         fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
-        found, supports, degenerate, correlated = fitted_causes(fit.state)
+        found, supports, degenerate, correlated, covariance = fitted_causes(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
         fit, found, supports, degenerate, correlated = sparse.fit, sparse.fitted_causes, (), (), ()
+        covariance = None
         verdict, findings = sparse.verdict, sparse.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {
@@ -165,6 +167,7 @@ def diagnose_response(
         degenerate=degenerate,
         rejected_channels=rejected,
         correlations=correlated,
+        covariance=covariance,
         supports=supports,
         hypotheses=rows,
         common_factors=None if sparse is not None else explain_gradients(fit.state),

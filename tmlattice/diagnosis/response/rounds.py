@@ -24,7 +24,7 @@ from tmlattice.diagnosis.response.weights import (
     weight,
 )
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.common import beside, common
+from tmlattice.inference.common import common, times_precision
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.priors import Group
 from tmlattice.inference.triangles import inverse_of_lower
@@ -79,7 +79,7 @@ def one_round(state: State, blocks: Mapping[int, Linear], bold: float = 1.0) -> 
         total = 0.0
         for block, own in weights.items():
             left = np.where(own[0] > 0, state.data.pick(at.at.left, block), 0.0)
-            total += float(np.sum(left * beside(*own, left)))
+            total += float(np.sum(left * times_precision(*own, left)))
         for block, there in blocks.items():
             for name, rows in there.where.items():
                 priors = [g for g in found[block].groups if g.basis[rows].any()]
@@ -127,7 +127,7 @@ def _corrected(
     for name, at in there.where.items():
         moved[at] = then.values[name] - there.start[at]
     data = then.data
-    left = beside(*weights, data.pick(then.at.left, block))
+    left = times_precision(*weights, data.pick(then.at.left, block))
     vector = gathered(there, data.plane_of(block), left) + there.normal.matrix @ moved
     bounds = bold * there.trust
     return found.solved(vector + there.normal.matrix @ there.start + there.start / bounds**2)

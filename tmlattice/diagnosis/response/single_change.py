@@ -18,10 +18,10 @@ from scipy.optimize import minimize_scalar
 from tmlattice.diagnosis.response.undetermined import Blur
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.among import Blurred
+from tmlattice.inference.alternatives import Alternative
+from tmlattice.inference.distributed import MarginalProblem
 from tmlattice.inference.newton import Fit, Outcome
 from tmlattice.inference.problem import Hypothesis
-from tmlattice.inference.rivals import Rival
 from tmlattice.inference.root import directions_of
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ class SingleChange:
         self.blur, self.plain = blur, blur.problem
         self.left = self.plain.at((), self.plain.first).residual
 
-    def likeliest(self, hypothesis: Hypothesis, start: float | None = None) -> Rival | None:
+    def likeliest(self, hypothesis: Hypothesis, start: float | None = None) -> Alternative | None:
         """A change with its likeliest amount; None where the readings want none of it.
 
         Args:
@@ -182,7 +182,7 @@ class SingleChange:
 
     def _rival(
         self, hypothesis: Hypothesis, unit: Array, amount: float, sigma: float, density: float
-    ) -> Rival:
+    ) -> Alternative:
         """As a fit; its point is among what is open of this change."""
         problem = self.blur.among(amount ** find(hypothesis[0]).power * unit)
         point = problem.at((Cause(*hypothesis, amount),), problem.first)
@@ -190,13 +190,13 @@ class SingleChange:
         if sigma:
             evidence += 0.5 * np.log(2 * np.pi * sigma**2)
         covariance = np.array([[sigma**2]])
-        return Rival(hypothesis, Fit(point, covariance, float(evidence), Outcome.CONVERGED))
+        return Alternative(hypothesis, Fit(point, covariance, float(evidence), Outcome.CONVERGED))
 
-    def among(self, one: Rival) -> Blurred:
+    def among(self, one: Alternative) -> MarginalProblem:
         """The problem among what is open of a change."""
         return self.blur.among(self.blur.of((one.cause,)))
 
-    def all_of(self, starts: Mapping[Hypothesis, float | None]) -> tuple[Rival, ...]:
+    def all_of(self, starts: Mapping[Hypothesis, float | None]) -> tuple[Alternative, ...]:
         """Of some hypotheses, with amounts near theirs, by falling evidence."""
         tried = (self.likeliest(hypothesis, start) for hypothesis, start in starts.items())
         found = [rival for rival in tried if rival is not None]

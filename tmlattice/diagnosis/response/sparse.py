@@ -24,11 +24,11 @@ from tmlattice.effects import LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
+from tmlattice.inference.alternatives import Detection, leading
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
-from tmlattice.inference.rivals import Detection, leading
 from tmlattice.inference.scan import scan
-from tmlattice.inference.search import Explanation, Named, Search, explain
+from tmlattice.inference.search import Explanation, Identified, Search, explain
 from tmlattice.observe.orbit_response import Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response, single_causes
@@ -233,7 +233,7 @@ def _among_open(
         return found
     nothing = np.zeros(plain.valid.shape, dtype=bool)
     one = Explanation(
-        plain, tried[0].fit, nothing, (Named(detection, tried),),
+        plain, tried[0].fit, nothing, (Identified(detection, tried),),
         before=before, first=seen, scan=seen,
     )  # fmt: skip
     more, evidence = _unsure(search, blur, one)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.priors import GUESSED, Group
+from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
@@ -178,7 +178,7 @@ class State:
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
     apart: tuple[Apart, ...] = ()
-    guessed: float = GUESSED
+    guessed: float = SCALE_SPREAD
     explained: tuple[Family, ...] = ()
     outcome: Outcome | None = None
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import Apart, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
-from tmlattice.inference import unknown_sizes
-from tmlattice.inference.clusters import Found, Rows, widened
+from tmlattice.inference import scale_uncertainty
+from tmlattice.inference.clusters import LinearFit, Rows, cluster_robust_errors
 from tmlattice.inference.heavy_tails import moments
 from tmlattice.inference.normal import Posterior
-from tmlattice.inference.unknown_sizes import MANY
+from tmlattice.inference.scale_uncertainty import MAX_MEMBERS
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -
     """Posterior errors, widened where single columns, or monitors, contradict all others; see
     `stated`."""
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
-    found = Found.of(there.normal.matrix, covariance)
+    found = LinearFit.of(there.normal.matrix, covariance)
     return _widened(state, block, there, posterior, found)
 
 
@@ -78,11 +78,11 @@ def of_sizes(state: State, block: int, there: Linear) -> Array:
     tried = [
         family
         for family in state.explained
-        if family.block == block and family.per == "ring" and family.size(state.data) <= MANY
+        if family.block == block and family.per == "ring" and family.size(state.data) <= MAX_MEMBERS
     ]
     whole = linear(allow(state, tried), block) if tried else there
     gone = [group.name for family in tried for group in family.groups(state.data)]
-    more = unknown_sizes.of_sizes(whole.normal, whole.groups, whole.start, gone)
+    more = scale_uncertainty.scale_covariance(whole.normal, whole.groups, whole.start, gone)
     return more[: len(there.start)]  # what was tried comes after
 
 
@@ -98,12 +98,14 @@ def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> floa
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     along = one.wide * posterior.spread @ posterior.covariance[:, [at]]
     variance = one.wide**2 * posterior.covariance[[at], at]
-    found = Found(there.normal.matrix, covariance, along, variance)
+    found = LinearFit(there.normal.matrix, covariance, along, variance)
     (sigma,) = _widened(state, one.block, there, posterior, found)
     return float(sigma**2 / variance[0])
 
 
-def _widened(state: State, block: int, there: Linear, posterior: Posterior, found: Found) -> Array:
+def _widened(
+    state: State, block: int, there: Linear, posterior: Posterior, found: LinearFit
+) -> Array:
     data = state.data
     rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.by_ring)
     weights = weight(state, block)
@@ -112,4 +114,4 @@ def _widened(state: State, block: int, there: Linear, posterior: Posterior, foun
     for column in np.flatnonzero(weights.any(axis=1)):
         seen = np.flatnonzero(weights[column])
         left[column, seen] -= rows.times(np.full(len(seen), column), seen, moved[:, None])[:, 0]
-    return widened(rows, weights, left, found, taken(state, block))
+    return cluster_robust_errors(rows, weights, left, found, taken(state, block))

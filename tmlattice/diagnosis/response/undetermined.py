@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, background_rms, find
-from tmlattice.inference.among import Blurred
+from tmlattice.inference.distributed import MarginalProblem
 from tmlattice.inference.normal import solve
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
@@ -146,10 +146,10 @@ class Blur:
         spread = self.open.root.T @ (self._signatures(causes) - self._without)
         return np.asarray(spread.reshape(-1, *self.problem.used.shape))
 
-    def among(self, spread: Array) -> Blurred:
+    def among(self, spread: Array) -> MarginalProblem:
         """The problem among errors that make so much of the readings."""
         own = self.problem
-        return Blurred(
+        return MarginalProblem(
             inner=own, spread=spread, places=own.places, rare=own.rare, amounts=own.amounts,
             judgement=own.judgement,
         )  # fmt: skip

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.state import DRIFT, KINDS, PLACE, WAVED, State
-from tmlattice.inference.common import amounts, beside, common
+from tmlattice.inference.common import amounts, common, times_precision
 from tmlattice.inference.priors import Group
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ def taken(state: State, block: int) -> Array:
 def weighed(state: State, block: int, left: Array) -> Array:
     """Inverse covariance of the readings that are fitted times what is left, 1/m, [column,
     monitor]."""
-    return beside(weight(state, block), taken(state, block), left)
+    return times_precision(weight(state, block), taken(state, block), left)
 
 
 def log_likelihood(state: State, block: int) -> float:

@@ -1,0 +1,157 @@
+"""Measurements stacked to one problem, and any problem among small errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from tmlattice import Cause, simulate
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.diagnosis.prepare import prepare
+from tmlattice.effects import apply, background_rms, find, monitors_with
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference import distributed
+from tmlattice.inference.combined import CombinedProblem
+from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.newton import fit
+from tmlattice.measurement import ClosedOrbit
+from tmlattice.observe.orbits import closed_orbits
+
+WEAK = Cause("quadrupole_gradient", "QD::3", -0.02)
+NOISE = 1e-6
+
+
+def _orbit(ring, causes, seed):
+    model = ResponseModel(apply(ring, causes))
+    read = monitors_with(ring, causes).read(model.readings)
+    read = read + NOISE * np.random.default_rng(seed).standard_normal(read.shape)
+    names = tuple(monitor.name for monitor in ring.monitors)
+    return ClosedOrbit(orbit=read[None], monitors=names, noise=(NOISE, NOISE))
+
+
+@pytest.fixture(scope="module")
+def turns(small_ring):
+    measured = simulate(small_ring, [WEAK], shots=3, seed=3).measurement()
+    return prepare(small_ring, measured, None, False, None, DEFAULT).problem
+
+
+@pytest.fixture(scope="module")
+def orbit(small_ring):
+    kick = Cause("corrector_kick_x", "v6", 2e-5)
+    return closed_orbits(small_ring, _orbit(small_ring, [WEAK, kick], 1), {})
+
+
+def test_rows_of_both_are_the_rows_of_each(turns, orbit):
+    both = CombinedProblem.of([turns, orbit])
+    point = both.at([WEAK], both.first)
+    alone = [part.at([WEAK], part.first) for part in (turns, orbit)]
+    assert_allclose(point.chi2, sum(one.chi2 for one in alone))
+    some = [(WEAK.effect, WEAK.element), ("monitor_gain_x", "end_1"), ("energy_spread", None)]
+    rng = np.random.default_rng(0)
+    data = rng.standard_normal((2, len(point.residual)))
+    found = both.metric(point).products(some, data)
+    rows = both.metric(point).rows(some)
+    assert_allclose(found.whole, np.einsum("hr,hr->h", rows, rows), rtol=1e-9)
+    assert_allclose(found.inner, rows @ data.T, rtol=1e-9, atol=1e-9)
+    assert (rows[2, len(alone[0].residual) :] == 0).all()  # a closed orbit has no launch
+
+
+def test_slopes_of_both_are_the_scans(turns, orbit):
+    both = CombinedProblem.of([turns, orbit])
+    point = both.at([WEAK], both.first)
+    h = 1e-5
+    up, down = (
+        both.at([replace(WEAK, amount=WEAK.amount + side * h)], both.first).residual
+        for side in (1, -1)
+    )
+    slope = both.slope(point, 0)
+    assert_allclose(slope, (down - up) / (2 * h), atol=2e-4 * np.abs(slope).max())
+
+
+def test_many_fixed_causes_act_as_ones_that_are_sought(turns, orbit):
+    """They stand in the model, or are put on each trajectory: of magnets, monitors and the beam."""
+    rng = np.random.default_rng(2)
+    fixed = tuple(
+        Cause(effect, f"{name}::{i}", size * rng.standard_normal())
+        for i in range(1, 8)
+        for effect, name, size in (
+            ("quadrupole_gradient", "QF", 1e-2), ("quadrupole_offset_x", "QD", 3e-4),
+            ("monitor_gain_y", "bpm", 0.05), ("monitor_offset_x", "bpm", 1e-4),
+        )
+    )  # fmt: skip
+    fixed += (Cause("energy_offset", None, 1e-4),)
+    both = CombinedProblem.of([turns, orbit])
+    with_fixed = replace(both, fixed=fixed).at([WEAK], both.first)
+    assert_allclose(
+        with_fixed.residual, both.at([*fixed, WEAK], both.first).residual, rtol=1e-9, atol=1e-6
+    )
+    assert np.abs(with_fixed.residual - both.at([WEAK], both.first).residual).max() > 10
+    slope = replace(both, fixed=fixed).slope(with_fixed, 0)
+    point = both.at([*fixed, WEAK], both.first)
+    assert_allclose(slope, both.slope(point, len(fixed)), rtol=1e-6, atol=1e-4)
+
+
+def test_a_reference_has_what_is_fixed_and_not_what_is_sought(orbit):
+    both = CombinedProblem.of([orbit], [orbit])
+    cause = Cause("corrector_kick_x", "v6", 2e-5)
+    count = len(orbit.at((), orbit.first).residual)
+    sought = both.at([cause], both.first).residual
+    fixed = replace(both, fixed=(cause,)).at((), both.first).residual
+    assert_allclose(sought[:count], fixed[:count])
+    assert np.abs(sought[count:] - fixed[count:]).max() > 1
+
+
+def test_fast_products_among_small_errors_are_those_of_all_signatures(turns):
+    """Two ways to the same scan: sums over readings, and signatures that are whitened."""
+    rms = {name: find(name).background for name in ("quadrupole_gradient", "monitor_gain_x")}
+    everywhere = [(name, place) for name in rms for place in find(name).places(turns.model.ring)]
+    start = fit(turns, (), turns.first)
+    among = fit_distributed_errors(
+        turns, DistributedErrors.usual(everywhere, rms), start.nuisances, learn=False
+    )
+    assert among.before.chi2 < 0.9 * start.chi2
+    problem = among.problem
+    some = [(WEAK.effect, WEAK.element), ("monitor_offset_y", "end_1"), ("energy_spread", None),
+            ("quadrupole_offset_x", "QF::3"), ("monitor_swap", "bpm::4")]  # fmt: skip
+    data = among.before.residual[None]
+    found = problem.metric(among.before.point).products(some, data)
+    out = among.before.projection.out
+    rows = out(problem.white(turns.metric(among.before.point.view).rows(some)))
+    assert_allclose(found.whole - found.inside, np.einsum("hr,hr->h", rows, rows), rtol=1e-6)
+    assert_allclose(found.inner, rows @ out(data).T, rtol=1e-6, atol=1e-6)
+
+
+def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):
+    """Sizes learnt from closed orbits; a corrector that is far off stands out among them."""
+    usual = background_rms({"all": None})
+    rng = np.random.default_rng(5)
+    small = [
+        Cause(name, place, float(rms * rng.standard_normal()))
+        for name, rms in usual.items()
+        for place in find(name).places(small_ring)
+    ]
+    everywhere = [(cause.effect, cause.element) for cause in small]
+    problem = closed_orbits(small_ring, _orbit(small_ring, small, 2), {})
+    learnt = fit_distributed_errors(
+        problem, DistributedErrors.usual(everywhere, usual), problem.first
+    )
+    assert learnt.log_evidence > 1e3
+    assert 0.5 < learnt.before.chi2 / problem.valid.sum() < 1.5  # 70 readings: +- 0.17
+    assert 0.5 < learnt.sizes["quadrupole_offset_x"] / usual["quadrupole_offset_x"] < 2
+
+
+def test_small_errors_that_need_a_cause_to_store_a_beam_are_a_sentence(small_ring, monkeypatch):
+    """The search went on from a point that is none (AssertionError)."""
+    usual = background_rms({"quadrupole_offset_x": None})
+    everywhere = [(n, place) for n in usual for place in find(n).places(small_ring)]
+    problem = closed_orbits(small_ring, _orbit(small_ring, [], 2), {})
+
+    def lost(problem, causes, nuisances):
+        there = fit(problem, causes, nuisances)
+        return replace(there, point=replace(there.point, projection=None, lost="no orbit"))
+
+    monkeypatch.setattr(distributed, "fit", lost)
+    with pytest.raises(UnstableRingError, match="no orbit with distributed errors"):
+        fit_distributed_errors(problem, DistributedErrors.usual(everywhere, usual), problem.first)

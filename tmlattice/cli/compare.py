@@ -1,0 +1,35 @@
+"""`tmlattice compare`: what two diagnoses, two lattices or two orbit responses differ in."""
+
+from contextlib import nullcontext
+from pathlib import Path
+
+import click
+
+from tmlattice.cli.options import Careful, console, json_option, quiet_option
+
+
+@click.command("compare", cls=Careful)
+@click.argument("first", metavar="A")
+@click.argument("second", metavar="B")
+@json_option
+@quiet_option
+def compare(first: str, second: str, json_file: Path | None, quiet: bool) -> None:
+    """List what A and B differ in: two diagnoses, two lattices or two orbit responses.
+
+    A and B are folders of `tmlattice diagnose --out` (or a diagnosis.json); built-in names or
+    lattice files; or measurement folders. Errors are differences over their standard errors, both
+    taken as independent. Of a response each corrector's orbits are compared at the kick of A: rms
+    of the difference beside what the noise alone makes, and the ratio of the two responses.
+    """
+    from tmlattice.files import output_file, write_json
+    from tmlattice.report.compare import compare as run
+
+    with output_file(json_file) if json_file else nullcontext() as path:
+        found = run(first, second)
+        if path:
+            write_json(path, found.as_json())
+    if not quiet:
+        screen = console()
+        screen.print(found.report(), soft_wrap=True)
+        if json_file:
+            screen.print(f"written: {json_file}")

@@ -1,0 +1,216 @@
+"""A diagnosis of its file: `Diagnosis.load("result")`.
+
+The file holds findings, errors, steps and every sentence of the report. It does not hold the
+readings, the scan and the covariance: what needs them says so.
+"""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass, replace
+from functools import cache
+from os import PathLike
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from tmlattice.diagnosis.assessment import Block
+from tmlattice.diagnosis.consequences import Consequences
+from tmlattice.diagnosis.correlations import Correlation
+from tmlattice.diagnosis.next_measurement import NextMeasurement
+from tmlattice.diagnosis.recommended_actions import element_kind
+from tmlattice.diagnosis.response.common_factors import CommonFactors, Instead
+from tmlattice.diagnosis.response.hierarchical import Step
+from tmlattice.diagnosis.response.inconsistencies import Inconsistency
+from tmlattice.diagnosis.response.missing_effects import Weighed
+from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.support import Support
+from tmlattice.diagnosis.suspects import Suspect
+from tmlattice.diagnosis.views import PartView, StoredView
+from tmlattice.effects import Cause, RingEffect, apply, find
+from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.inference.validation import Gap, Misfit
+from tmlattice.lattice import Ring, load_ring
+from tmlattice.measurement.documents import read_document
+
+FORMAT = "tmlattice-diagnosis"
+DOCUMENT, LATTICE = "diagnosis.json", "diagnosis.lattice.json"
+"""Of a folder of `save`: the result, and the lattice that it is about."""
+
+_KEYS = {
+    (Consequences, "design"): "design_tunes",
+    (Instead, "amounts"): "common_factors",
+    (NextMeasurement, "parts"): "between",
+    (NextMeasurement, "separation"): "separation_sigma",
+    (PartView, "label"): "name",
+    (CommonFactors, "between"): "between_families",
+}
+"""Of a field, where the file calls it otherwise."""
+
+
+def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diagnosis:
+    """Return the diagnosis of a folder of `save`, or of a diagnosis.json.
+
+    Report and tables are those of the diagnosis that was saved. The file does not hold readings,
+    scan and covariance: figures of them and a correction need the diagnosis itself.
+
+    Args:
+        path: the folder, or the JSON file.
+        ring: the lattice; None: of the file diagnosis.lattice.json beside it, else the one that
+            the file names.
+
+    Raises:
+        MeasurementError: no diagnosis, a file of an earlier version that lacks something, or a
+            lattice that does not have its elements.
+        LatticeError: the lattice cannot be read.
+    """
+    place = Path(path)
+    file = place / DOCUMENT if place.is_dir() else place
+    document = read_document(file, "diagnosis", FORMAT)
+    ring = _ring(file, document) if ring is None else ring
+    places = {name for e in ring.elements for name in (e.name, e.family)}
+    for row in document["errors"]:
+        if row["element"] is not None and row["element"] not in places:
+            raise MeasurementError(f"'{file}': '{ring.name}' has no element '{row['element']}'")
+    try:
+        return _diagnosis(cls, document, ring)
+    except KeyError as error:
+        raise MeasurementError(
+            f"'{file}' of tmlattice {document['package']} does not hold {error}; diagnose again"
+        ) from error
+
+
+def _ring(file: Path, document: Mapping[str, Any]) -> Ring:
+    beside, named = file.with_name(LATTICE), str(document["provenance"].get("lattice"))
+    try:
+        ring = load_ring(beside if beside.is_file() else named)
+    except TmlatticeError as error:
+        raise MeasurementError(
+            f"'{file}' needs its lattice '{named}': put {LATTICE} beside it, or give the lattice "
+            f"(in Python: ring=) ({error})"
+        ) from error
+    return replace(ring, name=named)
+
+
+def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
+    noise, gap = d["readings_noise"], d["gap"]
+    causes = tuple(Cause(row["effect"], row["element"], row["amount"]) for row in d["errors"])
+    made: Diagnosis = cls(
+        verdict=d["verdict"],
+        findings=tuple(_finding(row, ring) for row in d["findings"]),
+        fit_before=decoded(Misfit, gap["fit"]["before"]),
+        fit_after=decoded(Misfit, gap["fit"]["after"]),
+        heldout=_gap(gap),
+        heldout_shots=tuple((gap["heldout"] or {}).get("shots", ())),
+        unexplained=dict(d["unexplained"]),
+        tunes=d["tunes"],
+        next=decoded(NextMeasurement | None, d["next_measurement"]),
+        sensitivity={name: decoded(float, value) for name, value in d["sensitivity"].items()},
+        warnings=tuple(d["warnings"]),
+        noise=(decoded(float, noise["x"]), decoded(float, noise["y"])),
+        noise_estimated=noise["estimated"],
+        provenance=d["provenance"],
+        ring=ring,
+        corrected=apply(ring, [cause for cause in causes if _in_ring(cause)]),
+        causes=causes,
+        errors=tuple(decoded(float, row["amount_sigma"]) for row in d["errors"]),
+        view=StoredView(
+            d["kind"],
+            tuple(_part(row) for row in d.get("measurements", ())),
+            tuple(d["assessment"]["measured"]),
+            (gap["heldout"] or {}).get("correctors"),
+        ),
+        outliers=tuple(d["outliers"]),
+        steps=decoded(tuple[Step, ...], d["steps"]),
+        rejected_steps=decoded(tuple[Step, ...], d["rejected_steps"]),
+        bad_monitors=tuple(d["bad_monitors"]),
+        priors=d["priors"],
+        prior_errors={name: decoded(float, value) for name, value in d["prior_errors"].items()},
+        degenerate=tuple(d["degenerate"]),
+        common_factors=decoded(CommonFactors | None, d["common_factors"]),
+        inconsistencies=decoded(Inconsistency | None, d["inconsistencies"]),
+        hypotheses=decoded(tuple[Weighed, ...] | None, d["hypotheses"]),
+        suspects=decoded(tuple[Suspect, ...], d["suspects"]),
+        rejected_channels=tuple((row["element"], row["plane"]) for row in d["rejected_channels"]),
+        compared=decoded(tuple[Block, ...], d["assessment"]["blocks"]),
+        correlations=decoded(tuple[Correlation, ...], d["correlations"]),
+        devices=d.get("devices", {}),
+        supports=decoded(tuple[Support, ...], d["errors"]),
+    )
+    return made
+
+
+def _in_ring(cause: Cause) -> bool:
+    effect = find(cause.effect)
+    return isinstance(effect, RingEffect) and not (effect.calibrates or effect.acts_on_settings)
+
+
+def _finding(row: Mapping[str, Any], ring: Ring) -> Finding:
+    first = row["recommended_action"]
+    stated = [] if first is None else [first, *row["alternative_actions"]]
+    actions = [{**own, "kind": element_kind(ring, own["element"])} for own in stated]
+    found: Finding = decoded(Finding, {**row, "recommended_actions": actions})
+    return found
+
+
+def _part(row: Mapping[str, Any]) -> PartView:
+    part: PartView = decoded(PartView, {**row, "monitors": [], "left": np.zeros((2, 0))})
+    return part
+
+
+def _gap(gap: Mapping[str, Any]) -> Gap | None:
+    held = gap["heldout"]
+    if held is None:
+        return None
+    return Gap(
+        decoded(tuple[Misfit, ...], held["steps"]),
+        np.zeros((0, 0, 0)),
+        gap["explained"],
+        decoded(tuple[float, float] | None, gap["explained_interval"]),
+        held["since"],
+        held["readings"],
+        held["lost"],
+    )
+
+
+def decoded(kind: Any, value: Any) -> Any:
+    """A value of a JSON file as the type that an attribute has.
+
+    Null is NaN for a number. A tuple of fixed length may be an object, by the order of its keys.
+
+    Raises:
+        KeyError: a field that is absent.
+    """
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        if value is None and NoneType in inner:
+            return None
+        return decoded(next(one for one in inner if one is not NoneType), value)
+    if kind is float:
+        return float("nan") if value is None else float(value)
+    if is_dataclass(kind):
+        return _record(kind, value)
+    if origin is tuple:
+        items = list(value.values()) if isinstance(value, Mapping) else value
+        if inner[-1] is Ellipsis:
+            return tuple(decoded(inner[0], item) for item in items)
+        return tuple(decoded(one, item) for one, item in zip(inner, items, strict=True))
+    if origin is Literal or not isinstance(origin, type) or not issubclass(origin, Mapping):
+        return value
+    return {key: decoded(inner[1], item) for key, item in value.items()}
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _record(kind: Any, row: Mapping[str, Any]) -> Any:
+    own = {}
+    for field in fields(kind):
+        key = _KEYS.get((kind, field.name), field.name)
+        if key in row:
+            own[field.name] = decoded(_hints(kind)[field.name], row[key])
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise KeyError(key)
+    return kind(**own)

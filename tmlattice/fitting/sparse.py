@@ -1,0 +1,266 @@
+"""Fine-tuning by few causes: which magnets changed, by how much, and what the tunes then are.
+
+Every powered quadrupole and sextupole is a candidate. It is the search of the diagnosis, with these
+hypotheses alone and evidence alone to stop it; magnets that explain the readings about as well
+widen the stated error of the tunes.
+"""
+
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2 as chi_square
+
+from tmlattice.beam.model import Model
+from tmlattice.beam.strengths import LARGEST
+from tmlattice.effects import Cause, apply
+from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
+from tmlattice.fitting.adam import FitResult
+from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.priors import AmountPrior, Student
+from tmlattice.inference.search import Explanation, Search, explain
+from tmlattice.lattice import Ring
+from tmlattice.measurement import Measurement
+from tmlattice.network import TaylorNetwork
+from tmlattice.observe.data import Data, first_turn
+from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.optics import RingTunes, short_way
+
+Array = NDArray[np.float64]
+
+EFFECTS = {"quadrupole": "quadrupole_gradient", "sextupole": "sextupole_strength"}
+
+FAULT = 0.3
+"""Prior rms of the relative change of a strength that has changed."""
+
+LARGEST_NUMBER, REFINED = 5, 12
+"""Of causes, and of candidates that are refined after each scan."""
+
+MAX_MISFIT = 5.0
+"""Standard errors by which a misfit may exceed the noise before it is more than noise."""
+
+FALSE_ALARM_ODDS = 1e6
+"""False alarms of `warn_of_launches` are that rare."""
+
+RARER = 10.0
+"""Each cause beyond the first is so many times less likely than the one before: faults are rare,
+and with hundreds of candidates a false second one would else come in one case of a hundred."""
+
+NEGLIGIBLE = 1e-6
+"""Weight of an explanation, against the best one's, below which it is left out of the spread."""
+
+
+def fit_sparse(
+    network: TaylorNetwork,
+    measurement: Measurement,
+    *,
+    ring: Ring | None = None,
+    kinds: Sequence[str] = ("quadrupole", "sextupole"),
+    noise: float | None = None,
+    launch_sigma: ArrayLike | None = None,
+    fault: float = FAULT,
+    largest_number: int = LARGEST_NUMBER,
+    refined: int = REFINED,
+    candidates: Sequence[str] | None = None,
+    progress: bool = True,
+) -> FitResult:
+    """Fit a measurement's first turn by as few changed magnets as the evidence asks for.
+
+    Args:
+        network: the design.
+        measurement: at least one shot.
+        ring: that the network was made from; else the network's own `ring`.
+        kinds: of magnets whose strength may have changed.
+        noise: rms of one reading, m; else the measurement's.
+        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
+            exact; inf: unknown; None: the measurement's own.
+        fault: prior rms of a relative change.
+        largest_number: of causes.
+        refined: candidates that are refined after each scan.
+        candidates: names of the only magnets that may have changed; None: all of the kinds.
+        progress: there is nothing to show; every method takes it.
+
+    Returns:
+        The network of the refined ring, its tunes from its own matrix, and their standard error:
+        that of the changes, and the spread over other magnets that explain the readings nearly as
+        well, weighted by their evidence. No error is stated where no cause was found: what a
+        fault too small to be seen does to the tunes is not known from these readings.
+
+    Raises:
+        MeasurementError: no reading, or no noise stated.
+        TmlatticeError: no ring to change, or no powered magnet of these kinds.
+        UnstableRingError: the ring that explains the readings has no tune.
+    """
+    begun = time.perf_counter()
+    ring = network.ring if ring is None else ring
+    if ring is None:
+        raise TmlatticeError("method 'sparse' changes the ring's magnets: give ring=")
+    monitors = [monitor.name for monitor in ring.monitors]
+    data = first_turn(monitors, measurement, noise, launch_sigma, network.dimension)
+    found = sparse_causes(
+        ring, data, kinds, network.dimension, fault, largest_number, refined, candidates
+    )
+    warn_of_launches(ring, data, network.dimension, found)
+    best = _refined(found)
+    assert isinstance(found.problem, FirstTurns)
+    turn = RingTunes(found.problem.model.assembly)
+    tunes = turn.of(best.causes)
+    errors = np.sqrt(np.diag(best.covariance))
+    chi2 = [found.before.chi2, best.chi2][: 1 + bool(best.causes)]
+    return FitResult(
+        network=TaylorNetwork.from_ring(apply(ring, best.causes), network.dimension),
+        loss=[c * float(np.mean(data.sigma**2)) / data.shots for c in chi2],
+        penalty=[0.0] * len(chi2),
+        best_epoch=len(chi2) - 1,
+        stopped_early=False,
+        seconds=time.perf_counter() - begun,
+        options={
+            "method": "sparse",
+            "kinds": list(kinds),
+            "noise": noise,
+            "launch_sigma": None if launch_sigma is None else np.ravel(launch_sigma).tolist(),
+            "fault": fault,
+            "largest_number": largest_number,
+            "refined": refined,
+            "candidates": None if candidates is None else list(candidates),
+        },
+        tunes=tunes,
+        tune_sigma=_spread(turn, best, tunes, found) if best.causes else None,
+        changes={
+            str(cause.element): (cause.amount, float(error))
+            for cause, error in zip(best.causes, errors, strict=True)
+        },
+        launches=in_coordinates(best.nuisances, network.dimension)
+        if data.launch_sigma.any()
+        else None,
+    )
+
+
+def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation) -> None:
+    """Warn if the readings contradict the stated launches.
+
+    The same search with free launches must explain the readings, and lower chi-square by more than
+    four free numbers a shot do by chance, once in `ONCE_IN` times.
+
+    Args:
+        ring: the design.
+        data: with the launches as stated; unknown ones cannot be contradicted.
+        dimension: 4 or 6.
+        found: the search with the launches as stated.
+    """
+    stated = np.isfinite(data.launch_sigma[:, :4])
+    if not stated.any():
+        return
+    sigma = data.launch_sigma.copy()
+    sigma[:, :4] = np.inf
+    free = sparse_causes(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
+    readings, numbers = int(data.valid.sum()), int(stated.sum())
+    gain = found.fit.chi2 - free.chi2
+    explained = free.chi2 <= readings + MAX_MISFIT * np.sqrt(2 * readings)
+    if not explained or gain <= chi_square.isf(1 / FALSE_ALARM_ODDS, numbers):
+        return
+    off = np.abs(free.nuisances - data.launches)[:, :4]
+    x, y = 1e6 * off[:, [0, 2]].max(axis=0)
+    px, py = 1e6 * off[:, [1, 3]].max(axis=0)
+    warnings.warn(
+        f"the launches are not those stated: if they are fitted freely, chi-square falls by "
+        f"{gain:.0f}, of {readings} readings, and they differ from the stated ones by up to "
+        f"{x:.3g} µm and {px:.3g} µrad in x, {y:.3g} µm and {py:.3g} µrad in y; give "
+        "launch_sigma=, inf where the launches are unknown",
+        stacklevel=3,
+    )
+
+
+def in_coordinates(launches: Array, dimension: int) -> Array:
+    """Launches (x, px, y, py, delta), [shot, 5], in the coordinates of a network, [shot, n]."""
+    states = np.zeros((len(launches), dimension))
+    states[:, :4] = launches[:, :4]
+    if dimension == 6:
+        states[:, 5] = launches[:, 4]
+    return states
+
+
+def sparse_causes(
+    ring: Ring,
+    data: Data,
+    kinds: Sequence[str] = ("quadrupole", "sextupole"),
+    dimension: int = 4,
+    fault: float = FAULT,
+    largest_number: int = LARGEST_NUMBER,
+    refined: int = REFINED,
+    candidates: Sequence[str] | None = None,
+) -> Explanation:
+    """The changed strengths that the evidence asks for; see `fit_sparse` for the arguments.
+
+    Raises:
+        TmlatticeError: no such magnet.
+        BeamLostError: the launch is lost in the design.
+    """
+    model = Model(ring, data.settings, data.turns, dimension=dimension)
+    effects = [EFFECTS[kind] for kind in kinds]
+    hypotheses = model.hypotheses(effects)
+    if not hypotheses:
+        raise TmlatticeError(f"'{ring.name}' has no powered {' or '.join(kinds)} to fit")
+    if candidates is not None:
+        wanted = {ring[name].name for name in candidates}
+        hypotheses = [h for h in hypotheses if h[1] in wanted]
+        if not hypotheses:
+            raise TmlatticeError(
+                f"none of {sorted(wanted)} is a powered {' or '.join(kinds)}; name some that are"
+            )
+    problem = FirstTurns(
+        model=model,
+        data=data,
+        places=dict.fromkeys(effects, len(hypotheses) / len(effects)),  # all magnets are alike
+        amounts=AmountPrior(Student(fault, np.inf), bound=LARGEST),
+        judgement=Judgement(unknown=0.0, alternatives=refined, rarer=RARER),
+    )
+    before = fit(problem, (), data.launches)
+    if before.point.lost:
+        raise BeamLostError("the launch is lost in the design ring; launch closer to the axis")
+    return explain(
+        Search(problem, hypotheses, largest_number, unnamed=False, by_marginal_likelihood=True),
+        before,
+    )
+
+
+def _refined(found: Explanation) -> Fit:
+    """The amounts to rounding: the search stops at a share of their error."""
+    fresh = replace(found.problem, judgement=replace(found.problem.judgement, same=0.0))
+    now = found.fit
+    return fit(fresh, now.causes, now.nuisances, steps=20, tolerance=1e-9) if now.causes else now
+
+
+def _spread(turn: RingTunes, best: Fit, tunes: Array, found: Explanation) -> Array:
+    """Standard error of the tunes [2] about the best ones, over all explanations refined last."""
+    others = [rival.fit for named in found.named for rival in named.alternatives[1:]]
+    total, weights = np.zeros((2, 2)), 0.0
+    for one in [best, *others, *(rival.fit for rival in found.beyond)]:
+        weight = float(np.exp(one.log_evidence - best.log_evidence))
+        if not weight > NEGLIGIBLE:
+            continue
+        try:
+            away = short_way(turn.of(one.causes) - tunes)
+            slopes = _tune_slopes(turn, one)
+        except UnstableRingError:
+            continue  # the ring stores a beam, or nobody would ask for its tunes
+        total += weight * (slopes @ one.covariance @ slopes.T + np.outer(away, away))
+        weights += weight
+    return np.asarray(np.sqrt(np.diag(total / weights)))
+
+
+def _tune_slopes(turn: RingTunes, one: Fit) -> Array:
+    """d tunes / d amounts, [2, cause]."""
+    slopes = []
+    for i, cause in enumerate(one.causes):
+        h = min(1e-5, 0.1 * float(np.sqrt(one.covariance[i, i])))
+        ends = []
+        for side in (h, -h):
+            moved = Cause(cause.effect, cause.element, cause.amount + side)
+            ends.append(turn.of((*one.causes[:i], moved, *one.causes[i + 1 :])))
+        slopes.append(short_way(ends[0] - ends[1]) / (2 * h))
+    return np.stack(slopes, axis=1)

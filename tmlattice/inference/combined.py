@@ -1,0 +1,351 @@
+"""Several measurements of one machine as one problem: rows stacked, causes shared.
+
+>>> both = CombinedProblem.of([first_turns, dispersion])
+>>> explain(Search(both, hypotheses, unnamed=False), fit(both, (), both.first))
+
+Each measurement keeps its nuisances and its noise. A cause without effect in one of them has zero
+rows there.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from tmlattice.effects import Cause
+from tmlattice.inference.metric import Hypothesis, Metric, Products
+from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
+from tmlattice.inference.root import Root
+from tmlattice.inference.whitening import Projection
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+class Blocks(Projection):
+    """Projection of each part's nuisances out of its own rows.
+
+    Args:
+        parts: the projections, one after another.
+    """
+
+    def __init__(self, parts: Sequence[Projection]) -> None:
+        self.parts = tuple(parts)
+        sizes = [len(part.Q) * part.Q.shape[1] for part in parts]
+        self.ends = np.cumsum(sizes)[:-1]
+
+    def split(self, rows: Array) -> list[Array]:
+        """Return the rows [..., row] of each part."""
+        return np.split(rows, self.ends, axis=-1)
+
+    def out(self, rows: Array) -> Array:
+        """Return rows less the part that nuisances explain."""
+        own = zip(self.parts, self.split(rows), strict=True)
+        return np.concatenate([part.out(np.ascontiguousarray(mine)) for part, mine in own], axis=-1)
+
+    @property
+    def log_volume(self) -> float:
+        """Sum over the parts."""
+        return sum(part.log_volume for part in self.parts)
+
+    def matrix(self) -> Array:
+        """The directions of all parts, [row, coordinate]."""
+        return np.asarray(block_diag(*(part.matrix() for part in self.parts)))
+
+    def inside(self, rows: Array) -> Array:
+        """Square of the part of rows that nuisances explain, [...]."""
+        own = zip(self.parts, self.split(rows), strict=True)
+        return np.asarray(sum(part.inside(np.ascontiguousarray(mine)) for part, mine in own))
+
+    def coordinates(self, rows: Array) -> Array:
+        """Changes of the nuisances, part after part."""
+        own = zip(self.parts, self.split(rows), strict=True)
+        return np.concatenate([part.coordinates(mine) for part, mine in own])
+
+
+@dataclass(frozen=True, kw_only=True)
+class CombinedProblem(Problem):
+    """Measurements of one machine.
+
+    Attributes:
+        parts: their problems; priors, thresholds and fixed causes of these are not used.
+        names: all monitors.
+        starts: first guess of each part's nuisances.
+        active: whether the causes sought act in a part; they do not in a reference. Fixed causes
+            act in all.
+    """
+
+    parts: tuple[Problem, ...] = field(repr=False)
+    names: tuple[str, ...] = field(repr=False)
+    starts: tuple[Array, ...] = field(repr=False)
+    active: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, parts: Sequence[Problem], before: Sequence[Problem] = ()) -> "CombinedProblem":
+        """Return the problem with the priors, judgement and fixed causes of the first part.
+
+        Args:
+            parts: measurements in which causes are sought.
+            before: reference measurements.
+        """
+        active = (True,) * len(parts) + (False,) * len(before)
+        parts = [*parts, *before]
+        names = dict.fromkeys(name for part in parts for name in part.monitors)
+        one = parts[0]
+        return cls(
+            places=one.places, rare=one.rare, fixed=one.fixed, amounts=one.amounts,
+            judgement=one.judgement,
+            parts=tuple(replace(part, fixed=()) for part in parts), names=tuple(names),
+            starts=tuple(part.first for part in parts), active=active,
+        )  # fmt: skip
+
+    @property
+    def alone(self) -> bool:
+        """Whether no part is, or contains, a reference."""
+        return all(self.active) and all(part.alone for part in self.parts)
+
+    def reference(self, nuisances: Array) -> "tuple[CombinedProblem, Array]":
+        """Return the problem of the reference measurements or shots, and its nuisances."""
+        parts: list[tuple[Problem, Array]] = []
+        for part, active, start in zip(
+            self.parts, self.active, self.of_parts(nuisances), strict=True
+        ):
+            own, first = part.reference(start) if active else (part, start)
+            parts += [] if own is None else [(own, first)]
+        problems, starts = zip(*parts, strict=True)
+        found = replace(self, parts=problems, starts=starts, active=(True,) * len(parts))
+        return found, found.first
+
+    # --- nuisances: one flat vector -------------------------------------------------------------
+    @property
+    def first(self) -> Array:
+        """First guesses of the nuisances, part after part."""
+        return np.concatenate([start.ravel() for start in self.starts])
+
+    @property
+    def free(self) -> int:
+        """Sum over the parts."""
+        return sum(part.free for part in self.parts)
+
+    @property
+    def freedom(self) -> int:
+        """Sum over the parts."""
+        return sum(part.freedom for part in self.parts)
+
+    def of_parts(self, nuisances: Array) -> list[Array]:
+        """Nuisances of each part, in its own shape."""
+        flat = np.split(nuisances, _ends([start.size for start in self.starts]))
+        return [own.reshape(start.shape) for own, start in zip(flat, self.starts, strict=True)]
+
+    def moved(self, nuisances: Array, change: Array) -> Array:
+        """Return the nuisances after a change of each part's."""
+        changes = np.split(change, _ends([part.free for part in self.parts]))
+        own = zip(self.parts, self.of_parts(nuisances), changes, strict=True)
+        return np.concatenate([part.moved(n, c).ravel() for part, n, c in own])
+
+    # --- the model ------------------------------------------------------------------------------
+    def sees(self, hypothesis: Hypothesis) -> bool:
+        """Whether the cause has an effect in any part."""
+        return any(part.sees(hypothesis) for part in self.parts)
+
+    def everywhere(self) -> "CombinedProblem":
+        """Return the problem with causes that act in all parts."""
+        parts = tuple(part.everywhere() for part in self.parts)
+        return replace(self, parts=parts, active=(True,) * len(parts))
+
+    @cached_property
+    def parts_with_fixed(self) -> tuple[Problem, ...]:
+        """The parts, each with the fixed causes that act in it."""
+        return tuple(
+            part.with_fixed([c for c in self.fixed if part.sees((c.effect, c.element))])
+            for part in self.parts
+        )
+
+    def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
+        """Return the model's point; its `view` are the points of the parts."""
+        points = []
+        for part, active, own in zip(
+            self.parts_with_fixed, self.active, self.of_parts(nuisances), strict=True
+        ):
+            there = causes if active else ()
+            seen = [c for c in there if part.sees((c.effect, c.element))]
+            points.append(part.at(seen, own, kicks))
+            if points[-1].lost:  # the other parts are not needed
+                rest = np.full(1, np.nan)
+                return Point(
+                    tuple(causes), nuisances, dict(kicks), rest, None, rest, None, points[-1].lost
+                )
+        found = [point.projection for point in points]
+        return Point(
+            tuple(causes), nuisances, dict(kicks),
+            np.concatenate([point.residual for point in points]),
+            Blocks([projection for projection in found if projection is not None]),
+            np.concatenate([point.orbit.ravel() for point in points]), tuple(points),
+        )  # fmt: skip
+
+    def slope(self, point: Point, cause: int) -> Array:
+        """Return the slope, zero in parts without an effect, [row]."""
+        own = point.causes[cause]
+        rows = []
+        for part, active, here in zip(self.parts_with_fixed, self.active, point.view, strict=True):
+            if active and part.sees((own.effect, own.element)):
+                rows.append(part.slope(here, here.causes.index(own)))
+            else:
+                rows.append(np.zeros(len(here.residual)))
+        return np.concatenate(rows)
+
+    def metric(self, point: Point) -> Metric:
+        """Return the products summed over the parts."""
+        if len(self.parts) == 1:
+            return self.parts_with_fixed[0].metric(point.view[0])
+        return _CombinedMetric(self, point)
+
+    def metric_among(self, point: Point, root: Root, projection: Projection) -> Metric | None:
+        """Return the products of a single measurement, as its kind has them."""
+        if len(self.parts) > 1:
+            return None
+        return self.parts_with_fixed[0].metric_among(point.view[0], root, projection)
+
+    # --- free kicks: of a single measurement ----------------------------------------------------
+    @property
+    def kick_places(self) -> Sequence[str]:
+        """Places of free kicks of a single measurement; several have no kick in common."""
+        return self.parts[0].kick_places if len(self.parts) == 1 else ()
+
+    def kick_rows(self, point: Point, place: int) -> Array:
+        """Return the rows of a single measurement, as its kind has them."""
+        return self.parts_with_fixed[0].kick_rows(point.view[0], place)
+
+    def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the neighbours in any part."""
+        found = [h for part in self.parts for h in part.neighbours(hypothesis, among)]
+        return list(dict.fromkeys(found))
+
+    @property
+    def monitors(self) -> Sequence[str]:
+        """All monitors of the parts."""
+        return self.names
+
+    # --- readings -------------------------------------------------------------------------------
+    @property
+    def valid(self) -> Flags:
+        """Valid readings of all parts, flat."""
+        return np.concatenate([part.valid.ravel() for part in self.parts])
+
+    def owner(self) -> NDArray[np.int64]:
+        """Monitor of each reading, an index of `names`."""
+        at = {name: i for i, name in enumerate(self.names)}
+        found = []
+        for part in self.parts:
+            own = np.array([*(at[name] for name in part.monitors), -1])
+            found.append(own[part.owner().ravel()])
+        return np.concatenate(found)
+
+    def as_rows(self, readings: Array) -> Array:
+        """Return the rows, part after part."""
+        rows = [
+            part.as_rows(own.reshape(*own.shape[:-1], *part.valid.shape))
+            for part, own in zip(self.parts, self._split(readings), strict=True)
+        ]
+        return np.concatenate(rows, axis=-1)
+
+    def noise_rows(self) -> list[Flags]:
+        """Return the noise rows of a single measurement; of several: none."""
+        return self.parts[0].noise_rows() if len(self.parts) == 1 else []
+
+    def noisier(self, factors: Array) -> Self:
+        """Return the problem with scaled noise, of a single measurement."""
+        return replace(self, parts=tuple(part.noisier(factors) for part in self.parts))
+
+    def disagreement(self, point: Point) -> float:
+        """Return the disagreement of a single measurement; of several: 0."""
+        return self.parts[0].disagreement(point.view[0]) if len(self.parts) == 1 else 0.0
+
+    def left(self, point: Point) -> tuple[Array, Array]:
+        """Return the residuals and their variances, part after part."""
+        found = [part.left(here) for part, here in zip(self.parts, point.view, strict=True)]
+        rows, size = zip(*found, strict=True)
+        return np.concatenate([r.ravel() for r in rows]), np.concatenate([s.ravel() for s in size])
+
+    def without(self, dropped: Flags) -> Self:
+        """Return the problem without some readings."""
+        parts = [
+            part.without(own.reshape(part.valid.shape))
+            for part, own in zip(self.parts, self._split(dropped), strict=True)
+        ]
+        return replace(self, parts=tuple(parts))
+
+    def _split(self, flat: NDArray[Any]) -> list[NDArray[Any]]:
+        return np.split(flat, _ends([part.valid.size for part in self.parts]), axis=-1)
+
+
+def _ends(sizes: Sequence[int]) -> list[int]:
+    return [int(end) for end in np.cumsum(sizes)[:-1]]
+
+
+class _CombinedMetric(Metric):
+    def __init__(self, problem: CombinedProblem, point: Point) -> None:
+        assert isinstance(point.projection, Blocks)
+        super().__init__(point.projection)
+        self.problem, self.blocks = problem, point.projection
+        pairs = zip(problem.parts_with_fixed, point.view, strict=True)
+        self.metrics = [part.metric(here) for part, here in pairs]
+
+    def products(self, hypotheses: Sequence[Hypothesis], data: Array) -> Products:
+        total = Products.empty(len(hypotheses), len(data))
+        own = zip(
+            self.problem.parts, self.problem.active, self.metrics, self.blocks.split(data),
+            strict=True,
+        )  # fmt: skip
+        for part, active, metric, mine in own:
+            if not active:
+                continue
+            seen = np.array([i for i, h in enumerate(hypotheses) if part.sees(h)], dtype=np.intp)
+            if len(seen):
+                some = metric.products([hypotheses[i] for i in seen], np.ascontiguousarray(mine))
+                total.whole[seen] += some.whole
+                total.inside[seen] += some.inside
+                total.inner[seen] += some.inner
+        return total
+
+    def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
+        parts = []
+        sizes = [len(part.Q) * part.Q.shape[1] for part in self.blocks.parts]
+        problem = self.problem
+        for part, active, metric, size in zip(
+            problem.parts, problem.active, self.metrics, sizes, strict=True
+        ):
+            out = np.zeros((len(hypotheses), size))
+            seen = [i for i, h in enumerate(hypotheses) if active and part.sees(h)]
+            for start in range(0, len(seen), metric.chunk):
+                some = seen[start : start + metric.chunk]
+                out[some] = metric.rows([hypotheses[i] for i in some])
+            parts.append(out)
+        return np.concatenate(parts, axis=1)
+
+    def free_monitors(self, clean: Array) -> tuple[Array, Array]:
+        """Return the information; a monitor's readings in each measurement are a block."""
+        problem = self.problem
+        at = {name: i for i, name in enumerate(problem.names)}
+        found = []
+        for part, metric, mine in zip(
+            problem.parts, self.metrics, self.blocks.split(clean), strict=True
+        ):
+            found.append(
+                (*metric.free_monitors(np.ascontiguousarray(mine)), [at[m] for m in part.monitors])
+            )
+        size = max(gram.shape[-1] for gram, _, _ in found)
+        blocks = sum(gram.shape[1] for gram, _, _ in found)
+        grams = np.zeros((len(at), blocks, size, size))
+        inners = np.zeros((len(at), blocks, size))
+        block = 0
+        for gram, inner, where in found:
+            count, p = gram.shape[1], gram.shape[-1]
+            grams[where, block : block + count, :p, :p] = gram
+            inners[where, block : block + count, :p] = inner
+            block += count
+        return grams, inners

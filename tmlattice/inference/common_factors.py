@@ -1,0 +1,282 @@
+"""Common factors behind many numbers, selected by the marginal likelihood.
+
+>>> model = FactorModel(information, score, candidates, variance, slab)
+>>> [(one.candidate, one.amount, one.sigma) for one in model.reasons(model.choose(20))]
+
+Many numbers (gradients, say) are known with a covariance, and each scatters by itself. A candidate
+factor moves some of them together: all, a family, one. Factors are selected by adding the one with
+the largest evidence, removing redundant ones, and exchanging. The model is linear and Gaussian, so
+that the error of each amount includes the scatter.
+"""
+
+from collections.abc import Collection, Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lu_factor, lu_solve
+from scipy.special import logsumexp
+
+Array = NDArray[np.float64]
+
+MIN_CHI2 = 25.0
+"""Chi-square of a selected factor, at least: five standard deviations."""
+SWEEPS = 5
+"""Rounds in which every factor is exchanged against its alternatives."""
+MIN_INFORMATION = 1e-6
+"""Share of a candidate's information that the selected factors must leave, at least."""
+MIN_SCALE_EVIDENCE = 2.0
+"""Log evidence that the common scale of unresolved factors must gain to be used."""
+MAX_BEHIND = 3.0
+"""Log evidence below the best at which an alternative is still reported: odds of 1 to 20."""
+
+
+@dataclass(frozen=True)
+class CommonFactor:
+    """One selected factor.
+
+    Attributes:
+        candidate: its index.
+        amount, sigma: with the scatter of the single numbers in the error.
+        statistic: its chi-square given all others.
+        alternatives: candidates in its place and their probabilities; the first is itself.
+    """
+
+    candidate: int
+    amount: float
+    sigma: float
+    statistic: float
+    alternatives: tuple[tuple[int, float], ...]
+
+
+class FactorModel:
+    """Candidate factors together with the scatter of single numbers.
+
+    Args:
+        information: J^T W J of the numbers, nuisances projected out, [number, number].
+        score: J^T W y with all numbers at zero, [number].
+        candidates: what each moves, [number, candidate].
+        variance: of the scatter of each number, or its covariance, [number] or [number, number].
+        slab: prior rms of each candidate's amount, [candidate].
+        cost: log odds against each candidate beyond their number, [candidate].
+
+    Attributes:
+        background: log evidence of the scatter alone, over numbers that are zero.
+    """
+
+    def __init__(
+        self,
+        information: Array,
+        score: Array,
+        candidates: Array,
+        variance: Array,
+        slab: Array,
+        cost: Array | None = None,
+    ) -> None:
+        scatter = np.diag(variance) if variance.ndim == 1 else variance
+        factor = lu_factor(np.eye(len(score)) + information @ scatter)
+        wide = np.log(np.abs(np.diag(factor[0]))).sum()
+        self.background = float(score @ scatter @ lu_solve(factor, score) - wide) / 2
+        self.slab = slab
+        self.cost = np.log(len(slab)) + (np.zeros(len(slab)) if cost is None else cost)
+        self.score = candidates.T @ lu_solve(factor, score)
+        self.information = candidates.T @ lu_solve(factor, information) @ candidates
+        self.information = (self.information + self.information.T) / 2
+        self.candidates = candidates
+
+    def given(self, others: Sequence[int], rms: float) -> "FactorModel":
+        """Return the model with some candidates integrated out, each an amount of this rms."""
+        at = np.array(others, dtype=int)
+        inside = self.information[np.ix_(at, at)] + np.eye(len(at)) / rms**2
+        across = self.information[:, at]
+        taken = np.linalg.solve(inside, np.column_stack([across.T, self.score[at]]))
+        made = copy(self)
+        made.information = self.information - across @ taken[:, :-1]
+        made.score = self.score - across @ taken[:, -1]
+        wide = np.linalg.slogdet(inside)[1] + 2 * len(at) * np.log(rms)
+        made.background = self.background + float(self.score[at] @ taken[:, -1] - wide) / 2
+        made.information[at] = made.information[:, at] = made.score[at] = 0.0
+        return made
+
+    def given_others(
+        self, chosen: Sequence[int], alike: Collection[int], rms: Sequence[float]
+    ) -> "GivenOthers":
+        """Return the selected factors with the unresolved ones of their kind integrated out.
+
+        The common rms of the unresolved factors follows the evidence. A selected factor that is no
+        longer significant is one of them, or is removed.
+
+        Args:
+            chosen: selected factors.
+            alike: candidates of one kind.
+            rms: of the others' amounts, to be tried; together as probable as no others.
+        """
+        stay = list(chosen)
+        if not set(alike) & set(stay):
+            return GivenOthers(self, stay, 0.0, ((self, 1.0),))
+        while True:
+            chosen, others = stay, [own for own in alike if own not in stay]
+            sizes = [0.0, *rms] if others else [0.0]
+            made = [self.given(others, one) if one else self for one in sizes]
+            logs = np.array([own.background + own.log_evidence(chosen) for own in made])
+            best = int(np.argmax(logs - MIN_SCALE_EVIDENCE * (np.array(sizes) > 0)))
+            stay = made[best]._pruned(list(chosen), MIN_CHI2)
+            if len(stay) == len(chosen):
+                logs[1:] -= np.log(max(len(rms), 1))
+                chance = np.exp(logs - logsumexp(logs)).tolist()
+                return GivenOthers(
+                    made[best], stay, sizes[best], tuple(zip(made, chance, strict=True))
+                )
+
+    def fitted(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Amounts of some candidates and their covariance."""
+        at = np.array(chosen, dtype=int)
+        inside = self.information[np.ix_(at, at)] + np.diag(self.slab[at] ** -2.0)
+        covariance = np.linalg.inv(inside)
+        return covariance @ self.score[at], covariance
+
+    def log_evidence(self, chosen: Sequence[int]) -> float:
+        """Log evidence of some candidates over none, with the prior odds."""
+        if not len(chosen):
+            return 0.0
+        at = np.array(chosen, dtype=int)
+        amounts, covariance = self.fitted(chosen)
+        wide = np.linalg.slogdet(covariance)[1] / 2 - np.log(self.slab[at]).sum()
+        return float(amounts @ self.score[at] / 2 + wide - self.cost[at].sum())
+
+    def squares(self, chosen: Sequence[int]) -> Array:
+        """Chi-square of each of some candidates given the others."""
+        amounts, covariance = self.fitted(chosen)
+        variance = np.diag(covariance)
+        known = 1 / variance - self.slab[np.array(chosen, dtype=int)] ** -2.0
+        known = np.maximum(known, 0)
+        return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, 1e-300), 0.0)
+
+    def _given(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
+        """Score and information of each candidate given some, and the change of the amounts of
+        these by a unit of it, [chosen, candidate]."""
+        amounts, covariance = self.fitted(chosen)
+        across = self.information[:, list(chosen)]
+        lessened = covariance @ across.T
+        own = np.diag(self.information) - np.einsum("ij,ji->i", across, lessened)
+        return self.score - across @ amounts, np.maximum(own, 0.0), lessened
+
+    def gains(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Log evidence of adding each candidate, and its chi-square."""
+        score, own, _ = self._given(chosen)
+        spread = own + self.slab**-2.0
+        gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
+        square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
+        seen = own > MIN_INFORMATION * np.diag(self.information)  # else redundant
+        gain = np.where(seen, gain, 0.0) - self.cost
+        gain[list(chosen)] = -np.inf
+        return gain, np.where(seen, square, 0.0)
+
+    def choose(
+        self, most: int, clear: float = MIN_CHI2, without: Collection[int] = ()
+    ) -> list[int]:
+        """Select factors, except some."""
+        chosen: list[int] = []
+        while len(chosen) < most:
+            gain, square = self.gains(chosen)
+            gain[list(without)] = -np.inf
+            gain[square < clear] = -np.inf
+            best = int(np.argmax(gain))
+            if not gain[best] > 0:
+                break
+            chosen = self._pruned([*chosen, best], clear)
+            if best not in chosen:
+                break
+        for _ in range(SWEEPS):
+            before = list(chosen)
+            for own in before:
+                others = [c for c in chosen if c != own]
+                gain, square = self.gains(others)
+                gain[list(without)] = -np.inf
+                best = int(np.argmax(np.where(square < clear, -np.inf, gain)))
+                if gain[best] > gain[own] + 1e-9:
+                    chosen = [*others, best]
+            chosen = self._pruned(chosen, clear)
+            if set(chosen) == set(before):
+                break
+        return chosen
+
+    def _pruned(self, chosen: list[int], clear: float) -> list[int]:
+        """Remove redundant factors, the weakest first."""
+        while chosen:
+            worth = []
+            for own in chosen:
+                gain, square = self.gains([c for c in chosen if c != own])
+                worth.append(gain[own] if square[own] >= clear else -np.inf)
+            least = int(np.argmin(worth))
+            if worth[least] > 0:
+                break
+            chosen = [c for i, c in enumerate(chosen) if i != least]
+        return chosen
+
+    def averaged(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Amounts of some candidates and their variances, averaged over one further factor that is
+        not significant."""
+        amounts, covariance = self.fitted(chosen)
+        score, own, lessened = self._given(chosen)
+        spread = own + self.slab**-2.0
+        moved = -lessened * (score / spread)
+        gain = self.gains(chosen)[0]
+        gain[own <= MIN_INFORMATION * np.diag(self.information)] = -np.inf  # redundant
+        there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
+        more = moved @ there
+        wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there
+        return amounts + more, wider - more**2
+
+    def reasons(
+        self, chosen: Sequence[int], over: Sequence[tuple["FactorModel", float]] = ()
+    ) -> list[CommonFactor]:
+        """Return amounts, errors and alternatives of the selected factors, by falling chi-square.
+
+        Args:
+            chosen: selected factors.
+            over: models with their probabilities, each averaged over one further factor, see
+                `averaged`; none: no further factor.
+        """
+        if not chosen:
+            return []
+        amounts, covariance = self.fitted(chosen)
+        variance = np.diag(covariance)
+        if over:
+            each = [own.averaged(chosen) for own, _ in over]
+            chance = np.array([share for _, share in over])
+            means, within = (np.array([own[i] for own in each]) for i in (0, 1))
+            amounts = chance @ means
+            variance = chance @ (within + (means - amounts) ** 2)
+        found = []
+        for i, own in enumerate(chosen):
+            gain, square = self.gains([c for c in chosen if c != own])
+            linearise = [int(c) for c in np.flatnonzero(gain > gain[own] - MAX_BEHIND) if c != own]
+            odds = np.exp(gain[[own, *linearise]] - gain[own])
+            ranked = sorted(zip([own, *linearise], odds / odds.sum(), strict=True),
+                          key=lambda row: (row[0] != own, -row[1]))  # fmt: skip
+            found.append(
+                CommonFactor(
+                    own, float(amounts[i]), float(np.sqrt(variance[i])), float(square[own]),
+                    tuple((c, float(p)) for c, p in ranked),
+                )
+            )  # fmt: skip
+        return sorted(found, key=lambda reason: -reason.statistic)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenOthers:
+    """Selected factors, given unresolved ones of the same kind.
+
+    Attributes:
+        levels: the model, with the most probable rms of the others in its errors.
+        chosen: the selected factors.
+        rms: of the others, 0 if the evidence is against them.
+        over: models with every rms of the others, and their probabilities.
+    """
+
+    levels: FactorModel
+    chosen: list[int]
+    rms: float
+    over: tuple[tuple[FactorModel, float], ...]

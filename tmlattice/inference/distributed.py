@@ -1,0 +1,516 @@
+"""Problems with distributed errors: rows whitened by the covariance that such errors make.
+
+Distributed errors are Gaussian, and too many to be found one by one. With signatures S (rms times
+slope, in rows) the rows have the covariance C = 1 + S^T S. Its inverse root makes them white again,
+so that a search works as before. Signatures are linearised at the most probable errors, which are
+part of the model; a shift of the rows keeps the errors' prior centred at zero.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.effects import Cause, find
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference.metric import Hypothesis, Metric
+from tmlattice.inference.newton import Fit, fit, fit_nuisances
+from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
+from tmlattice.inference.root import Root, inverse_root
+from tmlattice.inference.variance_components import VarianceComponents, fit_variance_components
+from tmlattice.inference.whitening import Projection
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+LINEARISATIONS = 2
+"""Linearisations: at the design, and at the most probable errors."""
+
+ROWS = 1000
+"""Rows for variance components: 17 of them to some per cent; the time goes as the cube."""
+
+MAX_HALVINGS = 4
+"""Halvings, at most, of a step to the most probable errors where no beam is stored."""
+
+MAX_SHARE = 0.9999
+"""Largest share of a variance that data may remove: linearisation leaves a hundredth of the rms."""
+
+MIN_SHARE = 0.02
+"""Smallest share of a direction's variance that the data must remove for it to be kept."""
+
+MAX_ELEMENTS = 10**8
+"""Rows times distributed errors: 0.8 GB each array, 8 GB for all of them."""
+
+AT_ONCE = 2**24
+"""Numbers of signature rows in memory at a time."""
+
+
+@dataclass(frozen=True)
+class DistributedErrors:
+    """Gaussian distribution of distributed errors.
+
+    The covariance is rms (1 - sum_d share_d v_d v_d^T) rms, with the directions v that were
+    measured.
+
+    Attributes:
+        hypotheses: every error.
+        amounts: mean, [error].
+        rms: prior standard deviations, [error].
+        seen: measured directions, orthonormal, in units of the rms, [direction, error].
+        share: share of each direction's variance that measurements removed, [direction].
+        causes: further causes that are certain.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    amounts: Array = field(repr=False)
+    rms: Array = field(repr=False)
+    seen: Array = field(repr=False)
+    share: Array = field(repr=False)
+    causes: tuple[Cause, ...] = ()
+
+    @classmethod
+    def usual(
+        cls, hypotheses: Sequence[Hypothesis], rms: Mapping[str, float]
+    ) -> "DistributedErrors":
+        """Return the prior with zero mean and one rms per effect."""
+        scale = np.array([rms[name] for name, _ in hypotheses])
+        return cls(
+            tuple(hypotheses), np.zeros(len(scale)), scale, np.zeros((0, len(scale))), np.zeros(0)
+        )
+
+    def correlated(self, x: Array) -> Array:
+        """Correlated errors in units of the rms, from independent ones of size 1, [error, ...]."""
+        left = 1 - np.sqrt(1 - self.share)
+        return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
+                          .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
+
+    def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
+        """Return the distribution after more readings.
+
+        Args:
+            amounts: new mean, [error].
+            share: share of each direction's remaining variance that they removed, [direction].
+            seen: these directions in the coordinates of `correlated`, [direction, error].
+        """
+        if len(self.share):  # back to units of the prior rms
+            left = np.eye(len(amounts)) - (seen.T * share) @ seen
+            whole = self.correlated(self.correlated(left).T)
+            share, directions = np.linalg.eigh(np.eye(len(amounts)) - whole)
+            seen = directions.T
+        big = share > MIN_SHARE
+        return replace(
+            self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], MAX_SHARE)
+        )
+
+    @property
+    def errors(self) -> Array:
+        """Standard deviations, [error]."""
+        taken = self.share @ self.seen**2 if len(self.share) else 0.0
+        return np.asarray(self.rms * np.sqrt(np.maximum(1 - taken, 0.0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarginalProblem(Problem):
+    """A problem with nuisance errors integrated out: Gaussian, of size 1.
+
+    Attributes:
+        inner: the problem given these errors.
+        spread: d reading / d error, [error, *shape of `valid`].
+        shift: offset of the readings, of the shape of `valid`; or 0.
+    """
+
+    inner: Problem = field(repr=False)
+    spread: Array = field(repr=False)
+    shift: Array | float = field(default=0.0, repr=False)
+
+    @cached_property
+    def rows(self) -> Array:
+        """The errors' signatures in rows of the inner problem, [error, row]."""
+        return self.inner.as_rows(self.spread)
+
+    @cached_property
+    def _shifted(self) -> Array | float:
+        return self.inner.as_rows(self.shift) if isinstance(self.shift, np.ndarray) else self.shift
+
+    @cached_property
+    def _root(self) -> Root:
+        return inverse_root(self.rows)
+
+    @property
+    def log_scale(self) -> float:
+        """Log density of the rows beyond exp(-chi2 / 2): -1/2 log det of their covariance."""
+        return self._root.log_scale
+
+    def white(self, rows: Array) -> Array:
+        """Rows [..., row] of the inner problem, whitened."""
+        return self._root.white(rows)
+
+    # --- the model ------------------------------------------------------------------------------
+    @property
+    def first(self) -> Array:
+        """As in the inner problem."""
+        return self.inner.first
+
+    @property
+    def free(self) -> int:
+        """As in the inner problem."""
+        return self.inner.free
+
+    @property
+    def freedom(self) -> int:
+        """As in the inner problem."""
+        return self.inner.freedom
+
+    def sees(self, hypothesis: Hypothesis) -> bool:
+        """As in the inner problem."""
+        return self.inner.sees(hypothesis)
+
+    def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
+        """Return the model's point; its `view` is the inner problem's."""
+        point = self.inner.at(causes, nuisances, kicks)
+        if point.projection is None:
+            return replace(point, view=point)
+        return replace(
+            point,
+            residual=self.white(point.residual + self._shifted),
+            projection=Projection(self.white(point.projection.matrix().T).T[None]),
+            view=point,
+        )
+
+    def slope(self, point: Point, cause: int) -> Array:
+        """Return the whitened slope, [row]."""
+        return self.white(self.inner.slope(point.view, cause))
+
+    def moved(self, nuisances: Array, change: Array) -> Array:
+        """As in the inner problem."""
+        return self.inner.moved(nuisances, change)
+
+    def metric(self, point: Point) -> Metric:
+        """Return the kind's own products, or those of whitened signatures."""
+        assert point.projection is not None
+        fast = self.inner.metric_among(point.view, self._root, point.projection)
+        return _MarginalMetric(self, point) if fast is None else fast
+
+    @property
+    def kick_places(self) -> Sequence[str]:
+        """As in the inner problem."""
+        return self.inner.kick_places
+
+    def kick_rows(self, point: Point, place: int) -> Array:
+        """Return the whitened rows, [parameter, row]."""
+        return self.white(self.inner.kick_rows(point.view, place))
+
+    def everywhere(self) -> Self:
+        """As in the inner problem."""
+        return replace(self, inner=self.inner.everywhere())
+
+    @property
+    def alone(self) -> bool:
+        """As in the inner problem."""
+        return self.inner.alone
+
+    def with_fixed(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem with further fixed causes and the same errors."""
+        other = replace(self, inner=self.inner.with_fixed(causes))
+        vars(other)["_root"] = self._root
+        return other
+
+    def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """As in the inner problem."""
+        return self.inner.neighbours(hypothesis, among)
+
+    # --- readings -------------------------------------------------------------------------------
+    @property
+    def monitors(self) -> Sequence[str]:
+        """As in the inner problem."""
+        return self.inner.monitors
+
+    @property
+    def valid(self) -> Flags:
+        """As in the inner problem."""
+        return self.inner.valid
+
+    def owner(self) -> NDArray[np.int64]:
+        """As in the inner problem."""
+        return self.inner.owner()
+
+    def as_rows(self, readings: Array) -> Array:
+        """Return whitened rows, [..., row]."""
+        return self.white(self.inner.as_rows(readings))
+
+    def left(self, point: Point) -> tuple[Array, Array]:
+        """Residual of each single reading given those before it, and its variance."""
+        assert point.projection is not None
+        alone, size = self.inner.left(point.view)
+        clean = point.projection.out(point.residual)
+        clean = clean[self.inner.as_rows(np.ones(self.valid.shape)) > 0]
+        left = np.zeros(self.valid.shape)
+        left[self.valid] = clean
+        return np.where(alone == 0, 0.0, left), np.ones_like(size)
+
+    def without(self, dropped: Flags) -> Self:
+        """Return the problem without some readings; its covariance is computed anew."""
+        if not dropped.any():
+            return self
+        return replace(self, inner=self.inner.without(dropped))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistributedProblem(MarginalProblem):
+    """A problem with distributed errors.
+
+    The inner problem has the linearisation's amounts among its fixed causes. The errors are the
+    coordinates of `known.correlated`; the shift moves readings from these amounts to the mean.
+
+    Attributes:
+        known: distribution of the errors before these data.
+        linearised_at: amounts in the model, [error].
+        open: family of each error, and covariance of the log scales that were estimated; or None.
+    """
+
+    known: DistributedErrors = field(repr=False)
+    linearised_at: Array = field(repr=False)
+    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
+
+    def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
+        """Degrees of freedom of the variance along a hypothesis, from the scales' covariance."""
+        if self.open is None or point.projection is None:
+            return np.inf
+        family, covariance = self.open
+        row = point.projection.out(self.metric(point).rows([hypothesis]))[0]
+        squares = (self.rows @ self._root.back(row)) ** 2
+        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
+        return 2 / max(float(slope @ covariance @ slope), 1e-9)
+
+    def estimate(self, clean: Array) -> Array:
+        """Most probable amounts of the errors, given the rows that remain, [error]."""
+        known = self.known
+        amounts = known.amounts + known.rms * known.correlated(self.rows @ self._root.back(clean))
+        own = zip(known.hypotheses, amounts.tolist(), strict=True)
+        return np.array([find(name).floored(amount) for (name, _), amount in own])
+
+    def learnt(self, explained: Fit) -> DistributedErrors:
+        """Distribution of the errors given an explanation."""
+        seen = explained.projection.out(self.white(self.rows))
+        share, directions = np.linalg.eigh(seen @ seen.T)
+        big = share > MIN_SHARE
+        return self.known.updated(self.estimate(explained.clean), share[big], directions[:, big].T)
+
+
+class _MarginalMetric(Metric):
+    chunk = 256
+
+    def __init__(self, problem: MarginalProblem, point: Point) -> None:
+        assert point.projection is not None
+        super().__init__(point.projection)
+        self.problem, self.inner = problem, problem.inner.metric(point.view)
+
+    def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
+        return self.problem.white(self.inner.rows(hypotheses))
+
+    def free_monitors(self, clean: Array) -> tuple[Array, Array]:
+        """Return no information: monitor errors are part of the distributed ones."""
+        count = len(self.problem.monitors)
+        return np.zeros((count, 1, 1)), np.zeros((count, 1))
+
+
+@dataclass(frozen=True)
+class FittedErrors:
+    """Distributed errors as estimated from data.
+
+    Attributes:
+        problem: with these errors.
+        plain: without them, with the noise as estimated.
+        before: fit of the nuisances alone.
+        sizes, errors: rms by effect; relative error of each.
+        log_evidence: over no distributed errors.
+        outlier_evidence: log evidence that the one cause is a fault rather than a member of its
+            family of errors; None: not computed.
+    """
+
+    problem: DistributedProblem
+    plain: Problem
+    before: Fit
+    sizes: Mapping[str, float]
+    errors: Mapping[str, float]
+    log_evidence: float
+    outlier_evidence: float | None = None
+
+
+def fit_distributed_errors(
+    problem: Problem,
+    known: DistributedErrors,
+    nuisances: Array,
+    causes: Sequence[Cause] = (),
+    *,
+    learn: bool = True,
+    noisy: bool = False,
+    linearised_at: Array | None = None,
+    stored: Array | None = None,
+    weigh: bool = False,
+) -> FittedErrors:
+    """Return the distributed errors of a machine, linearised at their most probable amounts.
+
+    Args:
+        problem: of the design.
+        known: distribution of the errors before these data, with initial scales.
+        nuisances: first guess.
+        causes: causes that are fitted together with the errors.
+        learn: estimate the scales; else they stay.
+        noisy: estimate the noise too.
+        linearised_at: [error]; None: the mean of `known`, then the most probable amounts.
+        weigh: compare the one cause with a member of its family (`outlier_evidence`).
+        stored: amounts with a stored beam, towards which `linearised_at` is moved if needed.
+
+    Raises:
+        UnstableRingError: no beam is stored with the most probable errors.
+    """
+    names, belongs = families_of(known)
+    amounts = known.amounts if linearised_at is None else linearised_at
+    stored = amounts if stored is None else stored
+    evidence, errors, opened, outlier_evidence = 0.0, dict[str, float](), None, None
+    for turn in range(LINEARISATIONS if linearised_at is None else 1):
+        inner, alone, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
+        assert alone.projection is not None
+        stored = amounts
+        slopes = signatures_of(inner, alone, known.hypotheses)
+        slopes *= chain_factors(known, amounts)[:, None]
+        shift = (amounts - known.amounts) @ slopes
+        spread = known.correlated(known.rms[:, None] * slopes)
+        if learn:
+            moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
+            keep = sampled_rows(len(moved))
+            rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
+            noise = [part[keep] for part in inner.noise_rows()] if noisy else []
+            directions = alone.projection.matrix()[keep]
+            found = components_of_rows(moved[keep], directions, rows[:, keep], belongs, noise)
+            if weigh:  # as a member of its family
+                i = known.hypotheses.index((causes[0].effect, causes[0].element))
+                some, amount = rows[:, keep], causes[0].amount
+                some[i] *= find(causes[0].effect).chain(amount)
+                whole = moved[keep] + amount / known.rms[i] * some[i]
+                other = components_of_rows(whole, directions, some, belongs, noise)
+                outlier_evidence = found.log_marginal - other.log_marginal
+            if noise:
+                problem, inner = (own.noisier(found.noise) for own in (problem, inner))
+            evidence = found.log_evidence if turn == 0 else evidence
+            errors = dict(zip(names, found.error.tolist(), strict=True))
+            opened = (belongs, found.covariance)
+            known = replace(known, rms=known.rms * found.scale[belongs])
+            spread *= found.scale[belongs][:, None]
+        among = DistributedProblem(
+            places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
+            judgement=problem.judgement, inner=inner, known=known, linearised_at=amounts,
+            spread=spread.reshape(-1, *inner.valid.shape),
+            shift=shift.reshape(inner.valid.shape), open=opened,
+        )  # fmt: skip
+        point = fit_nuisances(among, causes, alone.nuisances)
+        assert point.projection is not None
+        nuisances = point.nuisances
+        amounts = among.estimate(point.projection.out(point.residual))
+    before = fit(among, (), nuisances)
+    if before.point.lost:
+        raise UnstableRingError(f"{before.point.lost} with distributed errors, without the causes")
+    sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
+    return FittedErrors(among, problem, before, sizes, errors, evidence, outlier_evidence)
+
+
+def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
+    """d reading / d amount in units of the readings' noise, [error, flat]; 0 where missing.
+
+    The noise is put back, so that readings can be dropped later: `as_rows` of ones gives it.
+    """
+    unit = problem.as_rows(np.ones(problem.valid.shape))
+    linearised_at, there = problem.everywhere().metric(point), unit > 0
+    out = np.zeros((len(hypotheses), problem.valid.size))
+    count = max(AT_ONCE // len(unit), 1)
+    for start in range(0, len(hypotheses), count):
+        some = slice(start, start + count)
+        rows = linearised_at.rows(hypotheses[some])
+        out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
+    return out
+
+
+def families_of(known: DistributedErrors) -> tuple[list[str], NDArray[np.int64]]:
+    """Effects in `known`, and the index of each error's effect, [error]."""
+    names = list(dict.fromkeys(name for name, _ in known.hypotheses))
+    return names, np.array([names.index(name) for name, _ in known.hypotheses])
+
+
+def linearise(
+    problem: Problem,
+    known: DistributedErrors,
+    amounts: Array,
+    stored: Array,
+    causes: Sequence[Cause],
+    nuisances: Array,
+) -> tuple[Problem, Point, Array]:
+    """Return the problem linearised as near to some amounts as a beam is stored.
+
+    Args:
+        problem, causes, nuisances, known: see `fit_distributed_errors`.
+        amounts: wanted, [error].
+        stored: amounts with a stored beam; the same object as `amounts`: unknown.
+
+    Returns:
+        The problem with these errors, the point of the causes, and the amounts.
+
+    Raises:
+        UnstableRingError: no amounts between the two store a beam.
+    """
+    first = amounts is stored
+    for turn in range(MAX_HALVINGS):
+        own = zip(known.hypotheses, amounts.tolist(), strict=True)
+        there = [Cause(*h, a) for h, a in own if a]
+        inner = replace(problem, fixed=(*problem.fixed, *there))
+        alone = fit_nuisances(inner, causes, nuisances)
+        if alone.projection is not None:
+            return inner, alone, amounts
+        if first:
+            break
+        # beyond the linear range
+        amounts = stored if turn == MAX_HALVINGS - 2 else (amounts + stored) / 2
+    raise UnstableRingError(f"{alone.lost} with the most probable distributed errors")
+
+
+def chain_factors(known: DistributedErrors, amounts: Array) -> Array:
+    """Factors from signatures to d readings / d amount, [error]; see `Effect.chain`."""
+    own = zip(known.hypotheses, amounts, strict=True)
+    return np.array([find(name).chain(amount) for (name, _), amount in own])
+
+
+def sampled_rows(count: int) -> NDArray[np.int64]:
+    """Return rows for variance components: a fixed random sample, as rows alternate in kind."""
+    if count <= ROWS:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, ROWS, replace=False))
+
+
+def components_of_rows(
+    residual: Array,
+    directions: Array,
+    rows: Array,
+    belongs: NDArray[np.int64],
+    noise: Sequence[Flags] = (),
+) -> VarianceComponents:
+    """Return the variance components from a sample of rows.
+
+    Args:
+        residual: [row].
+        directions: of the nuisances, [row, coordinate].
+        rows: signatures of errors of size 1, [error, row].
+        belongs: family of each error, [error].
+        noise: parts of the rows whose noise is estimated too, [row] each.
+    """
+    launch = directions[:, np.abs(directions).max(axis=0) > 0]
+    size = np.linalg.norm(launch, axis=0)
+    basis = np.linalg.qr(launch / size)[0] if launch.shape[1] else np.zeros((len(residual), 0))
+    there = basis.any(axis=1)  # the other rows have no reading, and no noise
+    there = np.any(noise, axis=0) | there if noise else np.ones_like(there)
+    families = [rows[belongs == k][:, there] for k in range(belongs.max() + 1)]
+    return fit_variance_components(
+        residual[there], basis[there], families, [part[there] for part in noise]
+    )

@@ -1,0 +1,150 @@
+"""Variance components: the sizes of a machine's distributed errors, from its readings.
+
+The errors are Gaussian with one rms per family (an effect, say): C = C0 + sum_h t_h^2 K_h with
+K_h = S_h^T S_h of the family's signatures at their usual rms. The scales t_h maximise the
+restricted likelihood, launches projected out, by the average information of Gilmour, Thompson and
+Cullis (1995). A prior keeps families that the readings do not determine near the others. The
+evidence decides whether there are distributed errors at all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri
+
+Array = NDArray[np.float64]
+
+COMMON_SPREAD = 1.5
+"""rms of the common log scale: machines differ by factors of five."""
+
+FAMILY_SPREAD = 0.7
+"""rms of one family's log scale relative to the others: by factors of two."""
+
+NOISE_SPREAD = 2.0
+"""rms of the log scale of a noise that is a first guess."""
+
+STEPS = 20
+LARGEST = 1.5  # of a step, in the logarithm
+MIN_GAIN = 0.5
+"""Gain of log likelihood below which the iteration ends: steps converge quadratically."""
+
+
+@dataclass(frozen=True)
+class VarianceComponents:
+    """Estimated scales of distributed errors.
+
+    Attributes:
+        scale: of each family, relative to its usual size, [family].
+        covariance: of the log scales, [family, family].
+        noise: scale of each part of the noise, relative to its first guess, [part].
+        log_evidence: over no distributed errors with the guessed noise.
+        log_marginal: log marginal likelihood, up to a constant.
+    """
+
+    scale: Array
+    covariance: Array
+    noise: Array
+    log_evidence: float
+    log_marginal: float
+
+    @property
+    def error(self) -> Array:
+        """Standard deviation of each log scale, [family]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def fit_variance_components(
+    rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[NDArray[np.bool_]] = ()
+) -> VarianceComponents:
+    """Return the most probable scales of families of distributed errors.
+
+    Args:
+        rows: residual in units of the noise, [row].
+        launches: orthonormal directions of the launches, [row, direction].
+        families: usual rms times signature of each error of a family, [error, row].
+        noise: parts of the rows whose noise is estimated too, [row] each; none: noise is known.
+    """
+
+    def out(x: Array) -> Array:
+        return np.asarray(x - (x @ launches) @ launches.T)
+
+    clean = out(rows)
+    inside = launches @ launches.T
+    seen = [out(some) for some in (*families, *(np.diag(mask.astype(float)) for mask in noise))]
+    parts = [own.T @ own for own in seen]
+    # without a scale: the noise where it is known, and the launches' directions
+    base = inside if noise else np.eye(len(rows))
+    precision = _prior(len(families), len(noise))
+    size = np.zeros(len(parts))
+    now = _state(clean, base, parts, size, precision)
+    damping = 1e-3
+    for _ in range(STEPS):
+        step = np.linalg.solve(now.information + damping * np.eye(len(size)), now.slope)
+        step *= min(1.0, LARGEST / np.abs(step).max(initial=1e-300))
+        trial = _state(clean, base, parts, size + step, precision)
+        if trial.value <= now.value + 1e-9:
+            if damping > 1e3 or np.abs(step).max(initial=0.0) < 0.02:
+                break
+            damping = max(10 * damping, 0.1)
+            continue
+        gained, size, now, damping = trial.value - now.value, size + step, trial, damping / 5
+        if gained < MIN_GAIN:
+            break
+    covariance = np.linalg.inv(now.information)
+    none = -0.5 * float(clean @ clean)
+    occam = 0.5 * (np.linalg.slogdet(precision)[1] + np.linalg.slogdet(covariance)[1])
+    count = len(families)
+    return VarianceComponents(
+        np.exp(size[:count]),
+        np.asarray(covariance[:count, :count], dtype=float),
+        np.exp(size[count:]),
+        float(now.value + occam - none),
+        float(now.value + occam),
+    )
+
+
+@dataclass(frozen=True)
+class _State:
+    value: float
+    slope: Array
+    information: Array
+
+
+def _prior(families: int, noise: int) -> Array:
+    """Prior precision of the log scales."""
+    covariance = np.full((families, families), COMMON_SPREAD**2) + FAMILY_SPREAD**2 * np.eye(
+        families
+    )
+    precision = np.zeros((families + noise,) * 2)
+    precision[:families, :families] = np.linalg.inv(covariance)
+    precision[families:, families:] = np.eye(noise) / NOISE_SPREAD**2
+    return precision
+
+
+def _state(
+    rows: Array, base: Array, parts: Sequence[Array], size: Array, precision: Array
+) -> _State:
+    """Log posterior of the scales, its slope, and the average information."""
+    weights = np.exp(2 * size)
+    covariance = base.copy()
+    for weight, part in zip(weights, parts, strict=True):
+        covariance += weight * part
+    factor, failed = dpotrf(covariance, lower=1, overwrite_a=1)
+    if failed:
+        return _State(-np.inf, np.zeros(len(size)), np.eye(len(size)))
+    solved = cho_solve((factor, True), rows, check_finite=False)
+    value = -np.log(np.diag(factor)).sum() - 0.5 * rows @ solved - 0.5 * size @ precision @ size
+    moved = np.array([w * (part @ solved) for w, part in zip(weights, parts, strict=True)])
+    back = cho_solve((factor, True), moved.T, check_finite=False)
+    inverse, _ = dpotri(factor, lower=1, overwrite_c=1)
+    inverse[np.triu_indices(len(inverse), 1)] = 0.0  # dpotri fills one half
+    inverse[np.diag_indices(len(inverse))] *= 0.5
+    traces = np.array(
+        [2 * w * np.vdot(inverse, part) for w, part in zip(weights, parts, strict=True)]
+    )
+    slope = moved @ solved - traces - precision @ size
+    information = 2 * moved @ back + precision
+    return _State(float(value), slope, information)

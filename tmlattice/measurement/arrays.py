@@ -1,0 +1,69 @@
+"""Readings of plain arrays x and y, for the records' `from_arrays`."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tmlattice.errors import MeasurementError
+
+Array = NDArray[np.float64]
+Unit = Literal["m", "mm", "um", "nm"]
+
+_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
+
+
+def metres(unit: str) -> float:
+    """The length of a unit of readings, m.
+
+    Raises:
+        MeasurementError: another unit.
+    """
+    if unit not in _METRES:
+        raise MeasurementError(f"no unit '{unit}'; readings are in {', '.join(_METRES)}")
+    return _METRES[unit]
+
+
+def names_of(elements: Iterable[Any]) -> tuple[str, ...]:
+    """Names of elements of a ring; names stay."""
+    return tuple(getattr(element, "name", element) for element in elements)
+
+
+def readings_of(
+    x: ArrayLike | None,
+    y: ArrayLike | None,
+    monitors: Sequence[str],
+    axes: Sequence[str],
+    unit: str,
+) -> Array:
+    """Return x and y as one array [*axes, monitor, 2], m.
+
+    Args:
+        x, y: [*axes, monitor], of which the first axes may be absent; None: not read.
+        monitors: names.
+        axes: of the result, before the monitor.
+        unit: of x and y.
+
+    Raises:
+        MeasurementError: another shape, another number of monitors, or neither x nor y.
+    """
+    if x is None and y is None:
+        raise MeasurementError("neither x nor y is given; give one at least")
+    given = {}
+    wanted = f"[{', '.join((*axes, f'{len(monitors)} monitors'))}]"
+    for name, values in (("x", x), ("y", y)):
+        if values is None:
+            continue
+        try:
+            array = np.asarray(values, dtype=float)
+        except (TypeError, ValueError):
+            raise MeasurementError(f"{name} does not hold numbers; give an array") from None
+        absent = len(axes) + 1 - array.ndim
+        if not 0 <= absent <= len(axes) or array.shape[-1] != len(monitors):
+            raise MeasurementError(f"{name} has the shape {array.shape}; it should be {wanted}")
+        given[name] = metres(unit) * array.reshape((1,) * absent + array.shape)
+    if len(shapes := {array.shape for array in given.values()}) > 1:
+        raise MeasurementError(f"x and y have the shapes {shapes}; they should be alike")
+    missing = np.full_like(next(iter(given.values())), np.nan)
+    return np.stack([given.get("x", missing), given.get("y", missing)], axis=-1)

@@ -1,0 +1,126 @@
+"""Measurements as tables of pandas and xarray, and back.
+
+The table is that of the measurement folder (`measurement.folder`), in m; `attrs["units"]` states
+the units, and `attrs["measurement"]` what measurement.json holds: launches, settings, noise. Both
+directions take the folder's own writer and reader, so that what is read back is bit-identical.
+"""
+
+import csv
+import json
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from tmlattice.errors import MeasurementError
+from tmlattice.measurement.folder import RESPONSE, AnyMeasurement, read_measurement
+from tmlattice.measurement.orbit_response import OrbitResponse
+from tmlattice.measurement.rows import read_rows
+from tmlattice.measurement.stored_files import KINDS, ORBITS, STEPS, TUNES, TURNS
+from tmlattice.measurement.write import write_measurement
+
+ATTRIBUTE = "measurement"
+_COLUMNS = {
+    "trajectory": TURNS, "turn_by_turn": TURNS, "closed_orbit": ORBITS, "dispersion": STEPS,
+    "tunes": TUNES, "orbit_response": RESPONSE,
+}  # fmt: skip
+
+
+def to_dataframe(measured: AnyMeasurement) -> Any:
+    """Return the readings as a pandas DataFrame: a row a reading.
+
+    Columns: shot, turn, monitor, x, y (m) of first turns and turn by turn; shot, monitor, x, y of
+    a closed orbit; step, monitor, x, y of a dispersion measurement; corrector, monitor, x, y, kick
+    (rad; Hz of the rows of "rf"), plane of an orbit response; shot, quantity, value, error of
+    tunes. The rest stands in `attrs`: `from_dataframe` reads an equal measurement back.
+
+    Raises:
+        MeasurementError: a reading above 0.2 m.
+    """
+    import pandas as pd
+
+    with TemporaryDirectory() as folder:
+        write_measurement(folder, measured)
+        document = json.loads((Path(folder) / "measurement.json").read_text(encoding="utf-8"))
+        columns = _COLUMNS[document["kind"]]
+        rows = read_rows(Path(folder) / _table(document["kind"]), columns)
+    texts = {name: np.array(own, dtype=object)[at] for name, (own, at) in rows.names.items()}
+    numbers = dict(zip(columns[-2:], rows.xy.T, strict=True))
+    frame = pd.DataFrame({name: (rows.whole | texts | numbers)[name] for name in columns})
+    del document["table_sha256"]
+    units = {"x": "m", "y": "m"} if "x" in frame.columns else {}
+    if isinstance(measured, OrbitResponse):
+        units["kick"] = "rad"
+        for column, values in _of_columns(measured).items():
+            frame[column] = frame["corrector"].map(values)
+    frame.attrs = {"units": units, ATTRIBUTE: document}
+    return frame
+
+
+def _of_columns(response: OrbitResponse) -> dict[str, dict[str, Any]]:
+    """Kick and plane by the name of the corrector."""
+    kicks = dict(zip(response.correctors, response.kicks.tolist(), strict=True))
+    planes = dict(zip(response.correctors, response.planes, strict=True))
+    if response.rf is not None:
+        kicks["rf"], planes["rf"] = response.rf.step, ""
+    return {"kick": kicks, "plane": planes}
+
+
+def to_xarray(measured: AnyMeasurement) -> Any:
+    """Return the readings as an xarray Dataset: x and y in m along shots, turns and monitors.
+
+    The axes are the first columns of `to_dataframe`; `attrs["measurement"]` is its attribute, as
+    JSON text, so that the Dataset can be written to a file.
+
+    Raises:
+        MeasurementError: a reading above 0.2 m, or xarray is not installed.
+    """
+    frame = to_dataframe(measured)
+    axes = list(_COLUMNS[frame.attrs[ATTRIBUTE]["kind"]][:-2])
+    of_columns = [frame.pop(name) for name in ("kick", "plane") if name in frame.columns]
+    try:
+        data = frame.set_index(axes).to_xarray()
+    except ImportError as error:
+        raise MeasurementError("to_xarray needs the package xarray: pip install xarray") from error
+    data = data.sel({axis: frame[axis].unique() for axis in axes})  # in the order of the readings
+    for values in of_columns:
+        first = values[~frame["corrector"].duplicated()].tolist()
+        data = data.assign_coords({values.name: ("corrector", first)})
+    data.attrs = {ATTRIBUTE: json.dumps(frame.attrs[ATTRIBUTE], ensure_ascii=False)}
+    for name, unit in frame.attrs["units"].items():
+        data[name].attrs["units"] = unit
+    return data
+
+
+def of_document(frame: Any) -> AnyMeasurement | None:
+    """The measurement of a frame of `to_dataframe`; None: it states none, or is no such table.
+
+    Raises:
+        MeasurementError: rows that cannot be read.
+    """
+    document = frame.attrs.get(ATTRIBUTE)
+    if isinstance(document, str):
+        document = json.loads(document)
+    if not isinstance(document, dict) or document.get("kind") not in _COLUMNS:
+        return None
+    columns = list(_COLUMNS[document["kind"]])
+    if not set(columns) <= set(frame.columns):
+        return None
+    with TemporaryDirectory() as folder:
+        place = Path(folder)
+        (place / "measurement.json").write_text(json.dumps(document), encoding="utf-8")
+        table = StringIO()
+        frame[columns].to_csv(table, index=False, quoting=csv.QUOTE_MINIMAL, lineterminator="\n")
+        (place / _table(document["kind"])).write_text(table.getvalue(), encoding="utf-8")
+        try:
+            return read_measurement(place)
+        except MeasurementError as error:
+            raise MeasurementError(str(error).replace(folder, type(frame).__name__)) from error
+
+
+def _table(kind: str) -> str:
+    if kind in KINDS:
+        return KINDS[kind].table
+    return "response.csv" if kind == "orbit_response" else "readings.csv"
