@@ -244,7 +244,7 @@ def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, sch
                      "(bpm::5, QD::5, end_5)", "the gap of held-out readings stays"]),
         ("none", ["No error is detected", "Detection limits",
                      "wrong strength of a quadrupole"]),
-        ("distributed", ["all along the ring", "faults that small errors hide", "--reference"]),
+        ("distributed", ["Distributed errors", "that distributed errors hide", "--reference"]),
     ],
 )  # fmt: skip
 def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):

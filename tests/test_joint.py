@@ -265,7 +265,7 @@ def test_what_has_no_meaning_is_a_sentence(small_ring):
 
 def test_readings_that_are_given_twice_are_refused(small_ring):
     data = {"monday": _orbit(small_ring, [KICK]), "again": _orbit(small_ring, [KICK])}
-    with pytest.raises(MeasurementError, match="'monday' and 'again' hold the same readings"):
+    with pytest.raises(MeasurementError, match="'monday' and 'again' contain the same readings"):
         diagnose(small_ring, data)
     data["again"] = _orbit(small_ring, [KICK], seed=5)
     assert diagnose(small_ring, data).verdict in {"identified", "ambiguous"}

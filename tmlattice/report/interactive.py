@@ -101,15 +101,15 @@ def _trace(
     style: Figure = {"line": {"width": size, "color": _colour(colour), "dash": dash}}
     if mode == "markers":
         style = {"marker": {"size": size, "color": _colour(colour)}}
-    hover: Figure = {"hoverinfo": "skip"}
+    texts: Figure = {"hoverinfo": "skip"}
     if text is not None:
-        hover = {
+        texts = {
             "text": [as_plain(one) for one in text],
             "hovertemplate": f"%{{text}}{hover}<extra></extra>",
         }
     return {
         "type": "scatter", "x": _short(x, 6), "y": _short(y, 4), "name": as_plain(name),
-        "mode": mode, **style, **hover, **more,
+        "mode": mode, **style, **texts, **more,
     }  # fmt: skip
 
 
