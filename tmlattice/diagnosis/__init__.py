@@ -77,16 +77,15 @@ def diagnose(
             (`diagnosis.twin`). Not for an orbit response.
         heldout: of first turns: the validation set itself, instead of a share.
         radiation: of first turns: bends and wigglers of the model radiate.
-        missing: of an orbit response: weigh which effect the result still lacks.
+        missing: of an orbit response: compare effects that may be missing.
         seed: of the split, the simulated threshold and the bootstrap.
         progress: called with the name of each stage.
 
-    Monitors and correctors that the lattice lacks are left out, and reported, where they are half
-    of the names at most.
+    BPMs and correctors that are not in the lattice are rejected with a message, up to half of the
+    names.
 
-    Of fewer than 100,000 readings the result is the same to the bit on any number of threads: a
-    library that shares a product among them adds in another order, and is no quicker there. Of
-    more it is the same to rounding.
+    Up to 100,000 readings the result is the same to the bit on any number of threads; above, it is
+    the same to rounding.
 
     Raises:
         MeasurementError: data that cannot be used, or are given twice, or an option without meaning

@@ -97,7 +97,7 @@ class Assessment:
             without small errors.
         families: whether families of errors were fitted.
         rejected: families that were tried and are not in the result.
-        small_errors: whether small errors everywhere are in the model.
+        small_errors: whether distributed errors are in the model.
         reference: whether a reference measurement was given.
         change: whether the findings are changes since that reference.
         measured: quantities of the stored beam that were measured.

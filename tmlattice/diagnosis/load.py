@@ -1,7 +1,7 @@
 """A diagnosis of its file: `Diagnosis.load("result")`.
 
 The file holds findings, errors, steps and every sentence of the report. It does not hold the
-readings, the scan and the covariance: what needs them says so.
+readings, the scan and the covariance: functions that need them raise an error.
 """
 
 from collections.abc import Mapping
@@ -56,11 +56,11 @@ def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diag
 
     Args:
         path: the folder, or the JSON file.
-        ring: the lattice; None: of the file diagnosis.lattice.json beside it, else the one that
+        ring: the lattice; None: of the file diagnosis.lattice.json next to it, else the one that
             the file names.
 
     Raises:
-        MeasurementError: no diagnosis, a file of an earlier version that lacks something, or a
+        MeasurementError: no diagnosis, a file of an earlier version with missing parts, or a
             lattice that does not have its elements.
         LatticeError: the lattice cannot be read.
     """
@@ -86,7 +86,7 @@ def _ring(file: Path, document: Mapping[str, Any]) -> Ring:
         ring = load_ring(beside if beside.is_file() else named)
     except TmlatticeError as error:
         raise MeasurementError(
-            f"'{file}' needs its lattice '{named}': put {LATTICE} beside it, or give the lattice "
+            f"'{file}' needs its lattice '{named}': put {LATTICE} next to it, or give the lattice "
             f"(in Python: ring=) ({error})"
         ) from error
     return replace(ring, name=named)

@@ -1,7 +1,7 @@
 """Preparation of the search: data and model, and the messages about them.
 
 BPMs without a signal are rejected, the noise is estimated where none is stated, and data of another
-ring are refused.
+ring raise an error.
 """
 
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ class Prepared:
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
         noise: rms of a reading, m, (x, y); NaN for a plane without readings.
         estimated: whether the noise comes from the data.
-        said: what a reader should know.
+        said: messages.
     """
 
     problem: FirstTurns

@@ -112,7 +112,7 @@ def diagnose_together(
         measured: by the names that the result calls them.
         reference: of the same machine before the fault, of any kinds: static errors cancel.
         background: small errors, as of `diagnose`.
-        known: of the small errors beforehand, from an earlier diagnosis whose ring as found this
+        known: of the distributed errors, from an earlier diagnosis whose estimated ring this
             is: see `twin`. Then no background is asked for.
         holdout: share of shots, or of correctors, in the validation set.
         heldout: of first turns alone: those shots themselves, instead of a share.
@@ -125,7 +125,7 @@ def diagnose_together(
         progress: called with the name of each stage.
 
     Raises:
-        MeasurementError: data that cannot be used; the sentence says which.
+        MeasurementError: data that cannot be used; the message names them.
         EffectError: none of the effects can be looked for.
         UnknownNameError: a monitor or an effect that does not exist.
         UnstableRingError: the design has no stored beam.

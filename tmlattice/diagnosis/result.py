@@ -205,17 +205,17 @@ class Diagnosis(ShownDiagnosis):
         fit_before, fit_after: misfit of the readings of the fit.
         heldout: of held-out readings, before, each finding or step added, after; or None.
         heldout_shots: their ids, of trajectories.
-        unexplained: p-value of what is left, where it sits, and its patterns (orbit response).
+        unexplained: p-value of the residual, its places and patterns (orbit response).
         tunes: fractions of Qx, Qy of the design and of the ring with the causes; None: unstable.
-        next: the shot that would tell the most probable alternatives apart, or None.
-        sensitivity: by effect, the amount that would be seen at half of its places.
-        warnings: what a reader should know.
-        outliers: single readings that the search left out: shot, turn, monitor, plane.
+        next: the shot that separates the most probable alternatives, or None.
+        sensitivity: by effect, the detection limit at half of its places.
+        warnings: messages.
+        outliers: single readings that the search rejected: shot, turn, monitor, plane.
         noise: rms of a reading, m, (x, y).
         noise_estimated: whether it comes from the data.
         provenance: package, lattice, options as used, seed, seconds.
         ring: the design.
-        repaired: the model repaired, which is the ring as found: the design with the named causes
+        repaired: the estimated ring: the design with the identified causes
             in it; monitors and correctors are in `calibration`. See `as_found` and `repair`.
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
@@ -226,15 +226,15 @@ class Diagnosis(ShownDiagnosis):
         priors: rms of small errors, learnt or stated, by family.
         prior_errors: relative error of those that were learnt; above one half the readings hardly
             see the family.
-        degenerate: what the data alone do not settle, in words.
-        reasons: the few numbers behind the gradients of a dense fit; None where none were fitted.
-        inconsistencies: what the RF's orbit and the correctors' responses disagree about, or None.
-        hypotheses: effects that may be missing, weighed; None: not asked.
-        suspects: where to look first for a fault that was not detected.
-        dispersion: beside that of the ring as found, for `write_calibration`.
+        degenerate: what the data alone do not determine, in words.
+        common_factors: of the gradients of a hierarchical fit; None where none were fitted.
+        inconsistencies: of the RF's orbit and the correctors' responses, or None.
+        hypotheses: effects that may be missing, with scores; None: not tested.
+        suspects: first places to inspect for an undetected fault.
+        dispersion: additional to that of the estimated ring, for `write_calibration`.
         rejected: channels that the model cannot describe: (monitor, "x" or "y"), or (corrector,
             None).
-        compared: blocks of readings with what the result predicts of them.
+        compared: blocks of readings with their prediction by the result.
         correlations: pairs of amounts that the data hardly separate.
         covariance: of the amounts of the causes, [cause, cause]; None where none is stated, as of
             a change between two orbit responses and of a diagnosis that was loaded. See `tables`.
@@ -449,7 +449,7 @@ class Diagnosis(ShownDiagnosis):
     def repair(self) -> tuple[Ring, tuple[Cause, ...]]:
         """The design with the settings that correct the faults, and the causes that none corrects.
 
-        Loaded into the machine as it was found, these settings make it the design again: see
+        In the present machine these settings restore the design: see
         `recommended_actions.compensated`.
         """
         return compensated(self.ring, self.faults)

@@ -212,6 +212,6 @@ def few(ring: Ring, data: Measurement | OrbitResponse) -> Check | None:
     if read < 2:
         return wrong(
             "monitors", f"{read} monitor was read; a trajectory needs two monitors at least, and "
-            "more to be judged: read more",
+            "more for a diagnosis: read more",
         )  # fmt: skip
     return None

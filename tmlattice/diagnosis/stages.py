@@ -43,10 +43,10 @@ class Stage:
 
     Attributes:
         static: small errors, which a reference has too.
-        causes: what was found.
+        causes: the findings.
         point: what they leave.
-        share: of the way to the likeliest small errors, from those of the fit, that `static` goes:
-            1, or less where no beam is stored with all of them.
+        share: of the step to the most probable distributed errors, from those of the fit, in
+            `static`: 1, or less where no beam is stored with all of them.
     """
 
     static: tuple[Cause, ...]
@@ -105,7 +105,7 @@ def _settled(
 
 
 def too_large(stages: Sequence[Stage]) -> list[str]:
-    """The message that the last model lacks a part of the distributed errors, or empty."""
+    """The message that a part of the distributed errors is not in the last model, or empty."""
     share = stages[-1].share
     if share == 1:
         return []

@@ -231,7 +231,7 @@ def _among(
         doubt = _given(explanation, small, learn)
         if doubt is None:
             break
-        search.progress("small errors with what was found")
+        search.progress("distributed errors with the findings")
         beside, causes = doubt
         weigh = not explanation.count and beside is explanation.fit  # one of the distributed errors
         try:
@@ -268,7 +268,7 @@ def _linearised(
     noisy: bool,
     weigh: bool = False,
 ) -> tuple[FittedErrors, tuple[Cause, ...]]:
-    """The small errors again, linearised at the most probable ones given what was found, and the
+    """The distributed errors, linearised at the most probable ones given the findings, and the
     causes with their share in them.
 
     Raises:
@@ -310,8 +310,8 @@ def _settled(
 ) -> tuple[Explanation, FittedErrors]:
     """Distributed errors linearised at all findings with their amounts, and the alternatives too.
 
-    What they took up of a fault before it was found spoils the slopes at which its rivals were
-    weighed: by ten in the log evidence, for a fault of 50 times the noise.
+    Distributed errors that absorbed a part of an undetected fault bias the comparison of its
+    alternatives: by ten in the log evidence, for a fault of 50 times the noise.
     """
     found = explanation.fit
     try:
@@ -344,10 +344,10 @@ def _given(
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
     """The fit and the causes to linearise the distributed errors at; None where they stay.
 
-    A strong fault's orbit makes small errors look like further faults, so the strongest finding is
-    taken along. A monitor that was set aside has errors of its own that took up what they could: it
-    starts anew. And sizes that were learnt with a fault among them are too large, so that it passes
-    for a small error: where nothing was found the most probable fault has to be weighed without it.
+    A strong fault's orbit makes distributed errors look like further faults, so the strongest
+    finding is included. Errors of a rejected BPM start at zero again. Prior scales learnt with a
+    fault are too large and hide it, so without findings the most probable fault is compared with
+    scales learnt without it.
     """
     if not explanation.count:
         if not learn:
@@ -439,8 +439,8 @@ def strongest(explanation: Explanation) -> Cause:
 def outlier(estimate: Sequence[Cause], sizes: Mapping[str, float]) -> Cause | None:
     """The outlier among the distributed errors: an amount far above its family's scale.
 
-    A family of which the readings see few (four correctors that are set) takes its size from such a
-    one, and so hides it.
+    The scale of a small family (four correctors that are set) includes such an outlier, and hides
+    it.
 
     Args:
         estimate: the most probable small errors.

@@ -49,8 +49,8 @@ class Suspect:
         near: the names of those monitors.
         statistic: fall of chi-square by it; or, of an outlier of a family, its distance from the
             median in units of the family's scatter.
-        threshold: of the whole scan; what exceeds it and is no finding is less probably a fault
-            than a large one of the small errors everywhere. Or `OUTLIER`.
+        threshold: of the whole scan; a larger one that is no finding is less probably a
+            fault than a large distributed error. Or `OUTLIER`.
         measure: "chi2" or "scatter": of which the statistic is.
         elements: all that share the amount.
         amount, amount_sigma: in the effect's unit; None of a scan's.

@@ -60,10 +60,9 @@ def knowledge_file(lattice: Path) -> Path:
 def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
     """The knowledge with the estimated ring; None: nothing on distributed errors.
 
-    The small errors with their covariance. Of an orbit response they are linear about its dense
-    fit; where that leaves no stored beam, or takes too long, each error of the fit has its own
-    standard deviation, its correlations left out: what neighbours know together is known less
-    well than it is.
+    The distributed errors with their covariance. Of an orbit response they are linearised at its
+    hierarchical fit. Where that stores no beam, or takes too long, each error of the fit has its
+    own standard deviation, without correlations.
     """
     view = diagnosis.view
     if isinstance(view, JointView):

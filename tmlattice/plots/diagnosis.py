@@ -42,7 +42,7 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
     _, ax = plt.subplots(figsize=(6.5, 6.5), layout="constrained")
     plot_plan(diagnosis, ax)
-    yield "plan", "The ring from above, with what was found.", _figure(ax)
+    yield "plan", "The ring from above, with the findings.", _figure(ax)
     yield from (response_figures if diagnosis.by_steps else _searched_figures)(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         if len(finding.recommended_actions) > 1:
@@ -74,14 +74,14 @@ def _of_readings(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     elif any(np.isfinite(part.left).any() for part in diagnosis.parts):
         yield (
             "readings",
-            "What is left at each monitor in units of the noise, of each measurement, with the "
-            "design and with what was found.",
+            "Residual at each BPM in units of the noise, of each measurement, with the "
+            "design and with the findings.",
             plot_parts(diagnosis),
         )
     yield (
         "scan",
         "How much better each hypothesis alone explains the data (fall of chi-square), along the "
-        "ring, before anything was found. Above the dashed line it is no accident of the noise "
+        "ring, before any finding. Above the dashed line it is no accident of the noise "
         "anywhere in the scan.",
         plot_scan(diagnosis),
     )
@@ -118,7 +118,7 @@ ROOM = 60.0
 
 
 def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
-    """The statistic of every hypothesis along the ring, before anything was found.
+    """Draw the statistic of every hypothesis along the ring, before any finding.
 
     Args:
         diagnosis: of `diagnose`.
@@ -147,7 +147,7 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
 
 
 def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None = None) -> Figure:
-    """The same around one finding, with the monitors; linear, so that neighbours can be told apart.
+    """Draw the statistic around one finding, with the BPMs, on a linear scale.
 
     Args:
         diagnosis: of `diagnose`.
@@ -189,14 +189,14 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
 
 
 def around(diagnosis: Diagnosis, finding: Finding) -> tuple[float, float]:
-    """From and to which s a finding with a place is drawn near by, m."""
+    """The interval of s, m, in which a finding is drawn."""
     assert finding.where is not None
     low, high = finding.where
     return max(low - ROOM, 0.0), min(high + ROOM, diagnosis.ring.length)
 
 
 def thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
-    """Of the named effects and of free kicks."""
+    """Detection thresholds of named effects and of free kicks."""
     explanation = diagnosis.explanation
     rate = diagnosis.provenance["options"]["false_alarm"]
     free = explanation.first_kicks
@@ -238,7 +238,7 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
 
 
 def middles(diagnosis: Diagnosis) -> Array:
-    """Where each hypothesis of the first scan sits, m; NaN for those without a place."""
+    """The place of each hypothesis of the first scan, m; NaN without one."""
     middles = {element.name: element.s for element in diagnosis.ring.elements}
     return np.array(
         [
@@ -249,7 +249,7 @@ def middles(diagnosis: Diagnosis) -> Array:
 
 
 def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
-    """Hypotheses without a place, the best of each effect."""
+    """Draw hypotheses without a place, the best of each effect."""
     found = diagnosis.explanation.first
     best: dict[str, float] = {}
     places = middles(diagnosis)
@@ -266,7 +266,7 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     side.set_xticks(range(len(best)), [find(effect).label for effect in best])
     side.tick_params(axis="x", labelrotation=90, labelsize="x-small", labelbottom=True)
     for label in side.get_xticklabels():
-        label.set_in_layout(False)  # they hang into the empty corner beside the strip
+        label.set_in_layout(False)  # they hang into the empty corner next to the strip
     side.set_xlim(-0.7, max(len(best), 1) - 0.3)
     side.set_title("whole ring", fontsize="small")
 
@@ -298,7 +298,7 @@ LABEL = 34
 
 
 def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
-    """The rms residual of held-out readings as findings are added one after another.
+    """Draw the rms residual of held-out readings against the number of findings.
 
     Args:
         diagnosis: with held-out shots.
@@ -344,7 +344,7 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
 
 
 def gap_axes(diagnosis: Diagnosis) -> Axes:
-    """High enough for all names beside the bars."""
+    """Axes of a height for all names next to the bars."""
     labels = gap_labels(diagnosis)
     lines = max(len(wrap(label, LABEL)) for label in labels)
     height = 1.3 + max(0.5, 0.1 + 0.17 * lines) * max(len(labels), 2)
@@ -353,21 +353,21 @@ def gap_axes(diagnosis: Diagnosis) -> Axes:
 
 
 def over_decades(rms: Iterable[float]) -> bool:
-    """Whether bars of these lengths want a logarithmic axis; a model that loses a beam has none."""
+    """Whether bars of these lengths need a logarithmic axis; a model that loses a beam has none."""
     there = [value for value in rms if np.isfinite(value)]
     return bool(there) and max(there) > 20 * max(min(there), 1e-9)
 
 
 def noise_rms(diagnosis: Diagnosis) -> float:
-    """Of a reading, both planes together, µm."""
+    """Noise rms of a reading, both planes together, µm."""
     return 1e6 * float(np.sqrt(np.nanmean(np.square(diagnosis.noise))))
 
 
 def gap_labels(diagnosis: Diagnosis) -> list[str]:
-    """What each model of the held-out gap has in it beyond the one before, the design first."""
+    """Labels of the held-out residuals: the design, then the errors added by each model."""
     steps = 0 if diagnosis.heldout is None else len(diagnosis.heldout.misfits)
     if diagnosis.priors:
-        return [diagnosis.ring.model, "+ small errors everywhere", "+ what was found"][:steps]
+        return [diagnosis.ring.model, "+ distributed errors", "+ findings"][:steps]
     faults = (f"+ {find(c.effect).words} {c.element or ''}".rstrip() for c in diagnosis.faults)
     return [diagnosis.ring.model, *faults][:steps]
 
@@ -378,7 +378,7 @@ MOST = 15
 
 
 def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
-    """Probabilities of the explanations of one finding.
+    """Draw the probabilities of the explanations of one finding.
 
     Args:
         finding: with a credible set.
@@ -404,7 +404,7 @@ def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
     ax.set_xlabel("probability [%]")
     rest = len(finding.credible_set) - len(members)
     if rest:
-        ax.set_title(f"{rest} less likely ones not drawn", loc="right", fontsize="small")
+        ax.set_title(f"{rest} less probable ones not drawn", loc="right", fontsize="small")
     ax.grid(axis="x", alpha=0.25)
     ax.set_axisbelow(True)
     return ax

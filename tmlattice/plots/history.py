@@ -25,7 +25,7 @@ def plot_loss(
         fit: of `fine_tune`.
         ax: where to draw; else a new one.
         floor: the loss that noise alone would leave, m^2.
-        others: what other methods leave, m^2, by name.
+        others: the loss of other methods, m^2, by name.
     """
     if ax is None:
         _, ax = plt.subplots()

@@ -10,7 +10,7 @@ from tmlattice.plots.strip import lattice_strip, plain_log
 
 
 def plot_parts(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
-    """The rms of what is left at each monitor in units of the noise, a panel a measurement.
+    """Draw the rms residual at each BPM in units of the noise, a panel a measurement.
 
     Args:
         diagnosis: with parts.
@@ -27,10 +27,10 @@ def plot_parts(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
         order = np.argsort(s)
         before, after = np.maximum(part.left[:, order], 1e-2)
         ax.plot(s[order], before, ".-", color=BEFORE, lw=0.8, ms=4, label=diagnosis.ring.model)
-        ax.plot(s[order], after, ".-", color=AFTER, lw=0.8, ms=4, label="with what was found")
+        ax.plot(s[order], after, ".-", color=AFTER, lw=0.8, ms=4, label="with the findings")
         ax.axhline(1.0, color="k", linestyle="--", linewidth=1)
         plain_log(ax)
-        ax.set_ylabel("left / noise")
+        ax.set_ylabel("residual / noise")
         ax.set_title(part.label, loc="left", fontsize="medium")
         ax.grid(alpha=0.25)
         mark(ax, diagnosis)

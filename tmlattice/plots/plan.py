@@ -1,4 +1,4 @@
-"""The ring from above, with what was found."""
+"""The ring from above, with the findings."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Small:
-    """What is drawn small, beside the orbit: by so much of the ring's size, outside positive."""
+    """Small symbols next to the orbit, and their offset as a share of the ring's size, outside
+    positive."""
 
     marker: str
     colour: str
@@ -29,7 +30,8 @@ SMALL = {"monitor": Small("o", "tab:cyan", 0.02), "corrector": Small("^", "tab:o
 """By kind."""
 
 LETTER, LINE, BESIDE = 0.022, 0.06, 0.06
-"""Of the ring's size: a letter's width and a line's height of a name, and how far it stands off."""
+"""Width of a letter and height of a line of a name, and its distance, as shares of the ring's
+size."""
 
 CULPRIT, SUSPECT = "#d1105a", "#c58a00"
 
@@ -52,7 +54,7 @@ def beside(plan: Survey, kind: str, places: list[int]) -> Array:
 
 
 def place_of(finding: Finding, diagnosis: Diagnosis, plan: Survey) -> Array | None:
-    """Where a finding stands, (x, y), m; None where it has no place."""
+    """The place of a finding, (x, y), m; None where it has none."""
     if finding.s is not None:
         return plan.along(finding.s, diagnosis.ring)
     if finding.elements:
@@ -63,7 +65,7 @@ def place_of(finding: Finding, diagnosis: Diagnosis, plan: Survey) -> Array | No
 
 
 def inwards(place: Array, plan: Survey) -> tuple[str, str]:
-    """Where beside a place its name has room: towards the middle of the ring."""
+    """The side of a place with space for its name: towards the middle of the ring."""
     away = place - plan.ends.mean(axis=0)
     side = "left" if away[0] > 0 else "right"
     if abs(away[1]) > abs(away[0]):
@@ -109,7 +111,8 @@ def label(number: int, finding: Finding) -> str:
 
 
 def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
-    """The ring from above: magnets along the orbit, monitors and correctors small, culprits marked.
+    """Draw the ring from above: magnets along the orbit, BPMs and correctors small, findings
+    marked.
 
     Args:
         diagnosis: of `diagnose`.

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 BEFORE, AFTER = "C0", "C3"
 
 ENOUGH = 4
-"""Monitors before a finding that tell the launch without it."""
+"""BPMs before a finding that determine the launch without it."""
 
 
 def _starts(finding: Finding) -> float | None:
@@ -29,8 +29,8 @@ def _starts(finding: Finding) -> float | None:
 
 
 def before_findings(diagnosis: Diagnosis) -> NDArray[np.bool_] | None:
-    """The monitors before the first place where something acts, [monitor]; None where there is no
-    such place, or too few of them."""
+    """The BPMs before the first finding, [monitor]; None where there is no such place, or too
+    few."""
     starts = [s for finding in diagnosis.findings if (s := _starts(finding)) is not None]
     if not starts:
         return None
@@ -68,7 +68,8 @@ def design_readings(diagnosis: Diagnosis) -> Array:
 def plot_readings(
     diagnosis: Diagnosis, figure: Figure | None = None, shot: int | None = None
 ) -> Figure:
-    """First-turn readings of a shot of the fit and what the design and the repaired ring leave.
+    """Draw first-turn readings of a shot of the fit, and the residuals of the design and the
+    estimated ring.
 
     Args:
         diagnosis: of `diagnose`.
@@ -107,7 +108,7 @@ def plot_readings(
             texts.append(_left_text(left, before if label == names[0] else None))
         if dropped[:, plane].any():
             at = dropped[:, plane]
-            orbit.plot(s[at], 1e3 * read[at, plane], "x", color="0.4", ms=5, label="left out")
+            orbit.plot(s[at], 1e3 * read[at, plane], "x", color="0.4", ms=5, label="rejected")
         orbit.set_ylabel(f"{name} [mm]")
         residual.set_ylabel(f"residual {name} [mm]")
         after = f"; with the findings {texts[1]}" if len(texts) > 1 else ""
@@ -133,7 +134,7 @@ def plot_readings(
 
 
 def _left_text(left: Array, before: NDArray[np.bool_] | None) -> str:
-    """The rms of what is left, m, as µm: of all, or before and behind the first finding."""
+    """The rms residual, m, as µm: of all, or before and behind the first finding."""
 
     def rms(values: Array) -> str:
         seen = values[np.isfinite(values)]

@@ -17,8 +17,8 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     if not result.stored:
         yield (
             "maps",
-            "Orbit change by corrector and monitor, each corrector in its own plane: measured, "
-            f"what the {_before(result)} leaves of it and what the result does. Grey: left out.",
+            "Orbit change by corrector and BPM, each corrector in its own plane: measured, and "
+            f"residuals of the {_before(result)} and of the result. Grey: rejected.",
             plot_maps(result),
         )
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
@@ -63,7 +63,7 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
         image[view.held[:-1][order]] = np.nan if title.endswith("result") else image[
             view.held[:-1][order]
         ]  # fmt: skip
-        limit = 4.0 * float(np.nanmedian(abs(image)))  # a plane with few correctors sets no scale
+        limit = 4.0 * float(np.nanmedian(abs(image)))  # a plane of a single corrector sets no scale
         colours = plt.get_cmap("RdBu_r").with_extremes(bad="0.8")
         shown = ax.imshow(
             image.T, aspect="auto", cmap=colours, vmin=-limit, vmax=limit, origin="lower",
@@ -78,7 +78,8 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
 
 
 def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
-    """What is left of each fitted corrector in its own plane before and after, in one scale."""
+    """Draw the residual of each fitted corrector in its own plane before and after, in one
+    scale."""
     figure = plt.figure(figsize=(11, 4.2), layout="constrained") if figure is None else figure
     view = result.response
     plane = np.array([int(p == "y") for p in view.measured.planes])

@@ -1,4 +1,4 @@
-"""The figure of an object that is asked to draw itself: `ring.plot()`, `diagnosis.plot()`, ..."""
+"""The default figures of objects: `ring.plot()`, `diagnosis.plot()`, ..."""
 
 from collections.abc import Iterator
 from os import PathLike
@@ -32,7 +32,7 @@ MOST = 8
 
 
 def plot_ring(ring: Ring, span: tuple[float, float] | None = None) -> Figure:
-    """Betas along the ring, its lattice below.
+    """Draw betas along the ring, with its lattice below.
 
     Args:
         ring: with a closed orbit and tunes.
@@ -47,7 +47,7 @@ def plot_ring(ring: Ring, span: tuple[float, float] | None = None) -> Figure:
 
 
 def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
-    """One of the figures of the report.
+    """Draw one of the figures of the report.
 
     Args:
         diagnosis: of `diagnose`.
@@ -74,7 +74,7 @@ def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
 
 
 def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = None) -> Figure:
-    """What was read, x above y.
+    """Draw the readings, x above y.
 
     Args:
         measured: of any kind.
@@ -133,7 +133,7 @@ def _lines(measured: Any) -> Iterator[tuple[str, Array]]:
 
 
 def _tunes(measured: TuneReading, ring: Ring | None) -> Figure:
-    """Tunes, and chromaticities where there are some, by shot; the ring's own beside them."""
+    """Draw tunes, and chromaticities where there are any, by shot, with the ring's own."""
     told = [("Q{}", measured.tune, measured.tune_error)]
     if measured.chromaticity is not None:
         told.append(("chromaticity {}", measured.chromaticity, measured.chromaticity_error))

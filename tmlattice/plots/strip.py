@@ -19,7 +19,7 @@ COLOURS = {
 
 
 METHOD_COLOURS = {"adam": "C3", "sparse": "C2", "map": "C1"}
-"""Of the methods of a fit, in every figure that holds them together."""
+"""Colours of the methods of a fit, in every figure."""
 
 
 def lattice_strip(ring: Ring, ax: Axes) -> Axes:
@@ -65,7 +65,7 @@ def _sign(element: Any) -> float:
 
 
 def plain_log(ax: Axes) -> None:
-    """A logarithmic axis upwards with 1, 2, 5, 10 beside it, not powers."""
+    """A logarithmic axis upwards with labels 1, 2, 5, 10 instead of powers."""
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")

@@ -1,4 +1,4 @@
-"""What a network says of its ring, along s."""
+"""The errors of a ring by a network, along s."""
 
 from typing import TYPE_CHECKING
 

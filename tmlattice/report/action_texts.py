@@ -42,11 +42,11 @@ def action_text(recommended_action: RecommendedAction) -> str:
         what = amount  # "no signal"
     else:
         what = f"{effect.quantity or effect.words} {amount}".rstrip()
-    consequences = ""
+    strength = ""
     if recommended_action.strength is not None:
         own = recommended_action.strength
-        consequences = f" ({own.name} {own.before:.4g} -> {own.after:.4g} {own.unit})"
-    return f"{subject(recommended_action)}, {what}{consequences}"
+        strength = f" ({own.name} {own.before:.4g} -> {own.after:.4g} {own.unit})"
+    return f"{subject(recommended_action)}, {what}{strength}"
 
 
 def title(finding: Finding) -> str:

@@ -89,7 +89,7 @@ def diagnose_change(
 
     Args:
         ring: the design.
-        before, after: of the same machine; correctors and monitors that one of them lacks are left
+        before, after: of the same machine; correctors and monitors of only one of them are left
             out.
         holdout: share of the correctors that validate the gap; amounts are fitted to all of them.
         effects: only changes of these are looked for.

@@ -1,11 +1,11 @@
-"""Which supplies, magnets and devices changed: candidates weighed by evidence.
+"""Changed supplies, magnets and devices: candidates compared by the marginal likelihood.
 
->>> findings, scatter = what_changed(state, judgement, left_open(reference))
+>>> findings, scatter = changed_supplies(state, judgement, undetermined_of(reference))
 
-Magnets of a supply scatter in their change, and by how much says how well a change of a supply is
-known. What a fit of every magnet learns of it has the changes of single magnets in it; so the
-scatter, too, is what the evidence of the candidates beside it wants. Where some supplies changed
-others may have, too, that cannot be told one by one: by how much is learnt in the same way.
+The magnets of a supply scatter in their change, and the scatter limits the precision of a supply's
+change. A hierarchical fit of every magnet includes changes of single magnets in it. So the scatter
+is learnt again given the candidates, and in the same way that of undetermined changes of other
+supplies.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -79,12 +79,12 @@ def changed_supplies(
 
     Args:
         state: of a fit of the change.
-        judgement: of the sets of rivals.
-        open_: what is not known of the ring that changed; None: it is known.
+        judgement: of the sets of alternatives.
+        open_: undetermined errors of the ring that changed; None: none.
 
     Returns:
         The findings; and by how much magnets of a supply scatter in their change, rms, relative,
-        and supplies that are not told (0: they did not), by the effects' names; empty where no
+        and undetermined supplies (0: none), by the effects' names; empty where no
         quadrupoles were fitted.
     """
     found, scatter = _found(state, judgement, {})
@@ -97,7 +97,7 @@ def changed_supplies(
         before = {(own.effect, own.element) for own in found}
         try:
             blurred = _blurred(problem, open_, found)
-        except UnstableRingError:  # what was found is too much for the ring
+        except UnstableRingError:  # the ring is unstable with the findings
             break
         found, scatter = _found(state, judgement, blurred)
         if not found or {(own.effect, own.element) for own in found} == before:

@@ -1,13 +1,13 @@
-"""Few reasons behind many gradient errors: one scale, focusing, regions, types, families, magnets.
+"""Common factors of many gradient errors: one scale, focusing, regions, types, families, magnets.
 
 >>> found = explain_gradients(fit.state)
->>> [(own.kind, own.name, own.amount, own.amount_sigma) for own in found.reasons]
+>>> [(own.kind, own.name, own.amount, own.amount_sigma) for own in found.common_factors]
 
-A dense fit ends in an error of every quadrupole. Here the same readings are asked which few numbers
-that many magnets share explain them: candidates of every level are weighed by evidence
-(`inference.levels`), beside other sets of them that say the same (`inference.sets`), with the
-scatter of single magnets, as the fit has learnt it, in every error. Single magnets that stay far
-off all the same are flagged, with the neighbours they pull against.
+A hierarchical fit ends in an error of every quadrupole. The same readings are explained again by
+common factors, numbers that many magnets share. Candidates of every level are compared by the
+marginal likelihood (`inference.levels`), with alternative sets (`inference.sets`). The learnt
+scatter of single magnets is in every error. Outlier magnets are reported with their correlated
+neighbours.
 """
 
 from collections.abc import Sequence
@@ -76,11 +76,11 @@ class Reason:
         name: of what shares it.
         members: the magnets, by their first pieces.
         amount, amount_sigma: relative change of the gradients; in the error are the scatter of
-            single magnets, and what the amount is in other sets of reasons as likely as they are.
-        probability: that it is there, of all sets of reasons.
-        statistic: chi-square that it explains beside all the others.
+            single magnets, and the amounts in alternative sets, weighted by their probability.
+        probability: that it is present, over all sets.
+        statistic: chi-square that it explains given all the others.
         makes: what would make it.
-        rivals: what the data do not exclude in its place, with probabilities.
+        rivals: alternatives that the data do not exclude, with probabilities.
         share_from_data: of the amount, 1 - posterior variance / prior variance.
     """
 
@@ -103,11 +103,11 @@ class Reason:
 
 @dataclass(frozen=True)
 class Instead:
-    """Another set of reasons for the same gradients.
+    """An alternative set of common factors for the same gradients.
 
     Attributes:
         probability: among all sets.
-        amounts: of each reason in it: name, amount and error, relative.
+        amounts: of each common factor in it: name, amount and error, relative.
     """
 
     probability: float
@@ -144,16 +144,16 @@ class Outlier:
 
 @dataclass(frozen=True)
 class CommonFactors:
-    """What is behind the gradients.
+    """The common factors of the gradients.
 
     Attributes:
-        reasons: by falling chi-square; the most probable set.
-        instead: other sets that are likely, by falling probability.
+        common_factors: by falling chi-square; the most probable set.
+        instead: alternative sets, by falling probability.
         outliers: by falling size.
-        share: of the gradients' mean square, that the reasons hold.
+        share: of the gradients' mean square, that the common factors explain.
         scatter: rms of single magnets about them, relative.
-        between: rms of families about what they share, relative; 0 where they are alike, or are a
-            reason one by one.
+        between: rms of families about what they share, relative; 0 where they are alike, or are
+            common factors one by one.
     """
 
     common_factors: tuple[Reason, ...]
@@ -176,7 +176,7 @@ class CommonFactors:
 
 
 def explain_gradients(state: State) -> CommonFactors | None:
-    """The few reasons behind the gradients of a dense fit; None where none were fitted."""
+    """Return the common factors of a hierarchical fit's gradients; None where none were fitted."""
     family = QuadrupoleGradient()
     if family.variable not in state.values or not family.size(state.data):
         return None
@@ -250,12 +250,13 @@ def explain_gradients(state: State) -> CommonFactors | None:
 def weighed(
     information: Array, pull: Array, among: Candidates, beside: Array
 ) -> tuple[float, FactorModel, list[LikelySet]]:
-    """How much families differ, by evidence, and the sets of reasons beside that.
+    """Return the scatter of families, by the marginal likelihood, and the sets of common factors
+    given it.
 
-    Where families differ by no more than their magnets, one that is off is a reason as others are.
-    Where each has a calibration of its own, no sum of a few reasons is right, and all are in every
-    set, with the prior that their scatter is: else the errors of what many of them share would be
-    those of families that are alike. A magnet without a family is one of its own.
+    Where families differ by no more than their magnets, an outlier family is a common factor like
+    others. Where each family has its own calibration, all are in every set, with their scatter as
+    prior; else the errors of numbers that many of them share would be too small. A magnet without a
+    family is one of its own.
 
     Args:
         information: J^T W J of the gradients, nuisances taken out, [magnet, magnet].
@@ -265,7 +266,7 @@ def weighed(
 
     Returns:
         Rms of families about what they share, relative, 0 where they are alike; the candidates
-        weighed beside one another; the likely sets of them.
+        compared together; the probable sets of them.
     """
     cost = np.array([COST[kind] for kind in among.kinds])
     families, others = np.flatnonzero(among.families), np.flatnonzero(~among.families)

@@ -1,12 +1,12 @@
-"""Single faults of an orbit response among small errors everywhere.
+"""Single faults of an orbit response among distributed errors.
 
->>> found = singled_out(data, split, fit.state, hypotheses, judgement)
+>>> found = detected_faults(data, split, fit.state, hypotheses, judgement)
 >>> [(one.cause, one.sigma, one.statistic) for one in found.faults]
 
-One cause after another is given a prior of its own beside all usual small errors
-(`small_errors`), whose sizes are learnt again without it, and everything settles anew, not
-linearised. It is a fault where it stands out by five standard deviations of what its family does,
-and by more than chance among so many causes and families of so many members.
+One cause after another is given a prior of its own together with all usual distributed errors
+(`small_errors`). Their scales are learnt again without it, and everything is fitted again, not
+linearised. A cause is detected at five standard deviations of its family's scatter, and above the
+chance level of so many causes and families.
 """
 
 import logging
@@ -78,7 +78,7 @@ class DetectedFaults:
     """The detected faults.
 
     Attributes:
-        state: small errors, and beside them the faults.
+        state: distributed errors together with the faults.
         faults: by falling statistic.
     """
 
@@ -99,8 +99,8 @@ def detected_faults(
 
     Args:
         data, split: the data, and the validation split.
-        fitted: a dense fit of it.
-        hypotheses: what may be wrong alone.
+        fitted: a hierarchical fit of the data.
+        hypotheses: possible single faults.
         most: faults at most.
         judgement: thresholds.
         progress: called with the name of each stage.

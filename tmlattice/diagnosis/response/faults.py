@@ -25,8 +25,8 @@ class Fault:
     Attributes:
         cause: with its amount.
         sigma: standard error, with what its family scatters.
-        statistic, p_value: by how much it stands out.
-        rivals: other causes in its place, by falling evidence; the first is itself.
+        statistic, p_value: of its detection.
+        rivals: alternatives, by falling evidence; the first is itself.
         evidence: of each.
     """
 

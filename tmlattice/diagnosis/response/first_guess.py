@@ -104,7 +104,7 @@ def strange(state: State, least: int = 1) -> float:
 
     Args:
         state: what the model makes of the readings.
-        least: columns of a plane that it takes to say what is typical.
+        least: columns of a plane required for the typical one.
     """
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]

@@ -135,7 +135,7 @@ def _rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
 def _pulls(
     names: list[str], alone: Array, wide: Array, both: Array, narrow: Array, families: int
 ) -> tuple[Pull, ...]:
-    """Families that stand out, then single magnets."""
+    """Inconsistent families, then single magnets."""
     more = np.maximum(wide - narrow, ROUNDING * wide)  # the information of the RF's orbit
     pulls = np.where(more > 0, (both - alone) / np.sqrt(np.where(more > 0, more, 1.0)), 0.0)
     order = sorted(range(len(names)), key=lambda i: (i >= families, -abs(pulls[i])))

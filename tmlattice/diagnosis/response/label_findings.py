@@ -28,8 +28,8 @@ def label_findings(
 
     Args:
         ring: the design.
-        exchanged: pairs that were corrected.
-        displaced: misplaced correctors.
+        swaps: pairs that were corrected.
+        misplaced: misplaced correctors.
         other: what each one of a pair does like the other: it "should", by the model, or it
             "did" in the reference.
     """

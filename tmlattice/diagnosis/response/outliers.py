@@ -1,8 +1,8 @@
 """Outliers of an orbit response: single readings, steps and BPMs.
 
-Readings that went wrong have a small weight in the fit, for its noise model learns who they belong
-to. But nobody may be validated by them: what is held out has such readings, too. Here they are
-found beside a fit, by one statistic: what it leaves, over the median of the same plane.
+Outliers have a small weight in the fit, by its noise model. They would still bias the validation,
+because held-out readings have outliers, too. Here they are detected by one statistic: the residual
+of a fit over the median of the same plane.
 
 >>> found = outliers(state)
 >>> state = without(state, found.unread)

@@ -89,7 +89,7 @@ class SingleChange:
     """Single changes of one machine.
 
     Args:
-        blur: what is not known of what they do there.
+        blur: undetermined errors and their effect on the changes.
     """
 
     def __init__(self, blur: Blur) -> None:

@@ -50,7 +50,7 @@ def labels_corrected(
         state: with the model's readings.
         measured: the measurement.
         known: pairs that were corrected before; new ones are added.
-        odd: what resembles nothing.
+        odd: rejected channels.
         among: correctors that may answer as others should.
     """
     pairs = _new(swaps(state, {*odd.correctors, *among}), known.correctors)
@@ -78,7 +78,7 @@ def swaps(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
 
     Args:
         state: with the model's readings.
-        among: names of those that may be exchanged with one another anywhere in the ring.
+        among: names of those that may be swapped anywhere in the ring.
     """
     data = state.data
     model, names = state.at.seen(state.at.beam), data.measured.correctors
@@ -145,8 +145,8 @@ def swapped_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
 
     Args:
         state: what the model makes of the readings.
-        among: those that resemble nothing: of a design with another phase advance many others seem
-            to be read one cell further on.
+        among: rejected channels; with a design of another phase advance many others look
+            shifted by one cell.
     """
     data, read = state.data, state.at.seen(state.at.beam)
     model, orbits = data.pick(read)[:-1], data.pick(data.orbits)[:-1]

@@ -1,9 +1,9 @@
-"""What was exchanged on one of two days: pairs of correctors, or of monitors.
+"""Swapped correctors or BPMs on one of two days.
 
 >>> measured, data, before = all_right(partial(response_data, ring), measured, 0.2)
 >>> since(before, after, said)
 
-The first day is held against the design, the second one against the first.
+The first day is compared with the design, the second one with the first.
 """
 
 from collections.abc import Callable
