@@ -174,14 +174,16 @@ def numbers(amounts: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, .
 
 def _candidates(ring: Ring, explanation: Explanation) -> Iterator[Candidate]:
     """Candidates by falling statistic: of the search, then of the scan of its residual."""
-    amounts: list[Candidate] = [
+    candidates: list[Candidate] = [
         (cause.effect, cause.element, named.detection.statistic)
         for cause, named in zip(explanation.fit.causes, explanation.named, strict=True)
         if cause.element is not None
     ]
-    amounts += [(None, ring.magnets[k].name, d.statistic) for k, d in explanation.kicks.items()]
-    amounts += [(None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()]
-    yield from sorted(amounts, key=lambda candidate: -candidate[2])
+    candidates += [(None, ring.magnets[k].name, d.statistic) for k, d in explanation.kicks.items()]
+    candidates += [
+        (None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()
+    ]
+    yield from sorted(candidates, key=lambda candidate: -candidate[2])
     scan = explanation.scan
     for i in np.argsort(-scan.statistic):
         if scan.statistic[i] < FLOOR:

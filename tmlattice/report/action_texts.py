@@ -68,8 +68,8 @@ def mechanism_text(recommended_action: RecommendedAction) -> str:
     if len(likely) == 1:
         effect = likely[0][0]
         return f"{words(effect)} ({effect}: {find(effect).sign})"
-    consequences = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in likely)
-    return "; or ".join(consequences) + ": the action is the same"
+    shares = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in likely)
+    return "; or ".join(shares) + ": the action is the same"
 
 
 def or_text(finding: Finding, most: int) -> str:

@@ -166,31 +166,31 @@ def misfits(state: State, left: Array) -> Array:
         rows = np.flatnonzero(straight == kicked)
         for read in (0, 1):
             size, orbit = sizes[rows, read], orbits[rows, kicked]
-            named = np.isfinite(size) & np.isfinite(orbit)
-            if named.sum() < COLUMNS:
+            known = np.isfinite(size) & np.isfinite(orbit)
+            if known.sum() < COLUMNS:
                 continue
             share = size / np.maximum(orbit, float(np.median(data.noise)))
             # residuals of unfitted readings are larger
             least = np.maximum(
-                _medians(size, named, state.fitted[rows]), NOISE * noise[read] / STEP
+                _medians(size, known, state.fitted[rows]), NOISE * noise[read] / STEP
             )
-            typical = np.maximum(_medians(share, named, state.fitted[rows]), 1e-300)
+            typical = np.maximum(_medians(share, known, state.fitted[rows]), 1e-300)
             ratio = np.minimum(size / least, share / typical)
             # a corrector that is rolled makes an orbit in the other plane, which the fit leaves as
             # large a share of as of others
             across = usual * np.fmax(orbits[rows, read], noise[read])
-            ratio = np.where(named, np.fmin(ratio, size / np.maximum(across, 1e-300)), 0.0)
-            if (ratio > STEP).sum() <= MOST * named.sum():
+            ratio = np.where(known, np.fmin(ratio, size / np.maximum(across, 1e-300)), 0.0)
+            if (ratio > STEP).sum() <= MOST * known.sum():
                 out[rows] = np.maximum(out[rows], ratio)
     return out
 
 
-def _medians(own: Array, named: Flags, fitted: Flags) -> Array:
+def _medians(own: Array, known: Flags, fitted: Flags) -> Array:
     """The median of all, of the fitted, or of the unfitted entries of each row; the larger one."""
-    out = np.full(len(own), np.median(own[named]))
+    out = np.full(len(own), np.median(own[known]))
     for alike in (fitted, ~fitted):
-        if (named & alike).any():
-            out[alike] = np.maximum(out[alike], np.median(own[named & alike]))
+        if (known & alike).any():
+            out[alike] = np.maximum(out[alike], np.median(own[known & alike]))
     return out
 
 
@@ -230,8 +230,8 @@ def _usual(state: State, block: int) -> Flags:
         rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
         for spared in (0.0, SPARED):
             rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
-            named = (count > 0) & state.good
-            usual = max(float(np.median(rms[named])), rounded) if named.any() else np.inf
+            known = (count > 0) & state.good
+            usual = max(float(np.median(rms[known])), rounded) if known.any() else np.inf
             blind = (gain < BLIND) & (block == 0)
             bad &= (count > 0) & ((rms > BAD * usual) | blind)
         good &= ~bad
