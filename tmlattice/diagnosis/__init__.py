@@ -71,9 +71,9 @@ def diagnose(
             orbit response, families of errors at most; None: all.
         false_alarm: share of faultless data sets in which something may be found.
         assume: what was recorded wrongly everywhere, see `measurement.assume`.
-        background: rms of small errors by effect (None: the catalogue's own), or "all"; None: as
-            the data have them. Not for an orbit response.
-        known: small errors from an earlier diagnosis whose estimated ring this is
+        background: rms of distributed errors by effect (None: the catalogue's own), or "all";
+            None: learnt. Not for an orbit response.
+        known: distributed errors from an earlier diagnosis whose estimated ring this is
             (`diagnosis.twin`). Not for an orbit response.
         heldout: of first turns: the validation set itself, instead of a share.
         radiation: of first turns: bends and wigglers of the model radiate.

@@ -3,7 +3,7 @@
 >>> measured, notes = in_the_lattice(ring, measured)
 
 A control room reads more than its lattice file has, such as a BPM in a transfer line. Such channels
-are left out, with a note. If most names are unknown, the names or the lattice are wrong: the first
+are rejected, with a note. If most names are unknown, the names or the lattice are wrong: the first
 one raises an error. So does a magnet in the place of a BPM.
 """
 

@@ -4,7 +4,7 @@ Text, page, JSON and figures take these sentences from here. `STATEMENTS` is the
 sentence with the condition that it requires; `docs/diagnose.md` shows it.
 
 >>> diagnosis.assessment.remainder, diagnosis.assessment.gap
-('noise', 'closed')
+('noise', 'explained')
 >>> diagnosis.assessment.sentence("remainder")
 'The remaining residual is noise (p = 0.35).'
 """
@@ -90,11 +90,11 @@ class Assessment:
         significant: of those, the ones that leave more than expected.
         places: where the remainder is, (from, to) in m.
         noise_estimated: whether the noise comes from the same readings.
-        gap: whether held-out readings show a gap, and whether it is closed.
+        gap: whether held-out readings show a gap, and whether it is explained.
         before, after: rms of held-out readings, m.
-        closed, interval: share of the gap that is closed, and its 95 % interval.
+        explained, interval: share of the gap that is explained, and its 95 % interval.
         series: rms of the held-out readings of each model, and what the last one expects, m; empty
-            without small errors.
+            without distributed errors.
         families: whether families of errors were fitted.
         rejected: families that were tried and are not in the result.
         small_errors: whether distributed errors are in the model.
@@ -226,7 +226,7 @@ def _gap(
     left: Sequence[Block],
     false_alarm: float,
 ) -> GapState:
-    """The state of the gap: none, closed, open or unknown."""
+    """The state of the gap, see `GapState`."""
     if gap is None:
         return "not_held_out"
     if gap.lost:

@@ -15,8 +15,7 @@ class Check:
 
     Attributes:
         name: what.
-        status: "fine"; "note", which a reader should know; "wrong", with which no diagnosis means
-            anything.
+        status: "fine"; "note"; "wrong", with which no diagnosis is possible.
         sentence: the finding, and its correction.
         before, after: chi-square per reading as stated, and with what is assumed; None where there
             is none.

@@ -85,7 +85,7 @@ def next_measurement(
         ring: the design.
         data: what was measured: its amplitudes, noise and knowledge of launches.
         first, second: refitted with everything else in place.
-        known: causes that the model holds anyway.
+        known: causes that are in the model anyway.
         seed: of the candidates' phases.
     """
     launches, settings = _candidates(ring, data, (first, second), seed)

@@ -56,10 +56,10 @@ class Prepared:
     """A measurement ready for the search.
 
     Attributes:
-        problem: launches and readings, no small errors.
+        problem: launches and readings, no distributed errors.
         before: launches alone.
         hypotheses: what may be the cause.
-        known: causes that the model holds anyway.
+        known: causes that are in the model anyway.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
         noise: rms of a reading, m, (x, y); NaN for a plane without readings.
         estimated: whether the noise comes from the data.
@@ -295,7 +295,7 @@ def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
     Args:
         other: of the held-out shots.
         data: of the fit's.
-        dropped: readings that the search left out, [shot, reading, 2].
+        dropped: readings that the search rejected, [shot, reading, 2].
     """
     lost = dropped[data.active].all(axis=0)
     never = np.asarray(lost | ~data.valid[data.active].any(axis=0))

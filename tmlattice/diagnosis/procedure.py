@@ -3,7 +3,7 @@
 >>> diagnose_together(ring, {"kick": turns, "orbit": orbit, "injection": first_turns})
 
 Rows are stacked; causes are shared, nuisances are each measurement's own (see `strategy` for the
-steps). A reference of each kind holds what was there before.
+steps). A reference of each kind has the earlier errors.
 """
 
 import logging
@@ -111,9 +111,9 @@ def diagnose_together(
         ring: the design.
         measured: by the names that the result calls them.
         reference: of the same machine before the fault, of any kinds: static errors cancel.
-        background: small errors, as of `diagnose`.
+        background: distributed errors, as of `diagnose`.
         known: of the distributed errors, from an earlier diagnosis whose estimated ring this
-            is: see `twin`. Then no background is asked for.
+            is: see `twin`. Then no background is needed.
         holdout: share of shots, or of correctors, in the validation set.
         heldout: of first turns alone: those shots themselves, instead of a share.
         effects: names of those that may be the cause; else all usual ones.

@@ -60,7 +60,7 @@ class Member:
         effect, element, amount: see `Cause`.
         s: middle of the element, m.
         probability: of this explanation alone.
-        recommended_action: what takes it away, in words.
+        recommended_action: the correction, in words.
         device: what the control system calls the element; None: unknown.
     """
 
@@ -223,7 +223,7 @@ class Diagnosis(ShownDiagnosis):
         steps: of a hierarchical fit, those accepted, from the design to the result.
         rejected_steps: families that were rejected, with the residuals with them.
         bad_monitors: names of the rejected BPMs.
-        priors: rms of small errors, learnt or stated, by family.
+        priors: rms of distributed errors, learnt or stated, by family.
         prior_errors: relative error of those that were learnt; above one half the readings hardly
             see the family.
         degenerate: what the data alone do not determine, in words.
@@ -458,8 +458,8 @@ class Diagnosis(ShownDiagnosis):
     def gap(self) -> dict[str, Any]:
         """Residuals before and after, of fitted and of held-out readings.
 
-        Where there are small errors and findings, before is with the small errors alone; the
-        design's own is the first of the steps.
+        Where there are distributed errors and findings, before is with the distributed errors
+        alone; the design's own is the first of the steps.
         """
 
         def both(before: Misfit, after: Misfit) -> dict[str, Any]:

@@ -42,7 +42,7 @@ class Stage:
     """One model of the ring.
 
     Attributes:
-        static: small errors, which a reference has too.
+        static: distributed errors, which a reference has too.
         causes: the findings.
         point: what they leave.
         share: of the step to the most probable distributed errors, from those of the fit, in
@@ -215,8 +215,8 @@ def held_out_shots(
 ) -> Gap | None:
     """Return the gap on held-out first turns, in the covariance of their prediction.
 
-    Of the design; with the small errors, as the fit without causes leaves them; with the findings,
-    one by one where there are no small errors.
+    Of the design; with the distributed errors, as in the fit without causes; with the findings,
+    one by one where there are no distributed errors.
     """
     judge = part.heldout
     if judge is None:
@@ -243,13 +243,13 @@ def held_out_shots(
 def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stage) -> Array | None:
     """Return the covariance of the prediction of other shots.
 
-    Of the small errors what the readings leave open, and of the amounts of the causes: as in
+    Of the distributed errors their posterior covariance, and of the amounts of the causes: as in
     universal kriging (Matheron 1969), whose drift launches and amounts are.
 
     Args:
-        small: the small errors of the explanation.
+        small: the distributed errors of the explanation.
         explained: the fit of these shots.
-        other: of the other shots, with the small errors in its model.
+        other: of the other shots, with the distributed errors in its model.
         stage: the model.
 
     Returns:

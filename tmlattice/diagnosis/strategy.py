@@ -91,13 +91,13 @@ def sought(
 
     Args:
         search: what is searched.
-        everywhere: the small errors that the machine may have.
+        everywhere: the distributed errors that the machine may have.
         sizes: rms of them by effect; empty: there are none.
         learn: whether there are any, and how large they are, the data determine; `sizes` is where
             that starts.
         noisy: the noise is a guess, and learnt with them.
-        known: of the small errors beforehand, instead of sizes.
-        earlier: what explains the reference alone. The small errors start at those of the
+        known: of the distributed errors beforehand, instead of sizes.
+        earlier: what explains the reference alone. The distributed errors start at those of the
             reference, and are as large: a fault is none of them.
 
     Raises:
@@ -124,7 +124,7 @@ def sought(
         if explained(few) or len(start.residual) * len(seen) > MAX_ELEMENTS:
             return Found(explain(search, start, few) if more else few)
         begun = few.fit
-    search.progress("small errors")
+    search.progress("distributed errors")
     first = DistributedErrors.usual(seen, sizes) if known is None else known
     learn = learn and known is None
     asides = dict.fromkeys(((), () if few is None else _outstanding(few)))
@@ -291,7 +291,7 @@ def _parted(
 ) -> tuple[tuple[Cause, ...], Array]:
     """Causes, and distributed errors without a share in them: the causes have it all.
 
-    Small errors are in a reference too, and causes are not: there both have their own.
+    Distributed errors are in a reference too, and causes are not: there both have their own.
     """
     if not problem.alone:
         return tuple(causes), amounts
@@ -443,7 +443,7 @@ def outlier(estimate: Sequence[Cause], sizes: Mapping[str, float]) -> Cause | No
     it.
 
     Args:
-        estimate: the most probable small errors.
+        estimate: the most probable distributed errors.
         sizes: rms of their families, as learnt: where all are large, so is what is usual.
     """
     usual = {name: find(name).background or np.inf for name in sizes}

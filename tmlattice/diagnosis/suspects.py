@@ -71,7 +71,7 @@ class Suspect:
     device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {
             "kind": self.kind,
             "effect": self.effect,

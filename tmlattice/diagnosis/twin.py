@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 PRODUCTS = 2e12
-"""Readings times errors squared up to which the covariance of all small errors is taken from a
-response: some six minutes of processor (`docs/together.md`)."""
+"""Readings times errors squared up to which the covariance of all distributed errors of a response
+is computed: some six minutes of processor (`docs/together.md`)."""
 HARDLY = 0.3
 """Relative error of a family's scale above which the usual scale is kept: a response is sensitive
 to kicks by the orbit in sextupoles alone, which is not linear."""

@@ -23,7 +23,7 @@ class TrajectoryView:
         problem: the shots of the fit, without what was rejected.
         before, after: readings of the design and of the result, launches fitted,
             [shot, reading, 2], m.
-        dropped: readings that the search left out, [shot, reading, 2].
+        dropped: readings that the search rejected, [shot, reading, 2].
     """
 
     explanation: Explanation
@@ -67,7 +67,7 @@ class PartView:
         readings: their number.
         before, after: what the design and the result leave.
         monitors: names.
-        left: rms of what is left at each monitor in units of the noise, before and after,
+        left: rms residual at each BPM in units of the noise, before and after,
             [2, monitor]; NaN where nothing was read.
         numbers: of tunes, each as read and as both models have it.
     """

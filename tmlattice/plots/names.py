@@ -1,7 +1,7 @@
 """Names that fit into a drawing."""
 
 LONGEST = 22
-"""Letters of a name that have room."""
+"""Letters of a name that fit."""
 
 
 def brief(name: str) -> str:

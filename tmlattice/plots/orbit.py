@@ -67,7 +67,7 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
             (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
         )  # fmt: skip
         low, high = residual.get_ylim()
-        residual.set_ylim(low, high + 0.25 * (high - low))  # room for the words
+        residual.set_ylim(low, high + 0.25 * (high - low))  # space for the text
         for ax in (orbit, residual):
             if magnet is not None:
                 ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)

@@ -117,7 +117,7 @@ def plot_readings(
             (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
         )  # fmt: skip
         low, high = residual.get_ylim()
-        residual.set_ylim(low, high + 0.3 * (high - low))  # room for the words
+        residual.set_ylim(low, high + 0.3 * (high - low))  # space for the text
         for ax in (orbit, residual):
             mark(ax, diagnosis)
             ax.grid(alpha=0.25)

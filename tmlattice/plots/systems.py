@@ -28,7 +28,7 @@ def _finish(ax: Axes, x: str, y: str, title: str = "", legend: str | None = "bes
 
 
 def _room(ax: Axes, values: NDArray[np.float64]) -> None:
-    """Limits that leave room for the legend above the curves."""
+    """Limits that leave space for the legend above the curves."""
     size = np.abs(values).max()
     ax.set_ylim(-1.15 * size, 2.3 * size)
 

@@ -61,7 +61,7 @@ def plot_weights(
     largest = split.parts.max()
     if largest > 0:
         size.set_yscale("log")
-        size.set_ylim(1e-3 * largest, 20 * largest)  # room for the words
+        size.set_ylim(1e-3 * largest, 20 * largest)  # space for the text
     size.set_ylabel("parts of the\nsteepest step" if gradient else "parts [sigma]")
     size.legend(loc="upper right", ncols=3, fontsize="small", markerscale=5, framealpha=0.9)
     share.set_ylim(0, 1)

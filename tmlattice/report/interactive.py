@@ -1,6 +1,6 @@
 """Interactive figures for plotly.js, as plain dictionaries.
 
-The same figures as those of `tmlattice.plots`, whose pictures stand in the page where it is printed
+The same figures as those of `tmlattice.plots`, whose pictures are in the printed page,
 or where scripts are off. The colours "@ink" and "@faint" follow the reader's light or dark page.
 
 >>> figures(diagnosis)["scan"]["layout"]["xaxis"]["title"]["text"]
@@ -146,7 +146,7 @@ def _marks(diagnosis: Diagnosis) -> list[Figure]:
 def strip(ring: Ring) -> list[Figure]:
     """The lattice along s, each kind one outline; on hover the name of each magnet.
 
-    It stands once in the page, and is drawn under each figure that names an axis for its `strip`.
+    It is once in the page, and is drawn under each figure that names an axis for its `strip`.
     """
     traces = []
     widest = ring.length / 600

@@ -1,6 +1,6 @@
 """Sentences and rows of a report, for the terminal (`plain.report_text`) and the HTML page.
 
-The same sentences and rows stand in the terminal (`plain.report_text`) and in the HTML page.
+The same sentences and rows are in the terminal (`plain.report_text`) and in the HTML page.
 """
 
 import textwrap

@@ -19,7 +19,7 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
     """Plane of each corrector, with the families of the magnets before and behind it.
 
     Args:
-        ring: where they stand.
+        ring: with the magnets.
         correctors: names.
         planes: "x" or "y", of each.
     """

@@ -127,7 +127,7 @@ class Outlier:
         element: its first piece.
         amount, amount_sigma: relative, beyond what it shares.
         share_from_data: of the amount, 1 - posterior variance / prior variance.
-        against: neighbours that it pulls against: name, amount and correlation.
+        against: correlated neighbours: name, amount and correlation.
     """
 
     element: str

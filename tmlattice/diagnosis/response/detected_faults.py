@@ -333,7 +333,8 @@ def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
     posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
     wider = doubt(seen.state, one, it.there, posterior)
     amount, variance = float(own.amount[here]), float(own.sigma[here]) ** 2 * wider
-    # a small error multiplies with the fault: of a kick three times as strong it is three times
+    # a distributed error multiplies with the fault: of a kick three times as strong it is three
+    # times
     share = max(abs(find(one.cause[0]).joined(amount, 1.0) - amount), 1.0)
     variance += (share**2 - 1) * _scatter(it.there, it.sizes, one) ** 2
     return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))

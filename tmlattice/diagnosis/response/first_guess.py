@@ -55,7 +55,7 @@ class Guess(NamedTuple):
     Attributes:
         focusing, defocusing: relative change of all such quadrupoles.
         values: the same, by variable.
-        left: share of the typical column's mean square that is left there.
+        left: share of the typical column's mean square that is unexplained there.
     """
 
     focusing: float

@@ -94,7 +94,7 @@ def with_support(
     """Yield the causes of some families of a block, and their support by the data.
 
     Args:
-        state, there: where the fit stands, and `linear` of the block.
+        state, there: the state, and `linear` of the block.
         families: with a variable each.
         known: what is stated of the numbers of the block.
     """

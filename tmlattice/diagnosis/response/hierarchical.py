@@ -151,7 +151,7 @@ def fit_families(
 
     Args:
         data, split: the data, and the validation split.
-        families: that may be open; those without places or readings are left out.
+        families: that may be fitted; those without places or readings are omitted.
         progress: called with the name of each stage.
     """
     design = begin(data, split)

@@ -80,7 +80,7 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
     RF's orbit was read.
 
     Args:
-        state: where the fit stands.
+        state: of the fit.
         false_alarm: probability of a finding in consistent data.
     """
     single = QuadrupoleGradient()

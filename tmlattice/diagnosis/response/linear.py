@@ -197,7 +197,7 @@ def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
     out.
 
     Args:
-        there: where the fit stands.
+        there: of the fit.
         names: of variables.
 
     Returns:

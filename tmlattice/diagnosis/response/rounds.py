@@ -66,7 +66,7 @@ def one_round(state: State, blocks: Mapping[int, Linear], bold: float = 1.0) -> 
     """Solve the readings of both blocks, and take the step.
 
     Args:
-        state: where it stands.
+        state: the start.
         blocks: `linear` of each block that has families.
         bold: factor of every step bound: small after rounds that raised the cost.
     """
@@ -188,7 +188,7 @@ def settle(
     itself: a round that raised the cost is taken back and repeated with shorter steps.
 
     Args:
-        state: where it stands.
+        state: the start.
         most: rounds.
         gain: share of the cost that a round has to gain for another one.
         possible: whether a state is one that is sought; rounds end at one that is not.
@@ -237,7 +237,7 @@ def log_evidence(state: State) -> float:
     """The log evidence of the fitted readings (Laplace), up to a constant of the data.
 
     Args:
-        state: that has settled; states that are compared use the same monitors.
+        state: converged; states that are compared use the same monitors.
     """
     total = 0.0
     for block in (0, 1):

@@ -133,7 +133,7 @@ def sizes_in(there: Linear) -> tuple[Group, ...]:
     """The priors with scales from all numbers but each family's largest.
 
     Args:
-        there: where the fit stands.
+        there: of the fit.
     """
     groups = [replace(group, each=None, freedom=np.inf) for group in there.groups]
     pull = there.normal.vector + there.normal.matrix @ there.start

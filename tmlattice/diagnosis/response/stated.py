@@ -90,7 +90,7 @@ def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> floa
 
     Args:
         state, there, posterior: as in `stated`; its block is that of the cause.
-        one: has a prior of its own in them.
+        one: has its own prior in them.
     """
     ends = np.cumsum([group.basis.shape[1] for group in posterior.groups])
     at = int(ends[[group.name for group in posterior.groups].index(one.name)]) - 1

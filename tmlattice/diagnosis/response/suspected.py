@@ -133,7 +133,7 @@ class _Block:
 
     Attributes:
         there: the fit.
-        sizes: the small errors' priors, without those of what is wrong alone.
+        sizes: the distributed errors' priors, without those of single faults.
         across: J^T W S, [number, suspect].
         own, left: S^T W S, and S^T W r, [suspect].
     """
@@ -165,8 +165,8 @@ class Seen:
     """Return the products of all suspects at a fit.
 
     Args:
-        state: with small errors, and with what is wrong alone so far.
-        suspects: to be weighed.
+        state: with distributed errors, and with the single faults so far.
+        suspects: to be compared.
     """
 
     def __init__(self, state: State, suspects: Sequence[Suspect]) -> None:

@@ -137,7 +137,7 @@ def learnt(state: State, spent: dict[int, Spent], alike: bool = False) -> State:
         state: after a round.
         spent: degrees of freedom of each block's parameters.
         alike: all columns and all monitors have the same misfit: which of them are wrong is unknown
-            before the model has settled.
+            before convergence.
     """
     old = state.noise
     new = replace(
