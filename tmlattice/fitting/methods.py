@@ -18,7 +18,7 @@ from tmlattice.observe.data import NOISE_FLOOR, first_turn
 
 
 class Method(StrEnum):
-    """How a network is fine-tuned."""
+    """Method of fine-tuning a network."""
 
     ADAM = "adam"
     MAP = "map"
@@ -34,21 +34,20 @@ def fine_tune(
     method: Method | str = "adam",
     **options: Any,
 ) -> FitResult:
-    """Fit a network to the first turn of a measurement; the given network is left as it is.
+    """Fit a network to the first turn of a measurement; the given network is not changed.
 
     Args:
         network: the design.
         measurement: launches and readings.
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
-            (`fitting.many.fit_map`); "sparse", as few changed magnets as the evidence asks for
-            (`fitting.few.fit_sparse`); "told", the same that knows which magnets may have changed
-            (`candidates=`): nothing else can be better. All but the first state the error of their
-            tunes.
+            (`fitting.map_fit.fit_map`); "sparse", the set of changed magnets with the largest
+            evidence (`fitting.sparse.fit_sparse`); "told", the same with known candidates
+            (`candidates=`), the best possible. All but the first state the error of their tunes.
         options: of the method, see there.
 
-    Launches are as exact as the measurement states (`launch_sigma=` overrides it). A warning says
-    where the readings contradict that.
+    Launches are as exact as the measurement states (`launch_sigma=` overrides it). A warning
+    reports readings that contradict that.
 
     Raises:
         ChoiceError: an unknown method; it is a ValueError too.
@@ -66,9 +65,7 @@ def fine_tune(
     if chosen is Method.MAP:
         return _with_chi2(fit_map(network, measurement, **options), measurement)
     if chosen is Method.TOLD and not options.get("candidates"):
-        raise ValueError(
-            "method 'told' is told the magnets that may have changed: give candidates="
-        )
+        raise ValueError("method 'told' needs the magnets that may have changed: give candidates=")
     if isinstance(network, SymplecticNetwork):
         if network.ring is None:
             raise ValueError("methods 'sparse' and 'told' need a network made from a ring")
@@ -79,7 +76,7 @@ def fine_tune(
 def _check_launches(
     network: TaylorNetwork | SymplecticNetwork, measurement: Measurement, sigma: ArrayLike | None
 ) -> None:
-    """Warn of launches that are not those stated; nothing is said without a ring or a noise."""
+    """Warn of launches that differ from those stated; silent without a ring or a noise."""
     ring, n = network.ring, network.dimension
     if ring is None or measurement.noise is None:
         return
@@ -90,7 +87,7 @@ def _check_launches(
 
 
 def _with_chi2(result: FitResult, measurement: Measurement) -> FitResult:
-    """The result with its chi-square."""
+    """Add chi-square to the result."""
     noise = result.options.get("noise")
     ordered = measurement.in_order_of(result.network.monitors)
     sigma = ordered.noise if noise is None else np.full((len(ordered.monitors), 2), noise)
