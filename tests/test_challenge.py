@@ -369,7 +369,7 @@ def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
     shutil.copy(SMALL, "ring.py")
     folder, options = tmp_path / "set", {"lattice": "ring.py", "shots": 2, "progress": False}
     make("A", 1, 1, folder, **options)
-    with pytest.raises(TmlatticeError, match="holds another challenge"):
+    with pytest.raises(TmlatticeError, match="contains another challenge"):
         make("A", 2, 2, folder, **options)
     ring = (tmp_path / "ring.py").read_text()
     (tmp_path / "ring.py").write_text(ring.replace("k = 0.9\n", "k = 0.91\n"))

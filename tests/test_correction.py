@@ -235,7 +235,7 @@ def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
     ("- {knob: nothing}", "state its members"),
     ("- {knob: QF, present: 0}", "present strength is 0"),
     ("- {knob: QF, low: 2, high: 1}", "limits are 2 and 1"),
-    ("- {knob: QF, curve: '0:0 1:1 2:0.5', unit: A, present: 1}", "has to rise, or fall"),
+    ("- {knob: QF, curve: '0:0 1:1 2:0.5', unit: A, present: 1}", "must rise, or fall"),
     ("- {knob: QF, unit: A}", "state its present setting"),
     ("- {knob: QF, step: much}", "no number"),
     ("- {knob: QF, colour: red}", "unknown column"),

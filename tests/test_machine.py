@@ -214,7 +214,7 @@ def test_background_is_scaled_and_named_effects_win(small_ring):
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
-        ({"energy_offset": None}, "no usual size; say energy_offset=RMS"),
+        ({"energy_offset": None}, "no usual size; give energy_offset=RMS"),
         ({"monitor_roll": -1.0}, "zero or more"),
         ({"all": float("nan")}, "zero or more"),
     ],

@@ -164,7 +164,7 @@ def test_bad_monitors_harm_no_other(rng):
     assert_pulls(pulls(result, amplitude, good))  # that with spikes too
     said = " ".join(result.warnings)
     assert "monitor 'b2' stands still" in said
-    assert "more than 8 times the noise off" in said
+    assert "more than 8 times the noise from the fit" in said
     assert result.noise[8].min() > 20 * NOISE
     # a turn late: the phase of the mode's own tune
     late = result.amplitude[0, 12, 0, 0] / result.amplitude[0, 13, 0, 0]
@@ -253,6 +253,6 @@ def test_noise_has_no_lines(rng):
 
 def test_noise_that_is_stated_wrongly_is_said(rng):
     readings, _ = signal(rng)
-    assert lines(recorded(readings, noise=(NOISE, NOISE))).said == ()
-    (said,) = lines(recorded(readings, noise=(NOISE / 5, NOISE / 5))).said
+    assert lines(recorded(readings, noise=(NOISE, NOISE))).warnings == ()
+    (said,) = lines(recorded(readings, noise=(NOISE / 5, NOISE / 5))).warnings
     assert "is 5 times the stated noise" in said

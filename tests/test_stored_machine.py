@@ -91,7 +91,7 @@ def test_lines_of_a_small_kick_are_at_modes(tiny):
     vectors, tunes = at_modes(tiny, UPRIGHT)
     simulation = simulate_turns(tiny, UPRIGHT, turns=200, amplitude=1e-6, noise=1e-11)
     found = lines(simulation.measured, near=tunes, at=places(tiny))
-    assert found.said == ()
+    assert found.warnings == ()
     assert_allclose(found.tune[0], tunes, atol=1e-7)
     off = deviations(found, vectors)
     assert 0.7 < np.sqrt(np.mean(off**2)) < 1.3  # 120 numbers

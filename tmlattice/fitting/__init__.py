@@ -1,4 +1,4 @@
-"""Fine-tuning of a network on measured trajectories, and what it says of the tunes.
+"""Fine-tuning of a network on measured trajectories, and its prediction of the tunes.
 
 >>> result = fine_tune(network, measurement)       # the paper's recipe
 >>> fine_tune(network, measurement, method="sparse").changes    # which magnet, by how much

@@ -11,7 +11,7 @@ from tmlattice.network.autograd import Tensors
 
 
 class CompiledSweep:
-    """See `autograd.BackEnd`; the states of all exits are kept from the forward sweep."""
+    """See `autograd.BackEnd`; the forward sweep stores the states of all exits."""
 
     def __init__(self, maps: RingMaps, r: Tensor, start: Tensor) -> None:
         self.maps, self.r, self.start = maps, r, start

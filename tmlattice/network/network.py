@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 class OnLost(StrEnum):
-    """What a lost trajectory does."""
+    """Treatment of a lost trajectory."""
 
     RAISE = "raise"
     INF = "inf"
@@ -36,7 +36,7 @@ class TaylorNetwork(NetworkChain, Chain):
     exit of magnet k. States are OCELOT's (x, px, y, py), or (x, px, y, py, tau, p), in m and
     units of the reference momentum. All weights are float64 and of their layer alone.
 
-    `network.to("cuda")` moves it to a graphics card, and everything that it does runs there.
+    `network.to("cuda")` moves it, and all its computations, to a graphics card.
 
     Args:
         maps: weights and read-outs of a ring.
@@ -45,7 +45,7 @@ class TaylorNetwork(NetworkChain, Chain):
         W0: [layer, n], parameter.
         W1: [layer, n, n], parameter.
         W2: [layer, n, n (n + 1) / 2], parameter, in the order x1^2, x1 x2, ..., xn^2.
-        maps, ring: what it was made from; names and places of layers and monitors.
+        maps, ring: arguments; names and places of layers and monitors.
 
     Source: A. Ivanov, I. Agapov, Phys. Rev. Accel. Beams 23 (2020) 074601, for the architecture.
     """
@@ -63,7 +63,7 @@ class TaylorNetwork(NetworkChain, Chain):
         self.W2 = torch.nn.Parameter(torch.from_numpy(maps.W2.copy()))
         read_outs = (torch.from_numpy(r) for r in (maps.R0, maps.R1, maps.R2))
         closing = (torch.from_numpy(c) for c in maps.closing.coefficients)
-        for name, fixed in (  # these follow `.to`, and are no part of `state_dict`
+        for name, fixed in (  # moved by `.to`, and no part of `state_dict`
             ("_read_outs", packed(*read_outs)),
             ("_closing", packed(*closing)),
             ("_first_monitor", torch.from_numpy(maps.start)),
@@ -71,27 +71,26 @@ class TaylorNetwork(NetworkChain, Chain):
             self.register_buffer(name, fixed, persistent=False)
 
     def symplectic(self) -> SymplecticNetwork:
-        """The same ring in layers that are symplectic exactly, and stay so whatever is fitted.
+        """Return the same ring in layers that are symplectic for any parameters.
 
         See `SymplecticNetwork`.
         """
         return SymplecticNetwork.from_network(self)
 
     def weights(self) -> tuple[Array, Array, Array]:
-        """W0, W1, W2 as numpy arrays; on the CPU they share the parameters' memory: do not change
-        them."""
+        """W0, W1, W2 as numpy arrays; on the CPU they share the parameters' memory: read-only."""
         W0, W1, W2 = (w.detach().cpu().numpy() for w in (self.W0, self.W1, self.W2))
         return W0, W1, W2
 
     def copy(self) -> "TaylorNetwork":
-        """A network of its own with the same weights."""
+        """Return a copy with the same weights."""
         new = TaylorNetwork(self.maps).to(self.W0.device)
         new.ring = self.ring
         new.load_state_dict(self.state_dict())
         return new
 
     def sweep(self) -> BackEnd:
-        """What runs the sweeps on the device of the weights."""
+        """Back end for the device of the weights."""
         if self.W0.is_cuda:
             on_card: BackEnd = _cuda().TritonSweep(self._read_outs, self._first_monitor)
             return on_card
@@ -104,15 +103,15 @@ class TaylorNetwork(NetworkChain, Chain):
         *,
         on_lost: OnLost | str = "raise",
     ) -> Tensor:
-        """Readings of every monitor, differentiable by launch and weights.
+        """Return readings of every monitor, differentiable by launch and weights.
 
         First derivatives are fast. Second ones (`create_graph=True`) are exact and take seconds:
         they come from a loop of torch operations (`plain_readings`). Of `torch.func`, `grad` and
-        `vjp` work; `vmap` and `jvp` are refused.
+        `vjp` work; `vmap` and `jvp` raise errors.
 
         Args:
             launch: states at the start of the ring, [batch, n].
-            turns: how many turns are read; None: the first one, without an axis for it.
+            turns: number of turns; None: the first one, without an axis for it.
             on_lost: "raise" an error for a lost trajectory, or let its readings be "inf" from that
                 turn on: it then adds nothing to a gradient.
 
@@ -121,13 +120,13 @@ class TaylorNetwork(NetworkChain, Chain):
 
         Raises:
             BeamLostError: names the layer where a trajectory was lost.
-            ChoiceError: another word for `on_lost`.
+            ChoiceError: another value of `on_lost`.
             ValueError: a launch of another shape, or no turn.
         """
         if on_lost not in (known := [choice.value for choice in OnLost]):
             raise unknown_choice("on_lost", on_lost, known)
         if turns is not None and turns < 1:
-            raise ValueError(f"{turns} turns have no reading; read one at least")
+            raise ValueError(f"{turns} turns have no reading; read at least one")
         x = self._launch(launch)
         every = x.new_full((len(x), len(self.monitors), 2), torch.inf)
         rows = torch.arange(len(x), device=x.device)
@@ -171,7 +170,7 @@ def _cuda() -> Any:
 
 
 def plain_readings(network: TaylorNetwork, launch: Tensor) -> Tensor:
-    """Readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
+    """Return readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
 
     The same mathematics as `network(launch)`, differentiated by torch alone: any order, any
     `torch.func` transform.
