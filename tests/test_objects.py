@@ -174,6 +174,27 @@ def test_sequence_of_cpymad_with_its_errors_has_madx_optics(madx, what):
     np.testing.assert_allclose(found.dx[0], theirs.dx[0], rtol=0, atol=2e-4)
 
 
+@pytest.mark.parametrize("kind", ["line", "sequence"])
+def test_offset_of_an_element_acts_as_in_madx(madx, kind):
+    """In a LINE it does nothing, in a SEQUENCE it does."""
+    elements = """beam, particle=electron, energy=3; m: monitor; d: drift, l=0.5;
+    qf: quadrupole, l=0.4, k1=0.91, dx=1e-4; qd: quadrupole, l=0.4, k1=-1;
+    b: sbend, l=1.2, angle=2*pi/16;"""
+    line = "cell: line=(qf, d, b, d, qd, d, m, d); ring: line=(16*cell);"
+    cells = "".join(f"cell, at={4 * i}; " for i in range(16))
+    sequence = f"""cell: sequence, l=4, refer=entry; qf, at=0; b, at=0.9; qd, at=2.6; m, at=3.5;
+    endsequence; ring: sequence, l=64, refer=entry; {cells} endsequence;"""
+    one = madx(elements + {"line": line, "sequence": sequence}[kind] + "use, sequence=ring;")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        orbit = load_ring(one).twiss().x[0]
+    assert any("DX of the QUADRUPOLE (as in a LINE)" in str(w.message) for w in caught) == (
+        kind == "line"
+    )
+    assert orbit == pytest.approx(one.twiss().x[0], abs=1e-12)
+    assert (abs(orbit) > 1e-4) == (kind == "sequence")
+
+
 def test_sequence_of_cpymad_is_that_of_its_file(madx, tmp_path):
     (tmp_path / "ring.seq").write_text(deck("proton", "2"))
     one = madx(deck("proton", "2"))
