@@ -84,13 +84,17 @@ def test_at_lattice_is_the_ring_of_its_file():
         load_ring(lattice)
 
 
-def test_at_misalignments_and_periods_come_over():
+def test_at_misalignments_periods_and_particle_come_over():
     lattice = at.load_lattice(str(SHIPPED / "hmba.mat"))
     assert load_ring(lattice).length == pytest.approx(lattice.periodicity * lattice.cell_length)
     at.shift_elem(lattice[20], 2e-4, -1e-4)
     name = lattice[20].FamName.lower()
     moved = load_ring(lattice)[f"{name}*"][0]
     assert (moved.errors.dx, moved.errors.dy) == (2e-4, -1e-4)
+    lattice.particle = at.Particle("proton")
+    proton = load_ring(lattice)
+    assert proton.mass == pytest.approx(load_ring(proton, particle="proton").mass, rel=1e-6)
+    assert not proton.radiates
 
 
 def test_ocelot_elements_in_lists_and_lattices():
