@@ -6,10 +6,12 @@ is wrong.
 
 The tour
 --------
-A ring is a built-in name, a lattice file (OCELOT, AT, MAD-X, elegant, Xsuite), or a `Ring`:
+A ring is a built-in name, a lattice file (OCELOT, AT, MAD-X, elegant, Xsuite), an object of AT,
+Xsuite, OCELOT or cpymad, or a `Ring`:
 
 >>> import tmlattice
 >>> ring = tmlattice.load_ring("petra3")
+>>> ring["qd*"], ring.twiss().to_dataframe(), ring.to_at()
 >>> figure = ring.plot()                                   # betas and magnets
 
 A machine whose fault is known, what its monitors read, and what that says:

@@ -96,9 +96,9 @@ log = logging.getLogger(__name__)
     "--lattice-out",
     type=FILE,
     metavar="FILE",
-    help="The ring as found, with its errors: .json (the package's own), .at.json (AT), .madx or "
-    ".seq (MAD-X), .py (OCELOT). FILE.calibration.json beside it holds what monitors and "
-    "correctors do (`tmlattice predict`).",
+    help="The ring as found, with its errors: .json (the package's own), .at.json (AT), "
+    ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json beside it "
+    "holds what monitors and correctors do (`tmlattice predict`).",
 )
 @click.option(
     "--corrected-out",
