@@ -473,6 +473,11 @@ class Diagnosis(ShownDiagnosis):
         interval = None if gap is None or gap.interval is None else list(gap.interval)
         return {
             "noise": float(np.sqrt(np.mean(np.square(self.noise)))),
+            "readings_noise": {
+                "x": self.noise[0],
+                "y": self.noise[1],
+                "estimated": self.noise_estimated,
+            },
             "fit": both(self.fit_before, self.fit_after),
             "heldout": heldout,
             "closed": None if gap is None else gap.closed,  # null where nothing was put in
@@ -494,11 +499,6 @@ class Diagnosis(ShownDiagnosis):
             "findings": [finding.as_json() for finding in self.findings],
             "steps": [step.as_json() for step in self.steps],
             "refused": [step.as_json() for step in self.refused],
-            "readings_noise": {
-                "x": self.noise[0],
-                "y": self.noise[1],
-                "estimated": self.noise_estimated,
-            },
             "bad_monitors": list(self.bad_monitors),
             "rejected": [{"element": name, "plane": plane} for name, plane in self.rejected],
             "degenerate": list(self.degenerate),
