@@ -93,7 +93,8 @@ def _ring(file: Path, document: Mapping[str, Any]) -> Ring:
 
 
 def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
-    noise, gap = d["readings_noise"], d["gap"]
+    gap = d["gap"]
+    noise = gap["readings_noise"]
     causes = tuple(Cause(row["effect"], row["element"], row["amount"]) for row in d["errors"])
     made: Diagnosis = cls(
         verdict=d["verdict"],

@@ -11,7 +11,16 @@ import numpy as np
 
 from tmlattice.by_name import is_frame
 from tmlattice.errors import MeasurementError, TmlatticeError, plain, unknown_name
-from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, as_frame, read_columns, text_of
+from tmlattice.importers.columns import (
+    CSV,
+    HDF5,
+    SDDS,
+    SHEETS,
+    as_frame,
+    label,
+    read_columns,
+    text_of,
+)
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported, counted
@@ -104,7 +113,7 @@ def bring_in(
         if isinstance(error, TmlatticeError):
             raise
         log.info("not imported", exc_info=True)
-        shown = ", ".join(f"'{path}'" for path in files)
+        shown = ", ".join(f"'{path}'" for path in files) or label(frames[0])
         said = plain(f"{type(error).__name__}: {error}", 200)
         raise MeasurementError(
             f"{shown}: fields have other types or sizes than a reader knows ({said}); save it again"
