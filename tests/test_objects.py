@@ -446,6 +446,25 @@ def test_cavity_of_xtrack_is_at_the_stable_phase(madx):
         assert 0 < quiet(line.twiss).qs < 0.1
 
 
+def test_errors_of_monitors_are_read_by_madx(small_ring, madx):
+    """What MAD-X's CORRECT takes for readings of the closed orbit: gain, then offset."""
+    offset, gain = Cause("monitor_offset_x", "bpm::7", 2e-4), Cause("monitor_gain_x", "bpm::7", 0.1)
+    other = Cause("monitor_offset_x", "bpm::3", 1e-3)
+    ring = apply(small_ring, FAULTS)
+    with pytest.warns(UserWarning, match="monitor_roll of bpm::1 cannot be written"):
+        text = ring.to_madx([offset, gain, other, Cause("monitor_roll", "bpm::1", 0.01)])
+    one = madx(text)
+    one.twiss()
+    one.input("correct, plane=x, mode=lsq, monerror=1, monscale=1, error=1e-8;")
+    table = one.table.mon
+    read = dict(zip(table.name, table["x.old"], strict=True))
+    optics = ring.twiss()
+    beam = dict(zip(optics.name, optics.x, strict=True))
+    for k in range(16):
+        expected = beam[f"bpm::{k}"] * (1.1 if k == 7 else 1.0) + {7: 2e-4, 3: 1e-3}.get(k, 0.0)
+        assert read[f"bpm:{k + 1}"] == pytest.approx(expected, abs=1e-9), k
+
+
 def test_objects_do_not_share_their_elements_with_the_ring(small_ring):
     lattice = small_ring.to_ocelot()
     magnet = next(e for e in lattice.sequence if e.id == "QD")
@@ -524,7 +543,7 @@ def test_methods_are_seen_by_editors(small_ring):
     for name in ("to_at", "to_ocelot", "to_xtrack", "to_madx", "to_dataframe", "twiss"):
         method = getattr(small_ring, name)
         assert name in dir(small_ring)
-        assert not inspect.signature(method).parameters
+        assert [*inspect.signature(method).parameters] == ["calibration"] * (name == "to_madx")
         assert method.__doc__.startswith("Return")
 
 
