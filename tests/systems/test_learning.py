@@ -61,5 +61,5 @@ def test_missing_observations_are_left_out():
 
 
 def test_a_first_map_that_runs_away_is_refused():
-    with pytest.raises(DivergedError, match="runs away at step"):
+    with pytest.raises(DivergedError, match="diverges at step"):
         fit_map(TaylorMap.linear(np.diag([3.0, 1.0])), np.ones((40, 2)), (0, 1), [1.0, 1.0], 0.1)

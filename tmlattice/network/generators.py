@@ -144,20 +144,6 @@ def cubic_generator(W1: Array, W2: Array) -> Array:
     return generator
 
 
-def quadratic_generator(matrix: Array) -> Array:
-    """Generator [coefficient] whose linear field is a Hamiltonian `matrix` [n, n] (S-symmetric
-    part taken)."""
-    n = len(matrix)
-    hessian = symplectic_form(n).T @ matrix
-    hessian = 0.5 * (hessian + hessian.T)
-    generator = np.zeros(len(exponents(n)))
-    for k, row in enumerate(exponents(n)):
-        if sum(row) == 2:
-            i, j = (v for v, e in enumerate(row) for _ in range(e))
-            generator[k] = hessian[i, j] * (0.5 if i == j else 1.0)
-    return generator
-
-
 def multipoles(generator: Array) -> dict[str, Array]:
     """Return integrated multipoles of generators, from their terms in x and y alone.
 
