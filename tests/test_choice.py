@@ -35,7 +35,7 @@ def data(ring):
     [
         ([], "no effect is named"),
         (["insertion_device_focusing"], "no place in '.*small_ring.py' .*wigglers"),
-        (["energy_offset"], "cannot be told from the launch"),
+        (["energy_offset"], "cannot be separated from the launch"),
         (["radiation_loss_wigglers", "energy_offset"], "energy_offset cannot .*; radiation_loss_w"),
     ],
 )

@@ -261,7 +261,7 @@ def test_an_rf_orbit_in_millimetres_is_told(small_ring):
     assert told(check_data(small_ring, steps)) == []
     scaled = replace(steps, rf=replace(steps.rf, orbit=1e3 * steps.rf.orbit))
     (check,) = told(check_data(small_ring, scaled))
-    assert check.sentence.startswith("the RF's orbit is 1e+03 times what its step makes")
+    assert check.sentence.startswith("the RF's orbit is 1e+03 times the design's for its step")
     repeated = np.tile(scaled.rf.orbit[:5], (len(steps.monitors) // 5, 1))  # no monitor read that
     copied = replace(scaled, rf=replace(scaled.rf, orbit=repeated))
     assert told(check_data(small_ring, copied)) == []
@@ -285,7 +285,7 @@ def test_diagnose_stops_and_goes_on_with_what_is_assumed(small_ring, machine):
 
 
 def test_a_reference_is_looked_at_too(small_ring, healthy):
-    """What is wrong in one of the two alone no assumption of both mends."""
+    """What is wrong in one of the two alone no assumption of both corrects."""
     wrong = replace(healthy, readings=healthy.readings * [-1, 1])
     for which, data, reference, one in (
         ("the reference", healthy, wrong, True), ("the second measurement", wrong, healthy, True),
@@ -294,7 +294,7 @@ def test_a_reference_is_looked_at_too(small_ring, healthy):
         with pytest.raises(MeasurementError, match="x has the wrong sign") as raised:
             diagnose(small_ring, data, reference=reference)
         said = str(raised.value)
-        assert said.startswith(f"{which} alone (mend its file") == one
+        assert said.startswith(f"{which} alone (correct its file") == one
         assert "--assume x-reversed" in said
 
 

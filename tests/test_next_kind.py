@@ -55,7 +55,7 @@ def test_what_is_proposed_parts_them(small_ring, tunes):
 def test_it_is_told_in_text_and_json(tunes):
     _, diagnosis = tunes
     said = next_text(diagnosis)
-    assert "minutes) would part 'quadrupole_gradient QD::3' from" in said
+    assert "minutes) would separate 'quadrupole_gradient QD::3' from" in said
     assert said in to_do(diagnosis)
     document = json.loads(json.dumps(diagnosis.as_json()))
     schema = resources.files("tmlattice") / "schemas" / "diagnosis.schema.json"

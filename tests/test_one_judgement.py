@@ -87,8 +87,8 @@ def test_what_is_left_is_no_noise_where_an_effect_is_missing(small_ring):
         small_ring, [Cause("skew_gradient", "QD::5", 0.02)], engine="ocelot", seed=1
     ).measured
     found = diagnose(small_ring, measured, effects=["quadrupole_gradient"])
-    assert "The model lacks an effect" in page(found)
+    assert "An effect is missing from the model" in page(found)
     assert found.assessment.remainder == "effect_missing"
     healthy = diagnose(small_ring, simulate_response(small_ring, engine="ocelot", seed=1).measured)
     assert healthy.assessment.remainder == "noise"
-    assert "lacks an effect" not in page(healthy)
+    assert "effect is missing from" not in page(healthy)

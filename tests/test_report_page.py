@@ -132,7 +132,7 @@ def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turn
     tab = opened(first_turns)
     assert headings(tab) == ["findings", "notes", "gap", "scan", "sensitivity", "provenance"]
     answer = tab.inner_text("#answer")
-    for words in ("IDENTIFIED", "Culprit", "QD::5", "Place", "Gap", "Do next"):
+    for words in ("IDENTIFIED", "Finding", "QD::5", "Place", "Gap", "Do next"):
         assert words in answer
     assert tab.locator("nav a").count() == 6
     assert tab.locator(".figure .main-svg").first.is_visible()
@@ -186,7 +186,7 @@ def test_several_measurements_are_told_and_drawn_one_by_one(opened, together):
     assert "QD::5" in tab.inner_text("#answer")
     assert tab.locator('.figure[data-figure="data-readings"] .main-svg').first.is_visible()
     assert "tune" in tab.inner_text("#gap ~ .scroll")
-    numbers = tab.locator("table", has=tab.get_by_text("as found", exact=True)).first
+    numbers = tab.locator("table", has=tab.get_by_text("estimated", exact=True)).first
     assert [row.split("\t")[0] for row in numbers.inner_text().splitlines()[1:]] == ["Qx", "Qy"]
 
 

@@ -150,7 +150,7 @@ def test_small_errors_that_are_not_small_are_told(diagnosis):
         )  # fmt: skip
         assert ("(8 times)" in found.report()) == told
         notes = dict(tables.notes(found, found.provenance))
-        assert ("small errors larger than usual" in notes) == told
+        assert ("large distributed errors" in notes) == told
 
 
 def test_tunes_are_drawn_beside_those_of_the_ring(small_ring):

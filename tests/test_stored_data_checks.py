@@ -119,7 +119,7 @@ def test_tunes(small_ring, sound, change, said):
 
 
 def test_nothing_is_assumed_of_them(small_ring, sound):
-    with pytest.raises(MeasurementError, match="mend the data themselves"):
+    with pytest.raises(MeasurementError, match="correct the data themselves"):
         check_data(small_ring, sound["turn_by_turn"], assumed=["planes_exchanged"])
 
 

@@ -286,7 +286,7 @@ def test_ring_without_a_stable_orbit_is_said_to_be_unstable(small_ring, weak):
 def test_wrong_monitor_does_nothing_to_the_beam(small_ring):
     result = found(small_ring, [Cause("monitor_gain_x", "end_3", -0.5)])
     assert result.findings[0].consequences is None
-    assert "the stored beam does not feel it" in report_text(result)
+    assert "no effect on the stored beam" in report_text(result)
 
 
 # --- the next measurement -------------------------------------------------------------------------

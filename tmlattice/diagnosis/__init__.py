@@ -1,4 +1,4 @@
-"""Where the gap between model and machine lies, which effect causes it, how far it shrinks.
+"""The diagnosis: where model and machine differ, which effect causes it, how much it explains.
 
 >>> diagnosis = diagnose(ring, read_measurement("day_1"))
 >>> diagnosis.verdict
@@ -115,7 +115,7 @@ def diagnose(
 
 
 def _in_the_lattice(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
-    """One measurement, or several by name, without what the lattice lacks."""
+    """The measurement, or several by name, without what is not in the lattice."""
     if not isinstance(measured, Mapping):
         return in_the_lattice(ring, measured)
     parts = {name: in_the_lattice(ring, own) for name, own in measured.items()}
@@ -128,7 +128,7 @@ def _in_the_lattice(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
 
 
 def _each_once(measurement: Any) -> None:
-    """Raises a MeasurementError where readings are given twice, which would count twice."""
+    """Raise a MeasurementError where readings are given twice."""
     named = list(measurement.items()) if isinstance(measurement, Mapping) else []
     for i, (name, one) in enumerate(named):
         for other, before in named[:i]:
@@ -136,8 +136,7 @@ def _each_once(measurement: Any) -> None:
                 _largest(one), _largest(before), equal_nan=True
             ):
                 raise MeasurementError(
-                    f"'{other}' and '{name}' hold the same readings, which would count twice: give "
-                    "each measurement once"
+                    f"'{other}' and '{name}' contain the same readings: give each measurement once"
                 )
 
 
@@ -156,7 +155,7 @@ def _readings(measurement: Any) -> int:
 def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnosis:
     measurement = _alone(measurement)
     if options.get("known") is not None and isinstance(measurement, Measurement):
-        measurement = {kind_of(measurement): measurement}  # beside what another kind left known
+        measurement = {kind_of(measurement): measurement}  # with the knowledge of another kind
     if isinstance(measurement, Measurement):
         of = "first turns"
     elif isinstance(measurement, OrbitResponse):
@@ -178,7 +177,7 @@ def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnos
 
         before = options.pop("reference")
         if options.pop("missing", False):
-            raise MeasurementError("the option 'missing' has no meaning beside a reference")
+            raise MeasurementError("the option 'missing' has no meaning with a reference")
         return diagnose_change(ring, before, measurement, **options)
     if isinstance(measurement, OrbitResponse):
         from tmlattice.diagnosis.response.procedure import diagnose_response
@@ -196,7 +195,7 @@ def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnos
 
 
 def _alone(measured: Any) -> Any:
-    """One measurement that stands in a mapping, itself."""
+    """A single measurement out of a mapping of one."""
     if isinstance(measured, Mapping) and len(measured) == 1:
         return next(iter(measured.values()))
     return measured

@@ -1,4 +1,4 @@
-"""The judgements of a diagnosis, each computed once, and the sentences that state them.
+"""The conclusions of a diagnosis, each computed once, and the sentences that state them.
 
 Text, page, JSON and figures take these sentences from here. `STATEMENTS` is the table of every
 sentence with the condition that it requires; `docs/diagnose.md` shows it.
@@ -35,7 +35,7 @@ _UNEXPLAINED = ("effect_missing", "above_noise")
 
 @dataclass(frozen=True)
 class Block:
-    """Readings compared with what the result predicts of them.
+    """Readings compared with their prediction by the result.
 
     Attributes:
         name: which readings.
@@ -59,12 +59,12 @@ class Block:
         return float(np.sqrt(self.chi2 / self.freedom))
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {**vars(self), "p_value": self.p_value, "ratio": self.ratio}
 
 
 def compared_of(fitted: Block, gap: Gap | None) -> tuple[Block, ...]:
-    """The readings of the fit, and the held-out ones with the last model of the gap."""
+    """Blocks of fitted readings, and of held-out ones with the last model of the gap."""
     square = np.nan if gap is None else gap.readings * gap.misfits[-1].chi2_per_dof
     if gap is None or gap.lost or not square > 0:
         return (fitted,)
@@ -72,8 +72,7 @@ def compared_of(fitted: Block, gap: Gap | None) -> tuple[Block, ...]:
 
 
 def combined_p_value(blocks: Sequence[Block]) -> float:
-    """Probability that the smallest p-value of so many blocks is as small (Bonferroni); NaN of
-    none."""
+    """The Bonferroni p-value of the smallest of several p-values; NaN of none."""
     if not blocks:
         return float("nan")
     return min(1.0, len(blocks) * min(block.p_value for block in blocks))
@@ -81,7 +80,7 @@ def combined_p_value(blocks: Sequence[Block]) -> float:
 
 @dataclass(frozen=True)
 class Assessment:
-    """What a diagnosis concludes of its own fit.
+    """The conclusions of a diagnosis about its own fit.
 
     Attributes:
         verdict: of the diagnosis.
@@ -128,15 +127,15 @@ class Assessment:
 
     @property
     def statements(self) -> tuple["Statement", ...]:
-        """Those whose condition holds: one of each topic at most."""
+        """The sentences whose condition holds: at most one of each topic."""
         return tuple(one for one in STATEMENTS if one.holds(self))
 
     def sentence(self, topic: str) -> str:
-        """The sentence about a topic; empty where none holds."""
+        """The sentence about a topic; empty where no condition holds."""
         return next((one.text(self) for one in self.statements if one.topic == topic), "")
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {
             "remainder": self.remainder,
             "p_value": self.p_value,
@@ -166,7 +165,7 @@ def assess(
     model: str = "design",
     false_alarm: float = DEFAULT.false_alarm,
 ) -> Assessment:
-    """The judgements of a result.
+    """Return the conclusions about a result.
 
     Args:
         verdict: of the diagnosis.
@@ -227,8 +226,7 @@ def _gap(
     left: Sequence[Block],
     false_alarm: float,
 ) -> GapState:
-    """The state of the gap; where nothing was put into the model, it is there if the held-out
-    readings are among the blocks that the result does not explain."""
+    """The state of the gap: none, closed, open or unknown."""
     if gap is None:
         return "not_held_out"
     if gap.lost:
@@ -292,7 +290,7 @@ def _above(own: Assessment) -> str:
 
 def _missing(own: Assessment) -> str:
     text = (
-        f"The model lacks an effect: the remaining residual is larger than expected "
+        f"An effect is missing from the model: the remaining residual is larger than expected "
         f"({chance_text(own.p_value)}; rms over expected rms: {_blocks(own)}).{_where(own)}"
     )
     if own.rejected:
@@ -307,7 +305,7 @@ def _closed(own: Assessment) -> str:
         text += f" (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"
     if own.series:
         *rms, expected = own.series
-        added = (f"the {own.model}", "with small errors", "with the findings")
+        added = (f"the {own.model}", "with distributed errors", "with the findings")
         steps = ", ".join(f"{a} {micrometres(b)}" for a, b in zip(added, rms, strict=False))
         text += f": {steps}; {micrometres(expected)} are expected"
     return text + "."
@@ -347,7 +345,7 @@ STATEMENTS = (
         "verdict nothing; the findings are changes since a reference; the remainder is larger than "
         "the noise",
         lambda own: own.verdict == "none" and own.change and own.remainder in _UNEXPLAINED,
-        lambda own: "No change since the reference is located, but drifts do not explain all "
+        lambda own: "No change since the reference is localised, but drifts do not explain all "
         "readings within their noise.",
         ("remainder_noise",),
     ),
@@ -364,31 +362,33 @@ STATEMENTS = (
         "verdict", "not_located",
         "verdict nothing, no reference; the remainder is larger than the noise",
         lambda own: own.verdict == "none" and not own.change and own.remainder in _UNEXPLAINED,
-        lambda own: f"No error is located, but the {own.model} does not explain all readings "
+        lambda own: f"No error is localised, but the {own.model} does not explain all readings "
         "within their noise.",
         ("remainder_noise",),
     ),
     Statement(
         "verdict", "small_errors_explain",
-        "verdict distributed; small errors are in the model; the remainder is noise or cannot be "
+        "verdict distributed; distributed errors are in the model; the remainder is noise or "
+        "cannot be "
         "tested",
         lambda own: _everywhere(own) and own.remainder not in _UNEXPLAINED,
-        lambda own: "Small errors all along the ring explain the readings; no single fault is "
+        lambda own: "Distributed errors explain the readings; no single fault is "
         "detected among them.",
         _LEAVES_MORE,
     ),
     Statement(
         "verdict", "small_errors_explain_part",
-        "verdict distributed; small errors are in the model; the remainder is larger than the "
+        "verdict distributed; distributed errors are in the model; the remainder is larger than "
+        "the "
         "noise",
         lambda own: _everywhere(own) and own.remainder in _UNEXPLAINED,
-        lambda own: "Small errors all along the ring explain a part of the readings; no single "
+        lambda own: "Distributed errors explain a part of the readings; no single "
         "fault is detected among them.",
         ("remainder_noise",),
     ),
     Statement(
         "verdict", "no_sparse_solution",
-        "verdict distributed; neither small errors nor families of errors are in the model",
+        "verdict distributed; neither distributed errors nor families of errors are in the model",
         lambda own: own.verdict == "distributed" and not own.small_errors and not own.families,
         lambda own: "The readings differ from the model all along the ring; no sparse set of "
         "errors explains them.",
@@ -441,7 +441,7 @@ STATEMENTS = (
         "size is determined to less than five standard errors",
         lambda own: own.gap == "share_unknown",
         lambda own: f"The rms residual of {_held(own)} falls {_falls(own)}; the share of the "
-        "gap that is closed is not determined by so few readings.",
+        "gap that is explained is not determined by these readings.",
     ),
     Statement(
         "gap", "gap_nothing_fitted", "a gap on held-out readings; nothing was put into the model",
@@ -465,18 +465,18 @@ STATEMENTS = (
     ),
     Statement(
         "reference", "reference_shows_faults",
-        "verdict distributed by small errors; no reference was given",
+        "verdict distributed, with distributed errors in the model; no reference was given",
         lambda own: _asks(own) and own.small_errors,
         lambda own: "A measurement of this machine from before the fault (--reference) shows "
-        "faults that small errors hide.",
+        "faults that distributed errors hide.",
     ),
     Statement(
         "reference", "reference_or_background",
-        "verdict distributed without small errors in the model; no reference was given",
+        "verdict distributed without distributed errors in the model; no reference was given",
         lambda own: _asks(own) and not own.small_errors,
-        lambda own: "Small errors everywhere look like this: state them (--background all), or "
+        lambda own: "Distributed errors look like this: state them (--background all), or "
         "give a measurement of this machine from before the fault (--reference).",
     ),
 )  # fmt: skip
-"""Every sentence about the fit as a whole, with its condition; the first that holds of a topic is
-stated by text, page and JSON."""
+"""Every sentence about the fit as a whole, with its condition; text, page and JSON state the first
+of a topic that holds."""

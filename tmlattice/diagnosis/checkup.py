@@ -1,4 +1,4 @@
-"""The result of the data checks: one sentence for each thing that was looked at."""
+"""The result of the data checks: one sentence for each check."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ Status = Literal["fine", "note", "wrong"]
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at.
+    """One check.
 
     Attributes:
         name: what.
         status: "fine"; "note", which a reader should know; "wrong", with which no diagnosis means
             anything.
-        sentence: what was found, and what mends it.
+        sentence: the finding, and its correction.
         before, after: chi-square per reading as stated, and with what is assumed; None where there
             is none.
         assume: with which a diagnosis goes on, the first choice first.
@@ -43,23 +43,23 @@ class Check:
 
 
 def fine(name: str, sentence: str) -> Check:
-    """Nothing to tell."""
+    """A check that passed."""
     return Check(name, "fine", sentence)
 
 
 def note(name: str, sentence: str, **more: Any) -> Check:
-    """Something to know."""
+    """A check with a note."""
     return Check(name, "note", sentence, **more)
 
 
 def wrong(name: str, sentence: str, **more: Any) -> Check:
-    """Something that has to be mended first."""
+    """A check that failed."""
     return Check(name, "wrong", sentence, **more)
 
 
 @dataclass(frozen=True)
 class Checkup:
-    """All that was looked at in a measurement.
+    """All checks of a measurement.
 
     Attributes:
         kind: of the measurement, as its folder has it.
@@ -73,21 +73,21 @@ class Checkup:
 
     @property
     def status(self) -> Status:
-        """The worst of them."""
+        """The worst status."""
         found = {check.status for check in self.checks}
         return "wrong" if "wrong" in found else "note" if "note" in found else "fine"
 
     @property
     def reported(self) -> tuple[Check, ...]:
-        """Those that are not fine, the worst first."""
+        """The checks that did not pass, the worst first."""
         order = ("wrong", "note")
         return tuple(c for status in order for c in self.checks if c.status == status)
 
     def stop(self, where: str = "") -> None:
-        """Raise where something has to be mended first.
+        """Raise an error if a check failed.
 
         Args:
-            where: in which data, said before the sentences.
+            where: the data, named before the sentences.
 
         Raises:
             MeasurementError: with the sentences.

@@ -1,4 +1,4 @@
-"""Which effects a diagnosis can look for."""
+"""The effects that a diagnosis can look for."""
 
 from collections.abc import Sequence
 
@@ -10,13 +10,13 @@ from tmlattice.errors import EffectError
 from tmlattice.lattice import Ring
 
 _COLUMNS = (0, 1, 2, 3, 5)
-"""Of the six coordinates, those of a launch in a measurement."""
+"""The five coordinates of a launch in a measurement."""
 
 
 def chosen_effects(
     ring: Ring, effects: Sequence[str] | None, launch_sigma: NDArray[np.float64]
 ) -> list[str]:
-    """The effects to be fitted: none where those that are asked for are seen in the data alone.
+    """The effects to be fitted; none where all that are requested show in the data alone.
 
     Args:
         ring: the design.
@@ -41,7 +41,9 @@ def chosen_effects(
             why.append(f"{name} has no place in '{ring.name}' (it sits on: {effect.sits_on_text})")
             chosen.remove(name)
         elif isinstance(effect, LaunchEffect) and effect.shifts in free:
-            why.append(f"{name} cannot be told from the launch of each shot, which is fitted too")
+            why.append(
+                f"{name} cannot be separated from the launch of each shot, which is fitted too"
+            )
             chosen.remove(name)
     if not chosen and len(why) == len(names(effects)):
         raise EffectError("; ".join(why) + ": name another effect")

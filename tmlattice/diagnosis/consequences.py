@@ -1,10 +1,10 @@
-"""What a finding does to the stored beam, and what is left of that after its repair.
+"""The effect of a finding on the stored beam, and the beam after its correction.
 
-All of it comes from one closed orbit and the layers' Jacobians about it, in six coordinates at the
-ring's energy; only the layers that a cause touches are made anew.
+All results come from one closed orbit and the Jacobians of the layers there, in six coordinates at
+the ring's energy. Only layers that a cause changes are computed again.
 
->>> told = consequences(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)])
->>> told["quadrupole_gradient", "qd::12"].found.beta_beat_rms
+>>> found = consequences(ring, [Cause("quadrupole_gradient", "qd::12", -0.2)])
+>>> found["quadrupole_gradient", "qd::12"].found.beta_beat_rms
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class Beam:
-    """The stored beam of a ring beside the design's, at the exits of all magnets.
+    """The stored beam of a ring compared with the design's, at the exits of all magnets.
 
     Attributes:
         tunes: fractions of Qx, Qy.
@@ -49,7 +49,7 @@ class Beam:
 
 @dataclass(frozen=True)
 class Consequences:
-    """Of one finding; None where the ring has no stable closed orbit.
+    """The stored beam with and without one finding; None where the ring has no stable closed orbit.
 
     Attributes:
         design: tunes of the design.
@@ -62,7 +62,7 @@ class Consequences:
     corrected: Beam | None
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {
             "design_tunes": None if self.design is None else list(self.design),
             "found": _json(self.found),
@@ -86,10 +86,10 @@ class StoredOptics:
 
 
 def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Consequences]:
-    """What each cause does to the stored beam, by effect and element.
+    """The effect of each cause on the stored beam, by effect and element.
 
-    Those of monitors, of the beam itself and of what acts on settings alone do nothing to the
-    stored beam of the design's settings, and have none; nor has what is no fault.
+    Those of monitors, of the beam itself and of what acts on settings alone do not change the
+    stored beam of the design's settings, and have no entry; nor have natural effects.
 
     Args:
         ring: the design.
@@ -115,11 +115,11 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
 
 
 def beam_with(ring: Ring, causes: Sequence[Cause]) -> Consequences:
-    """What all causes together do to the stored beam; nothing of it is repaired.
+    """The effect of all causes together on the stored beam, without any correction.
 
     Args:
         ring: the design.
-        causes: those of monitors and of settings are passed over.
+        causes: those of monitors and of settings are ignored.
     """
     design, estimated = optics_with(ring, causes)
     found = _relative(design, estimated)
@@ -147,7 +147,7 @@ def _changed(ring: Ring, mended: Ring, causes: Sequence[Cause]) -> dict[int, Ele
 
 
 def _optics(there: Assembly, changed: Mapping[int, Element]) -> StoredOptics | None:
-    """Of the ring with these elements; None where it has no stable closed orbit."""
+    """The optics of the ring with these elements; None where it has no stable closed orbit."""
     layers = Layers.of(there.maps)
     layers.put(there.layers_with(changed))
     W0, W1, W2 = layers.W

@@ -1,4 +1,4 @@
-"""Pairs of amounts that the data hardly separate: the posterior correlation of their errors."""
+"""Pairs of strongly correlated amounts, by the posterior correlation of their errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from tmlattice.inference.problem import Hypothesis
 
 STRONG = 0.9
-"""Correlation from which on a pair is stated: the error of each is 2.3 times what it would be with
-the other one known, and more."""
+"""Correlation from which on a pair is reported: the error of each is 2.3 times the one given the
+other."""
 MOST = 8
-"""Pairs that are stated."""
+"""Pairs that are reported."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Correlation:
     correlation: float
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         one, other = (
             {"effect": effect, "element": element} for effect, element in (self.first, self.second)
         )

@@ -1,10 +1,10 @@
-"""The data checks: what is wrong with a measurement as a whole, before any fault is sought.
+"""The data checks: errors of a measurement as a whole, before any search for faults.
 
 >>> checkup = check_data(load_ring("petra3"), read_measurement("day_1"))
->>> [check.sentence for check in checkup.told]
+>>> [check.sentence for check in checkup.reported]
 
-Global before local: a wrong sign, unit or order everywhere is told in a second, with the mend and
-with what to assume to go on; then launches, noise, monitors and single readings.
+Global errors come first: a wrong sign, unit or order is reported with its correction and with the
+assumption that continues without it. Launches, noise, BPMs and single readings follow.
 """
 
 import time
@@ -47,28 +47,28 @@ Array = NDArray[np.float64]
 ENERGY = 0.02
 """Share by which a stated beam energy may differ from the lattice's."""
 ALIEN = 0.85
-"""Share of the orbit that no trajectory of a section explains, of which noise or readings in no
-order leave all and strong errors everywhere 0.7: the data are of another ring."""
+"""Share of the orbit that no trajectory of a section explains from which on the data belong to
+another ring. Noise or readings in no order leave all of it, strong distributed errors 0.7."""
 CORRECTED = 0.1
-"""Misfit of the typical column once wrong signs, units or an order are undone, from which it may be
-the lattice that is wrong."""
+"""Misfit of the typical column with wrong signs, units or order corrected, from which on the
+lattice may be wrong."""
 FAR = 100.0
 """Square of the sigma by which launches may differ from the stated ones, by
 benchmarks/data_checks.py."""
 EXACT = 0.01
-"""Share of the launches that gains of the first monitors spoil them by."""
+"""Share of the launches that gains of the first BPMs change."""
 SECTIONS = 4
-"""At least, that tell what is usual."""
+"""Fewest passes that determine the usual misfit."""
 SPOILT = 3.0
-"""Misfit of a section, over the typical one, from which it is not trusted."""
+"""Misfit of a section over the typical one above which it is not used."""
 OVER, UNDER = 2.5, 3.0
 """Factors by which a stated noise may be too large, and too small."""
 _UNIT = "-in-"
 """In the names of assumptions about a unit."""
 SCALED = 3.0
-"""Times what the design makes of it, or as small a part, no RF's orbit is."""
+"""Ratio of the RF's orbit to the design's, or its inverse, that no ring has."""
 SPIKE = 20.0
-"""Sigma from which one reading is wrong for once, where its neighbours agree without it."""
+"""Sigma above which a single reading is an outlier, if its neighbours agree without it."""
 
 
 @by_name
@@ -79,12 +79,12 @@ def check_data(
     assumed: Sequence[str] = (),
     radiation: bool = False,
 ) -> Checkup:
-    """What is wrong with a measurement as a whole.
+    """Return the checks of a measurement as a whole.
 
     Args:
         ring: the design.
         data: of any kind.
-        assumed: what was written down wrongly, names of `ASSUMPTIONS`; it is undone first. Of first
+        assumed: what is recorded wrongly, names of `ASSUMPTIONS`; it is undone first. Of first
             turns and of orbit responses alone.
         radiation: the model radiates as expected.
 
@@ -117,7 +117,7 @@ def _of_stored(
 ) -> Checkup:
     if assumed:
         raise MeasurementError(
-            f"'{assumed[0]}' cannot be assumed of {in_words(data)}: mend the data themselves"
+            f"'{assumed[0]}' cannot be assumed of {in_words(data)}: correct the data themselves"
         )
     kinds = {
         TurnByTurn: "turn_by_turn", ClosedOrbit: "closed_orbit", Dispersion: "dispersion",
@@ -129,7 +129,7 @@ def _of_stored(
 
 _GLOBAL = "signs, units and order"
 _REPORTED = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
-"""Of what is noted, what the diagnosis does not find by itself."""
+"""Notes that the diagnosis does not find by itself."""
 
 
 def data_checks(
@@ -138,10 +138,10 @@ def data_checks(
     radiation: bool = False,
     reference: Measurement | OrbitResponse | None = None,
 ) -> list[str]:
-    """What a diagnosis of these data, and of a reference beside them, has to say of them.
+    """The notes on these data, and on a reference, for a diagnosis.
 
     Raises:
-        MeasurementError: something has to be mended first.
+        MeasurementError: a check failed.
         UnknownNameError: see `check_data`.
     """
     own = check_data(ring, data, radiation=radiation)
@@ -152,7 +152,7 @@ def data_checks(
     wrong, as_wrong = (
         {check.name for check in one.checks if check.status == "wrong"} for one in (own, other)
     )
-    alone = "{} alone (mend its file, --assume is of both): "
+    alone = "{} alone (correct its file; --assume applies to both): "
     own.stop("" if wrong <= as_wrong else alone.format("the second measurement"))
     other.stop(alone.format("the reference"))
     text, reported = (
@@ -166,7 +166,7 @@ Some = TypeVar("Some", Measurement, Measurement | None, OrbitResponse)
 
 
 def corrected_data(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
-    """The data, if there are some, with what is assumed undone."""
+    """The data with the assumed errors corrected, if there are any."""
     if data is None or not assumed:
         return data
     return assume(data, assumed, [monitor.name for monitor in ring.monitors])
@@ -187,7 +187,7 @@ def _provenance(
 
 
 def _stated(ring: Ring, data: AnyMeasurement) -> Check:
-    """What the data say of their lattice and energy."""
+    """The check of the stated lattice and energy."""
     if data.energy is None:
         return fine("energy", "the data state no energy")
     if abs(data.energy / ring.energy - 1) > ENERGY:
@@ -213,38 +213,43 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
-    judge = GlobalErrors(ring, data, known)
-    verdicts = judge.verdicts()
+    checked = GlobalErrors(ring, data, known)
+    verdicts = checked.verdicts()
     for verdict in verdicts:
-        judge = judge.corrected(verdict.names)
-    passes, found = judge.found(judge.measurement)
-    lattice = _lattice(ring, judge, passes, found)
-    if lattice.status == "wrong":  # no wrong sign, unit or order mends that
+        checked = checked.corrected(verdict.names)
+    passes, found = checked.found(checked.measurement)
+    lattice = _lattice(ring, checked, passes, found)
+    if lattice.status == "wrong":  # no wrong sign, unit or order explains that
         return [*checks, lattice]
     checks += [*_global(verdicts), lattice]
     if any(check.status == "wrong" for check in checks):
-        return checks  # until that is mended, noise and launches mean nothing
-    return [*checks, _launches(judge), _noise(judge, passes, found), _spikes(judge, passes, found)]
+        return checks  # noise and launches have no meaning before that is corrected
+    return [
+        *checks,
+        _launches(checked),
+        _noise(checked, passes, found),
+        _spikes(checked, passes, found),
+    ]
 
 
 def _global(verdicts: Sequence[Verdict]) -> list[Check]:
-    """One sentence for each global error."""
+    """One check for each global error."""
     if not verdicts:
-        return [fine(_GLOBAL, "no global error would make the data agree better")]
+        return [fine(_GLOBAL, "no global error would improve the agreement")]
     return [_sentence(verdict) for verdict in verdicts]
 
 
 def _sentence(verdict: Verdict) -> Check:
-    words, others, mend = _words(verdict.names, verdict.alike)
+    words, others, correction = _words(verdict.names, verdict.alike)
     where, before, after = "", verdict.before[0], verdict.after[0]
-    if not before > 2 * after:  # the sections agree either way: the launches tell
+    if not before > 2 * after:  # the sections agree either way: the launches decide
         where, before, after = " of the launches", verdict.before[1], verdict.after[1]
     if not np.isfinite(before):
         where, before, after = "", verdict.before[0], verdict.after[0]
     sure = certain(verdict)
     text = (
-        f"{words if sure else f'it may be that {words}'}{others}: chi-square per reading{where} "
-        f"{_number(before)} as stated, {_number(after)} with that undone; {mend}"
+        f"{words if sure else f'possibly {words}'}{others}: chi-square per reading{where} "
+        f"{_number(before)} as stated, {_number(after)} with that corrected; {correction}"
     )
     make = wrong if sure else note
     return make("signs, units and order", text, before=before, after=after, assume=verdict.names)
@@ -258,59 +263,60 @@ def _number(value: float) -> str:
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
 
 
-def _lattice(ring: Ring, judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
-    """Whether the readings follow trajectories of this ring at all."""
+def _lattice(ring: Ring, checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+    """The check whether the readings follow trajectories of this ring."""
     share = found.share(passes)
     if not np.isfinite(share):
-        return fine("lattice", "too few monitors to say whether this is the machine's lattice")
-    stated = judge.measurement.noise is not None
+        return fine("lattice", "too few BPMs to decide whether this is the machine's lattice")
+    stated = checked.measurement.noise is not None
     if share > ALIEN and not (stated and found.level < 4):
         return wrong(
             "lattice",
             f"the readings follow no trajectory of '{ring.name}': {100 * share:.0f} % of the orbit "
-            "is left even between neighbouring monitors; name the lattice of this machine, and "
-            "check the names and the order of the monitors",
+            "is unexplained even between neighbouring BPMs; name the lattice of this machine, and "
+            "check the names and the order of the BPMs",
             before=found.level if stated else None,
         )
     return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
 
 
-def _launches(judge: GlobalErrors) -> Check:
-    """Fitted launches against the stated ones."""
-    square = max(judge.square([()]), 1.0)
-    data = judge.measurement
+def _launches(checked: GlobalErrors) -> Check:
+    """The check of the stated launches against fitted ones."""
+    square = max(checked.square([()]), 1.0)
+    data = checked.measurement
     if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
         return fine("launches", "no launch is stated; they are fitted")
-    own, misfit = judge.launches(square, EXACT)
-    good = misfit < SPOILT * square  # else a fault of the first magnets spoils the fit
-    sections = judge.found(data)[1].misfit.shape[1]
+    own, misfit = checked.launches(square, EXACT)
+    good = misfit < SPOILT * square  # else a fault of the first magnets biases the fit
+    sections = checked.found(data)[1].misfit.shape[1]
     if not good.any() or sections < SECTIONS:
-        return fine("launches", "too few good monitors near the start to judge the launches")
+        return fine("launches", "too few good BPMs near the start to check the launches")
     worst = float(np.median(own[good], axis=0).max())
     if worst > FAR:
         return note(
             "launches",
             f"the fitted launches differ from the stated ones by {np.sqrt(worst):.0f} of their "
-            "launch_sigma, unless something is wrong before the first monitors: mend the launches "
+            "launch_sigma, unless there is a fault before the first BPMs: correct the launches "
             "or their rms, or go on with --assume launches-unknown",
             before=worst, assume=("launches-unknown",),
         )  # fmt: skip
     return fine("launches", "the fitted launches are the stated ones")
 
 
-def _noise(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
-    """The stated noise against what neighbouring monitors leave."""
+def _noise(checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+    """The check of the stated noise against the residuals between neighbouring BPMs."""
     level = float(np.sqrt(found.level))
     if not np.isfinite(level):
-        return fine("noise", "too few monitors to judge the noise")
+        return fine("noise", "too few BPMs to check the noise")
     typical = float(np.median(passes.sigma))
-    if judge.measurement.noise is None:
-        return fine("noise", f"none is stated; the readings leave {_micro(level * typical)}")
+    if checked.measurement.noise is None:
+        return fine("noise", f"none is stated; the residuals are {_micro(level * typical)}")
     if level < 1 / OVER:
         return wrong(
             "noise",
-            f"the stated noise of {_micro(typical)} is {1 / level:.1f} times what neighbouring "
-            f"monitors leave ({_micro(level * typical)}; chi-square per reading {level**2:.2g}): "
+            f"the stated noise of {_micro(typical)} is {1 / level:.1f} times the residuals "
+            f"between neighbouring BPMs ({_micro(level * typical)}; chi-square per reading "
+            f"{level**2:.2g}): "
             "state the noise of one reading, or go on with --assume noise-from-data",
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
@@ -324,19 +330,21 @@ def _noise(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
             "go on with --assume noise-from-data",
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
-    text = f"{_micro(typical)} is stated, neighbours leave {_micro(level * typical)}"
+    text = f"{_micro(typical)} is stated, neighbouring BPMs show {_micro(level * typical)}"
     if level <= UNDER:
         return fine("noise", text)
     if random is None:
         return note(
             "noise",
-            f"{text}: the noise is larger than stated, or errors all along the ring are as large; "
-            f"{len(judge.measurement.shots)} shots do not show which: take {PASSES} or more",
+            f"{text}: the noise is larger than stated, or distributed errors are as large; "
+            f"{len(checked.measurement.shots)} shots do not show which: take {PASSES} or more",
         )
     return fine(
         "noise",
-        f"{_micro(typical)} is stated, and the scatter from shot to shot is no larger; neighbours "
-        f"leave {_micro(level * typical)}, the same or in proportion in all shots: errors of the "
+        f"{_micro(typical)} is stated, and the scatter from shot to shot is no larger; "
+        "neighbouring "
+        f"BPMs show {_micro(level * typical)}, the same or in proportion in all shots: "
+        "errors of the "
         "machine",
     )
 
@@ -345,9 +353,9 @@ def _micro(metres: float) -> str:
     return f"{1e6 * metres:.3g} µm"
 
 
-def _spikes(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
-    """Single readings far off, where the same section of other shots agrees."""
-    none = fine("spikes", "no single reading is far off")
+def _spikes(checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+    """The check for outliers, where the same section of other shots agrees."""
+    none = fine("spikes", "no reading is an outlier")
     there = found.freedom > 2
     if len(found.misfit) < 3 or not there.any():
         return none
@@ -360,12 +368,12 @@ def _spikes(judge: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
         worst = int(alone.argmax())
         rest = found.misfit[p, w] * found.freedom[p, w] - alone[worst]
         if alone[worst] > SPIKE**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
-            name = judge.measurement.monitors[found.owner[w, worst]]
-            shot = judge.measurement.shots[passes.shot[p]]
+            name = checked.measurement.monitors[found.owner[w, worst]]
+            shot = checked.measurement.shots[passes.shot[p]]
             reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
     if not reported:
         return none
-    return note("spikes", f"single readings far off: {signals.some(reported)}; leave them empty")
+    return note("spikes", f"outliers: {signals.some(reported)}; leave them empty")
 
 
 # --- an orbit response ----------------------------------------------------------------------------
@@ -373,11 +381,11 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
     checks = signals.monitors(ring, data.monitors, data.response)
     if any(check.status == "wrong" for check in checks):
         return checks
-    judge = ResponseGlobalErrors(ring, data)
-    verdicts = judge.verdicts()
+    checked = ResponseGlobalErrors(ring, data)
+    verdicts = checked.verdicts()
     for verdict in verdicts:
-        judge = judge.corrected(verdict.names)
-    left = judge.misfit(())
+        checked = checked.corrected(verdict.names)
+    left = checked.misfit(())
     typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
     if typical > (CORRECTED if verdicts else ANOTHER):
         guess = _far(ring, data)
@@ -387,58 +395,62 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
                 f"the lattice of '{ring.name}' is far from the ring that was measured, which it "
                 f"resembles with all focusing quadrupoles changed by {100 * guess.focusing:+.0f} % "
                 f"and all defocusing ones by {100 * guess.defocusing:+.0f} %; signs and the order "
-                "of the data are not looked at",
+                "of the data are not checked",
             )
-            # a wrong unit is seen with any lattice
+            # a wrong unit shows with any lattice
             units = [own for own in verdicts if all(_UNIT in name for name in own.names)]
-            return [*checks, *map(_of_all, units), *_rf_step(judge), far]
-    if typical > ANOTHER:  # no wrong sign, unit or order mends that
+            return [*checks, *map(_of_all, units), *_rf_step(checked), far]
+    if typical > ANOTHER:  # no wrong sign, unit or order explains that
         return [*checks, wrong(
             "lattice",
             f"the response is not that of '{ring.name}': the typical column differs from the "
             f"design's by {100 * np.sqrt(typical):.0f} % of its size; name the lattice of this "
-            "machine, and check the names and the order of monitors and correctors",
+            "machine, and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
     if not verdicts:
-        checks.append(fine(_GLOBAL, "no global error would make the response agree better"))
+        checks.append(fine(_GLOBAL, "no global error would improve the agreement"))
     text = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
-    return [*checks, *map(_of_all, verdicts), *_rf_step(judge), fine("lattice", text)]
+    return [*checks, *map(_of_all, verdicts), *_rf_step(checked), fine("lattice", text)]
 
 
 def _of_all(verdict: ResponseVerdict) -> Check:
-    words, others, mend = _words(verdict.names, verdict.alike)
+    words, others, correction = _words(verdict.names, verdict.alike)
     before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
     text = (
         f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
-        f"stated, by {after:.0f} % with that undone; {mend}"
+        f"stated, by {after:.0f} % with that corrected; {correction}"
     )
     return wrong(_GLOBAL, text, assume=verdict.names)
 
 
-def _rf_step(judge: ResponseGlobalErrors) -> list[Check]:
-    scale = judge.rf_scale()
+def _rf_step(checked: ResponseGlobalErrors) -> list[Check]:
+    scale = checked.rf_scale()
     if not max(abs(scale), 1 / abs(scale)) > SCALED:
         return []
     text = (
-        f"the RF's orbit is {scale:.3g} times what its step makes of the design's: mend its unit "
+        f"the RF's orbit is {scale:.3g} times the design's for its step: correct its unit "
         "(m) or the step's (Hz), or leave it out"
     )
     return [wrong("RF step", text)]
 
 
 def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
-    """Where the design would resemble the data, if it is far from them."""
+    """The first guess of the optics, if the design is far from the data."""
     try:
         return elsewhere(response_data(ring, data))
-    except TmlatticeError:  # of which more is said by who needs it
+    except TmlatticeError:  # reported elsewhere
         return None
 
 
 def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
-    """What is wrong, what else it might be, and the mend."""
+    """The error, its alternatives, and the correction."""
     words = " and ".join(ASSUMPTIONS[n].words for n in names)
     others = "; ".join(
         f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}" for own in alike
     )
-    mends = ", ".join(dict.fromkeys(ASSUMPTIONS[n].mend for n in names))
-    return words, f" ({others})" if others else "", f"{mends}, or go on with {_options(names)}"
+    corrections = ", ".join(dict.fromkeys(ASSUMPTIONS[n].mend for n in names))
+    return (
+        words,
+        f" ({others})" if others else "",
+        f"{corrections}, or go on with {_options(names)}",
+    )

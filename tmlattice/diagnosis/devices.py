@@ -1,4 +1,4 @@
-"""Names of the control system beside those of the lattice, in all that a diagnosis states."""
+"""Names of the control system in all that a diagnosis reports."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -12,7 +12,7 @@ def devices_of(ring: Ring, measured: Iterable[Any]) -> dict[str, str]:
     """Names of the control system by names of the lattice.
 
     Args:
-        ring: whose names they are; others are passed over.
+        ring: whose names they are; others are ignored.
         measured: of any kinds; the first that has a name for an element gives it.
     """
     names = {element.name.casefold(): element.name for element in ring.elements}

@@ -1,4 +1,4 @@
-"""What a search found, as findings: each with what else it could be, where it sits, how sure."""
+"""Findings of a search: each with alternatives, place and probability."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternative], Array]:
-    """The likeliest rivals that hold the mass, and the probabilities of all."""
+    """The most probable alternatives within the credible set, and the probabilities of all."""
     evidence = np.array([rival.fit.log_evidence for rival in rivals])
     probability = np.exp(evidence - evidence.max())
     probability /= probability.sum()
@@ -35,11 +35,11 @@ def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternati
 
 
 FINAL_STEPS = 60
-"""Of the fit that is reported, at most."""
+"""Iterations of the reported fit at most."""
 
 
 def finished(explanation: Explanation) -> Explanation:
-    """With as many steps of its fit as it takes to converge, if it ran out of them."""
+    """The fit of the causes, iterated until it converges or reaches the maximum."""
     last = explanation.fit
     if last.outcome is not Outcome.STEPS:
         return explanation
@@ -50,7 +50,7 @@ def finished(explanation: Explanation) -> Explanation:
 def findings_of(
     ring: Ring, explanation: Explanation, dead: Sequence[tuple[int, float]], judgement: Judgement
 ) -> tuple[Finding, ...]:
-    """By falling statistic: causes with a name, kicks without, monitors set aside, dead ones."""
+    """Findings by falling statistic: named causes, unexplained kicks, rejected and dead BPMs."""
     found = [
         _named(ring, explanation, k, named, judgement.mass)
         for k, named in enumerate(explanation.named)
@@ -64,17 +64,17 @@ def findings_of(
 
 
 def cause_of(found: Finding) -> Cause:
-    """What is found, as a cause of its amount."""
+    """The hypothesis as a cause with its amount."""
     return Cause(found.effect or "", found.element, found.amount or 0.0)
 
 
 def strongest_first(found: Iterable[Finding]) -> tuple[Finding, ...]:
-    """By falling statistic."""
+    """Findings by falling statistic."""
     return tuple(sorted(found, key=lambda own: -own.detection.statistic))
 
 
 def least_certain(found: Sequence[Finding], without: str) -> str:
-    """The verdict of the least certain finding, or what it is where there is none."""
+    """The verdict of the least certain finding; without findings by the remainder."""
     return max((own.verdict for own in found), key=VERDICTS.index) if found else without
 
 
@@ -96,16 +96,16 @@ def finding_of(
     detection: Detection,
     mass: float,
 ) -> Finding:
-    """A cause with a name.
+    """The finding of a named cause.
 
     Args:
         ring: the design.
-        causes: the cause, and its rivals by falling probability.
+        causes: the cause, and its alternatives by falling probability.
         probability: of each.
-        shown: the first of them, that hold the mass.
+        shown: the first of them, which form the credible set.
         sigma: standard error of the amount.
         detection: how clearly it was seen.
-        mass: that a credible set is to hold.
+        mass: of the credible set.
     """
     cause = causes[0]
     actions = recommended_actions(ring, causes, probability, sigma)
@@ -131,7 +131,7 @@ def finding_of(
 
 
 def located(ring: Ring, element: Element, detection: Detection) -> Finding:
-    """Something without a name."""
+    """The finding of a kick without a named cause."""
     where, near = between(ring, [element.s])
     return Finding(
         effect=None,
@@ -150,7 +150,7 @@ def located(ring: Ring, element: Element, detection: Detection) -> Finding:
 
 
 def _dead(ring: Ring, monitor: Element, amount: float) -> Finding:
-    """A monitor whose readings say so themselves."""
+    """The finding of a BPM whose readings alone show a fault."""
     where, near = between(ring, [monitor.s])
     cause = Cause("monitor_dead", monitor.name, amount)
     return Finding(
@@ -173,11 +173,11 @@ def _dead(ring: Ring, monitor: Element, amount: float) -> Finding:
 def with_consequences(
     ring: Ring, findings: Sequence[Finding], causes: Sequence[Cause]
 ) -> tuple[Finding, ...]:
-    """The findings, each with what it does to the stored beam of the design's settings.
+    """The findings with their effects on the stored beam of the design's settings.
 
     Args:
         ring: the design.
-        findings: those that stand.
+        findings: those that are accepted.
         causes: theirs.
     """
     if not findings:
@@ -211,7 +211,7 @@ def _middle(ring: Ring, name: str | None) -> float | None:
 
 
 def _positions(ring: Ring, hypothesis: Hypothesis) -> list[float]:
-    """Of all elements that a hypothesis touches, m."""
+    """Positions of all elements that a hypothesis touches, m."""
     place = _middle(ring, hypothesis[1])
     if place is not None:
         return [place]
@@ -228,7 +228,7 @@ def verdict_of(
     estimated: bool,
     judgement: Judgement,
 ) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
-    """The least certain of the findings', the findings that stand, and what is to be said."""
+    """The verdict, the accepted findings, and the notes."""
     _, far_more = judgement.noise
     if findings and (why := _no_solution(explanation)):
         return "distributed", (), (f"no cause is named: {why}",)
@@ -240,19 +240,19 @@ def verdict_of(
 
 
 def _no_solution(explanation: Explanation) -> str:
-    """Why the fit of what was found is none; empty where it is one."""
+    """The reason why the fit of the findings is rejected; empty where it is accepted."""
     last, before = explanation.fit, explanation.before
     if not (last.causes or last.kicks):
         return ""
     if last.outcome is Outcome.STEPS:
-        return f"their fit did not converge ({last.outcome.value})"
+        return f"the fit did not converge ({last.outcome.value})"
     if last.chi2 > before.chi2:
         return f"with them chi-square rises from {before.chi2:.4g} to {last.chi2:.4g}"
     return ""
 
 
 def unexplained(ring: Ring, left: FreeScan, p_value: float, judgement: Judgement) -> dict[str, Any]:
-    """Whether what is left is noise, and where it sits if not."""
+    """The test of the remaining residual, and its place."""
     places: list[dict[str, float]] = []
     taken: set[float] = set()
     for i in np.argsort(-left.gain)[:200]:
@@ -268,7 +268,7 @@ def unexplained(ring: Ring, left: FreeScan, p_value: float, judgement: Judgement
 
 
 def sensitivity(found: Scan, judgement: Judgement) -> dict[str, float]:
-    """By effect, the amount that reaches the threshold at half of the places where it is seen."""
+    """Detection limits: by effect, the amount that reaches the threshold at half of its places."""
     threshold = found.threshold(judgement.false_alarm)
     amounts: dict[str, list[float]] = {}
     for (name, _), information in zip(found.hypotheses, found.information, strict=True):
@@ -279,7 +279,7 @@ def sensitivity(found: Scan, judgement: Judgement) -> dict[str, float]:
 
 
 def swap_of(state: State, name: str, judgement: Judgement) -> Finding:
-    """The finding of a monitor whose planes were put back."""
+    """The finding of a BPM with swapped planes."""
     data = state.data
     at = data.measured.monitors.index(name)
     model, d = state.at.read[:, at], data.orbits[:, at]

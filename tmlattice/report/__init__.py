@@ -1,4 +1,5 @@
-"""What a person reads of a diagnosis: words, text, one page that holds everything.
+"""Reports of a diagnosis: text and one self-contained page.
 
-Nothing is imported here: the text needs no template, and the page no figures before they are drawn.
+Nothing is imported here: the text needs no template, and the page loads figures only to draw
+them.
 """

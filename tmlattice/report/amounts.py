@@ -14,7 +14,7 @@ _SCALES = {
     "1/m": ((0.0, 1.0, "1/m"),),
     "scale": ((0.0, 1.0, "x expected"),),
 }
-"""By unit of the catalogue: from which modulus on, factor, readable unit."""
+"""By unit of the catalogue: least modulus, factor, readable unit."""
 
 
 def words(effect: str) -> str:
@@ -23,7 +23,7 @@ def words(effect: str) -> str:
 
 
 def scaled(effect: str, amount: float) -> tuple[float, str]:
-    """The factor and the readable unit in which an amount of this size is told."""
+    """The factor and the readable unit for an amount of this size."""
     unit = find(effect).unit
     steps = _SCALES.get(unit, ((0.0, 1.0, unit),))
     _, factor, name = [step for step in steps if abs(amount) >= step[0] or step[0] == 0][-1]
@@ -31,7 +31,7 @@ def scaled(effect: str, amount: float) -> tuple[float, str]:
 
 
 def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
-    """An amount in a readable unit, with its error to two digits where it has one.
+    """An amount in a readable unit, with its error to two digits.
 
     Args:
         effect: of the catalogue.
@@ -49,7 +49,7 @@ def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
 
 
 def least_text(effect: str, amount: float) -> str:
-    """The least amount that would be seen; a fault's largest where that is less."""
+    """The detection limit, or the largest fault where that is less."""
     kind = find(effect)
     if not amount <= kind.largest:
         return f"not even the largest fault, {amount_text(effect, kind.largest)}"
@@ -57,19 +57,19 @@ def least_text(effect: str, amount: float) -> str:
 
 
 def probability_text(probability: float) -> str:
-    """In per cent; never more certain than the numbers allow."""
+    """A probability in per cent, between "< 0.1 %" and "> 99.9 %"."""
     if probability > 0.9995:
         return "> 99.9 %"
     return f"{100 * probability:.1f} %" if probability > 0.001 else "< 0.1 %"
 
 
 def labelled(name: str, devices: Mapping[str, str]) -> str:
-    """An element with what the control system calls it, where that is known."""
+    """An element with its name in the control system, where that is known."""
     return f"{name} [{devices[name]}]" if name in devices else name
 
 
 def degenerate_text(effect: str, support: Support) -> str:
-    """What a number of an effect that the data do not determine is degenerate with."""
+    """What an undetermined amount of an effect is degenerate with."""
     if not support.degenerate_with:
         return "the data hardly depend on it"
     return "degenerate with " + ", ".join(
@@ -80,7 +80,7 @@ def degenerate_text(effect: str, support: Support) -> str:
 
 
 def all_of(places: Sequence[str | None], devices: Mapping[str, str]) -> str:
-    """The elements that share a number, in words.
+    """The elements that share an amount.
 
     Args:
         places: their names; None: the beam.

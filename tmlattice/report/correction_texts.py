@@ -1,4 +1,4 @@
-"""The sentences and rows of a correction: those of the terminal and of the page."""
+"""Sentences and tables of a correction, for the terminal and the page."""
 
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.targets import TARGETS
@@ -9,12 +9,12 @@ MOST = 20
 
 
 def settings_head() -> list[str]:
-    """Of the settings' table."""
+    """Head of the table of settings."""
     return ["device", "present", "new", "change", "unit", "limits", "gain"]
 
 
 def setting_row(setting: Setting) -> list[str]:
-    """Of the settings' table."""
+    """A row of the table of settings."""
     knob = setting.knob
     ends = ["" if abs(end) == float("inf") else f"{end:.6g}" for end in (knob.low, knob.high)]
     limits = " to ".join(ends) if any(ends) else "-"
@@ -27,24 +27,24 @@ def setting_row(setting: Setting) -> list[str]:
 
 
 def setting_rows(correction: Correction) -> list[list[str]]:
-    """Of the settings' table, the first `MOST`."""
-    return [setting_row(own) for own in correction.settings[:MOST]]
+    """Rows of the table of settings, the first `MOST`."""
+    return [setting_row(setting) for setting in correction.settings[:MOST]]
 
 
 def expected_head() -> list[str]:
-    """Of the table of targets."""
+    """Head of the table of targets."""
     return ["rms", "", "now", "expected", "68 %", "not reachable", "not determined"]
 
 
 def expected_rows(correction: Correction) -> list[list[str]]:
-    """Of the table of targets."""
+    """Rows of the table of targets."""
     rows = []
     for name in correction.before:
         target = TARGETS[name]
         for plane in (0, 1):
             now, *_ = correction.before[name][plane]
             then, low, high = correction.after[name][plane]
-            reach, data = (own[plane] for own in correction.stays[name])
+            reach, data = (values[plane] for values in correction.stays[name])
             shown = [amount(name, value) for value in (now, then, low, high, reach, data)]
             words = target.words + ("" if name in correction.counted else " (no target)")
             rows.append([words, target.planes[plane], shown[0], shown[1],
@@ -63,15 +63,15 @@ def amount(name: str, value: float) -> str:
 
 
 def gain_head(correction: Correction) -> list[str]:
-    """Of the table of gains."""
+    """Head of the table of gains."""
     return ["devices", *(TARGETS[name].words for name in correction.counted)]
 
 
 def gain_rows(correction: Correction) -> list[list[str]]:
-    """Devices, and the expected rms of each target with so many of them, the worse plane's."""
+    """Rows of gains: number of devices, expected rms of each target in the worse plane."""
     return [
-        [str(n), *(amount(name, max(own[name])) for name in correction.counted)]
-        for n, own in correction.gains
+        [str(n), *(amount(name, max(rms[name])) for name in correction.counted)]
+        for n, rms in correction.gains
     ]
 
 
@@ -92,7 +92,7 @@ def correction_text(correction: Correction, width: int = 100) -> str:
 
 
 def sentences(correction: Correction) -> list[str]:
-    """The gain, its error, iterations and warnings."""
+    """Sentences on the gain, its error, iterations and warnings."""
     share, error = 100 * correction.gain, 100 * correction.gain_error
     found = [] if correction.refused else [
         f"Expected gain: {share:.3g} ± {error:.1g} % of the squared errors in units of their "

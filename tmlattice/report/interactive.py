@@ -1,4 +1,4 @@
-"""Figures that one can hover and zoom, for plotly.js in the page: plain dictionaries.
+"""Interactive figures for plotly.js, as plain dictionaries.
 
 The same figures as those of `tmlattice.plots`, whose pictures stand in the page where it is printed
 or where scripts are off. The colours "@ink" and "@faint" follow the reader's light or dark page.
@@ -40,11 +40,11 @@ from tmlattice.speaks import micrometres
 Figure = dict[str, Any]
 
 MOST = 4000
-"""Points of the scan that are drawn: the page stays quick. The picture has all."""
+"""Points of the scan that are drawn, so that the page stays quick. The picture has all."""
 
 
 def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
-    """By the name that the picture of `plots.diagnosis.figures` has."""
+    """Figure functions by the name of the picture in `plots.diagnosis.figures`."""
     made = {"plan": plan(diagnosis)}
     if not diagnosis.by_steps:
         if not diagnosis.stored:
@@ -71,7 +71,7 @@ def _of_readings(diagnosis: Diagnosis) -> dict[str, Figure]:
 
 # --- parts ----------------------------------------------------------------------------------------
 def _short(values: ArrayLike, digits: int = 5) -> list[float | None]:
-    """Numbers with so many digits; None where there is none."""
+    """Numbers rounded to so many digits; None where one is not finite."""
     return [
         float(f"{v:.{digits}g}") if np.isfinite(v) else None
         for v in np.asarray(values, dtype=float).ravel()
@@ -79,7 +79,7 @@ def _short(values: ArrayLike, digits: int = 5) -> list[float | None]:
 
 
 def as_plain(text: str) -> str:
-    """A text for plotly that is shown as it stands, in the lines that it has.
+    """Escape a text for plotly, so that it is shown literally with its lines.
 
     Plotly takes tags, entities and, in templates, `%{x}` for its own; `"@..."` is a colour of the
     page's style (`page.js`).
@@ -95,21 +95,21 @@ def _colour(name: str) -> str:
 
 def _trace(
     x: ArrayLike, y: ArrayLike, name: str, colour: str, *, mode: str = "lines", size: float = 1.2,
-    text: Sequence[str] | None = None, told: str = "", dash: str = "solid", **more: Any,
+    text: Sequence[str] | None = None, hover: str = "", dash: str = "solid", **more: Any,
 ) -> Figure:  # fmt: skip
-    """A line, or markers, whose points show their `text`, and then the template `told`."""
+    """A line or markers; on hover a point shows its `text`, then the template `hover`."""
     style: Figure = {"line": {"width": size, "color": _colour(colour), "dash": dash}}
     if mode == "markers":
         style = {"marker": {"size": size, "color": _colour(colour)}}
-    hover: Figure = {"hoverinfo": "skip"}
+    texts: Figure = {"hoverinfo": "skip"}
     if text is not None:
-        hover = {
+        texts = {
             "text": [as_plain(one) for one in text],
-            "hovertemplate": f"%{{text}}{told}<extra></extra>",
+            "hovertemplate": f"%{{text}}{hover}<extra></extra>",
         }
     return {
         "type": "scatter", "x": _short(x, 6), "y": _short(y, 4), "name": as_plain(name),
-        "mode": mode, **style, **hover, **more,
+        "mode": mode, **style, **texts, **more,
     }  # fmt: skip
 
 
@@ -127,7 +127,7 @@ def _layout(height: int, **axes: Any) -> Figure:
 
 
 def _marks(diagnosis: Diagnosis) -> list[Figure]:
-    """Where the findings sit, over all rows against s."""
+    """Marks of the findings, over all rows against s."""
     shapes: list[Figure] = []
     for finding in diagnosis.findings:
         ends = finding.where if finding.effect is None else (finding.s, finding.s)
@@ -144,7 +144,7 @@ def _marks(diagnosis: Diagnosis) -> list[Figure]:
 
 
 def strip(ring: Ring) -> list[Figure]:
-    """The lattice along s, each kind one outline; every magnet tells its name.
+    """The lattice along s, each kind one outline; on hover the name of each magnet.
 
     It stands once in the page, and is drawn under each figure that names an axis for its `strip`.
     """
@@ -169,7 +169,7 @@ def strip(ring: Ring) -> list[Figure]:
         heights = [sum(strip_view.extent(e)) / 2 for e in own]
         traces.append(
             _trace([e.s for e in own], heights, kind, colour, mode="markers", size=8, opacity=0,
-                   text=[e.name for e in own], told=f"<br>{kind}<br>s = %{{x:.2f}} m",
+                   text=[e.name for e in own], hover=f"<br>{kind}<br>s = %{{x:.2f}} m",
                    showlegend=False)
         )  # fmt: skip
     return traces
@@ -180,7 +180,7 @@ _STRIP_AXIS = {"visible": False, "range": [-1.2, 1.2], "fixedrange": True}
 
 # --- the ring from above --------------------------------------------------------------------------
 def plan(diagnosis: Diagnosis) -> Figure:
-    """Magnets along the orbit, monitors and correctors small beside it, culprits marked."""
+    """Magnets along the orbit, BPMs and correctors small next to it, findings marked."""
     ring, view = diagnosis.ring, survey(diagnosis.ring)
     traces = [_trace(view.ends[:, 0], view.ends[:, 1], "orbit", "@faint", showlegend=False)]
     for kind, places in plan_view.groups(diagnosis).items():
@@ -189,7 +189,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
         at = plan_view.beside(view, kind, places)
         own = [ring.elements[i] for i in places]
         trace = _trace(at[:, 0], at[:, 1], plural(kind), colour, mode="markers",
-                       size=3 if small else 4, told=f"<br>{kind}",
+                       size=3 if small else 4, hover=f"<br>{kind}",
                        text=[f"{e.name}\ns = {e.s:.2f} m" for e in own])  # fmt: skip
         trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
         traces.append(trace)
@@ -200,7 +200,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
         traces.append({
             **_trace(place[:1], place[1:], name, "@culprit", mode="markers", size=20,
                      text=[plan_view.label(number, finding)], showlegend=False,
-                     told=f"<br>{as_plain(name)}<br>s = {_s_text(finding.s, finding.where)}"),
+                     hover=f"<br>{as_plain(name)}<br>s = {_s_text(finding.s, finding.where)}"),
             "mode": "markers+text",
             "texttemplate": f"{aside[4:]}<br> %{{text}} " if aside and high == "bottom"
             else f" %{{text}} {aside}",
@@ -231,7 +231,7 @@ def _s_text(s: float | None, where: tuple[float, float] | None) -> str:
 
 # --- trajectories ---------------------------------------------------------------------------------
 def readings(diagnosis: Diagnosis) -> Figure:
-    """What each model leaves of the shot that the design explains worst, monitor by monitor."""
+    """Residuals of each model, for the shot that the design explains worst, by BPM."""
     view = diagnosis.trajectories
     data = view.data
     monitors = diagnosis.ring.monitors
@@ -249,19 +249,19 @@ def readings(diagnosis: Diagnosis) -> Figure:
             values = 1e3 * (read - predicted)[shot, first, plane]
             traces.append(
                 _trace(s, values, model, colour, text=names, showlegend=not plane,
-                       told=f"<br>s = %{{x:.2f}} m<br>{name} less {as_plain(model)}: %{{y:.4f}} mm",
+                       hover=f"<br>s = %{{x:.2f}} m<br>{name} - {as_plain(model)}: %{{y:.4f}} mm",
                        legendgroup=model, yaxis="y2" if plane else "y")
             )  # fmt: skip
     layout = _layout(
-        460, xaxis=_axis("s [m]", anchor="y3"), yaxis=_axis("left of x [mm]", domain=[0.58, 1]),
-        yaxis2=_axis("left of y [mm]", domain=[0.12, 0.54]),
+        460, xaxis=_axis("s [m]", anchor="y3"), yaxis=_axis("residual x [mm]", domain=[0.58, 1]),
+        yaxis2=_axis("residual y [mm]", domain=[0.12, 0.54]),
         yaxis3={**_STRIP_AXIS, "domain": [0, 0.08]}, shapes=_marks(diagnosis),
     )  # fmt: skip
     return {"data": traces, "layout": layout, "strip": "y3"}
 
 
 def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
-    """What each measurement leaves at each monitor in units of the noise, before and after."""
+    """Residuals of each measurement at each BPM in units of the noise, before and after."""
     places = {monitor.name: monitor.s for monitor in diagnosis.ring.monitors}
     height = 0.9 / len(shown)
     traces, axes = [], {}
@@ -275,13 +275,16 @@ def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
         ):
             traces.append(
                 _trace(s[order], np.maximum(left[order], 1e-2), model, colour, text=names,
-                       told=f"<br>{as_plain(part.label)}, {as_plain(model)}<br>"
+                       hover=f"<br>{as_plain(part.label)}, {as_plain(model)}<br>"
                        "%{y:.3g} times the noise",
                        showlegend=not k, legendgroup=model, yaxis=axis)
             )  # fmt: skip
         top = 1 - k * height
         axes[axis.replace("y", "yaxis")] = _axis(
-            f"{part.label}\nleft / noise", type="log", dtick=1, domain=[top - 0.85 * height, top]
+            f"{part.label}\nresidual / noise",
+            type="log",
+            dtick=1,
+            domain=[top - 0.85 * height, top],
         )
     last = f"y{len(shown) + 1}"
     axes[last.replace("y", "yaxis")] = {**_STRIP_AXIS, "domain": [0, 0.06]}
@@ -296,11 +299,11 @@ def _amount(effect: str, power_of_it: float) -> str:
 
 
 def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figure:
-    """How much better each hypothesis alone explains the data, before anything was found.
+    """The gain in chi-square of each hypothesis alone, before any finding.
 
     Args:
         diagnosis: with a scan.
-        span: from and to which s, m: then linear, so that neighbours can be told apart.
+        span: from and to which s, m: then linear, to separate neighbours.
     """
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
     s = middles(diagnosis)
@@ -319,11 +322,11 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
     shown: set[str] = set()
     for effect, own in sorted(by_effect.items(), key=lambda item: order_of[find(item[0]).group]):
         group = find(effect).group
-        told = [f"{found.hypotheses[i][1]}\n{_amount(effect, found.amount[i])}" for i in own]
+        hover = [f"{found.hypotheses[i][1]}\n{_amount(effect, found.amount[i])}" for i in own]
         traces.append(
             _trace(s[own], found.statistic[own], group, COLOURS[group], mode="markers", size=4,
-                   told=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>fall of chi² %{{y}}",
-                   text=told, legendgroup=group, showlegend=group not in shown)
+                   hover=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>fall of chi² %{{y}}",
+                   text=hover, legendgroup=group, showlegend=group not in shown)
         )  # fmt: skip
         shown.add(group)
     named, of_kicks = thresholds(diagnosis)
@@ -345,7 +348,7 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
 
 
 def gap(diagnosis: Diagnosis) -> Figure:
-    """The rms residual of held-out readings as findings are added one after another."""
+    """The rms residual of held-out readings against the number of findings."""
     assert diagnosis.heldout is not None
     rms = [1e6 * step.rms for step in diagnosis.heldout.misfits]
     wrapped = [wrap(label, 28) for label in gap_labels(diagnosis)]
@@ -378,7 +381,7 @@ _ONE_TWO_FIVE = [float(f"{m}e{e}") for e in range(-3, 6) for m in (1, 2, 5)]
 
 
 def steps(diagnosis: Diagnosis) -> Figure:
-    """Held-out rms after each step that was kept."""
+    """Held-out rms after each accepted step."""
     kept = diagnosis.steps
     at = list(range(len(kept)))
     traces = []
@@ -390,7 +393,7 @@ def steps(diagnosis: Diagnosis) -> Figure:
     ):
         values = [1e6 * getattr(step, name) for step in kept]
         trace = _trace(at, values, label, colour, text=[step.effect for step in kept],
-                       told=f"<br>{label} %{{y:.3g}} µm")  # fmt: skip
+                       hover=f"<br>{label} %{{y:.3g}} µm")  # fmt: skip
         traces.append({**trace, "mode": "lines+markers"})
     noise = 1e6 * diagnosis.gap["noise"]
     traces.append(
@@ -411,16 +414,16 @@ def gradients(diagnosis: Diagnosis) -> Figure:
         for c, sigma in zip(diagnosis.causes, diagnosis.errors, strict=True)
         if c.effect == "quadrupole_gradient"
     ]
-    told = [f"{name}\n{amount:+.4f} ± {error:.4f} %" for name, _, amount, error in rows]
+    hover = [f"{name}\n{amount:+.4f} ± {error:.4f} %" for name, _, amount, error in rows]
     trace = _trace([r[1] for r in rows], [r[2] for r in rows], "gradient error", "tab:red",
-                   mode="markers", size=5, text=told, told="<br>s = %{x:.2f} m",
+                   mode="markers", size=5, text=hover, hover="<br>s = %{x:.2f} m",
                    showlegend=False)  # fmt: skip
     trace["error_y"] = {"array": _short([r[3] for r in rows], 3), "thickness": 1, "width": 0}
     return _above_strip(diagnosis, [trace], "gradient error [%]")
 
 
 def beta_beat(diagnosis: Diagnosis) -> Figure:
-    """Beta of the ring as found relative to the design's, along the ring."""
+    """Beta of the estimated ring relative to the design's, along the ring."""
     from tmlattice.beam.chain import Chain
     from tmlattice.optics import twiss
 
@@ -431,7 +434,7 @@ def beta_beat(diagnosis: Diagnosis) -> Figure:
         beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
         name = "xy"[plane]
         traces.append(_trace(before.s, beat, name, colour, text=names,
-                             told=f"<br>s = %{{x:.2f}} m<br>{name}: %{{y:+.3f}} %"))  # fmt: skip
+                             hover=f"<br>s = %{{x:.2f}} m<br>{name}: %{{y:+.3f}} %"))  # fmt: skip
     return _above_strip(diagnosis, traces, f"beta / {diagnosis.ring.model} - 1 [%]")
 
 

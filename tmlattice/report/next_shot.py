@@ -1,4 +1,4 @@
-"""The measurement that would tell more, in words."""
+"""The recommended next measurement, in words."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from tmlattice.diagnosis.result import Diagnosis
 
 
 def next_text(diagnosis: Diagnosis) -> str:
-    """The next measurement, in words; empty where none was proposed."""
+    """The recommended next measurement; empty where none was proposed."""
     shot = diagnosis.next
     if shot is None:
         return ""
@@ -19,7 +19,7 @@ def next_text(diagnosis: Diagnosis) -> str:
     launch = shot.launch
     if launch is None:
         return (
-            f"{KIND_WORDS[shot.kind]} ({shot.minutes:.2g} minutes) would part '{first}' from "
+            f"{KIND_WORDS[shot.kind]} ({shot.minutes:.2g} minutes) would separate '{first}' from "
             f"'{second}' by {shot.separation:.1f} standard deviations"
             + _enough(shot.separation, "of them")
         )
@@ -31,7 +31,7 @@ def next_text(diagnosis: Diagnosis) -> str:
         where += f", energy {100 * launch['delta']:+.2f} %"
     how = f"with {' and '.join(changes)}, " if changes else ""
     return (
-        f"One more shot, {how}launched at {where}, would part '{first}' from '{second}' by "
+        f"One more shot, {how}launched at {where}, would separate '{first}' from '{second}' by "
         f"{shot.separation:.1f} standard deviations" + _enough(shot.separation)
     )
 
@@ -47,7 +47,7 @@ KIND_WORDS = {
 
 
 def _enough(separation: float, what: str = "such shots") -> str:
-    """How many such measurements make 5 standard deviations."""
+    """The number of such measurements that reach 5 standard deviations."""
     if separation >= 5:
         return "."
     return f"; {int(np.ceil((5 / separation) ** 2))} {what} reach 5."

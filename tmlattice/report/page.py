@@ -1,4 +1,4 @@
-"""The HTML report of a diagnosis: figures inside that can be hovered and zoomed, nothing outside.
+"""The HTML report of a diagnosis: one file with interactive figures and no external resources.
 
 >>> html = page(diagnosis, draw(diagnosis, folder))
 """
@@ -27,7 +27,7 @@ DPI = 130
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure in a file, and the words under it."""
+    """A figure's file and its caption."""
 
     name: str
     caption: str
@@ -35,12 +35,12 @@ class Picture:
 
     @property
     def source(self) -> str:
-        """As an image's source in a page."""
+        """The image as a data URL."""
         return f"data:image/png;base64,{b64encode(self.path.read_bytes()).decode('ascii')}"
 
 
 def render(template: str, provenance: Mapping[str, Any], **context: Any) -> str:
-    """A page of this folder's template; what the provenance holds beside texts is shown as JSON."""
+    """A page from a template of this folder; other provenance than texts is shown as JSON."""
     environment = Environment(
         loader=PackageLoader("tmlattice.report", "."),
         autoescape=True,
@@ -56,7 +56,7 @@ def render(template: str, provenance: Mapping[str, Any], **context: Any) -> str:
 
 
 def _rounded(value: Any) -> Any:
-    """What a clock measured is not known to a nanosecond."""
+    """A copy of the provenance with times rounded to microseconds."""
     return round(value, 1) if isinstance(value, float) else value
 
 
@@ -76,7 +76,7 @@ def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Pic
 
 
 def _no_formulas(figure: "Figure") -> None:
-    """Dollar signs of names are no formula, which matplotlib would set, or fail to."""
+    """Escape dollar signs in names, which matplotlib would read as formulas."""
     from matplotlib.text import Text
     from matplotlib.ticker import FixedFormatter
 
@@ -90,8 +90,10 @@ def _no_formulas(figure: "Figure") -> None:
 
 
 def shrink(path: Path, caption: str) -> None:
-    """A PNG file with a palette, a third as large; a rare colour keeps its place in it. Its caption
-    is in it, for a report that is rendered again."""
+    """Write a PNG file with a palette, a third as large, with its caption inside.
+
+    Rare colours are kept. The caption is for a report that is rendered again.
+    """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -122,14 +124,14 @@ def pictures_in(folder: Path) -> list[Picture]:
 
 
 def draw(diagnosis: Diagnosis, folder: Path, correction: Correction | None = None) -> list[Picture]:
-    """Every figure of a diagnosis, and of its correction, as a PNG file in the folder."""
+    """Draw every figure of a diagnosis and of its correction as a PNG file in the folder."""
     from tmlattice.plots import diagnosis as drawn
 
     return [*save(drawn.figures(diagnosis), folder), *draw_correction(correction, folder)]
 
 
 def draw_correction(correction: Correction | None, folder: Path) -> list[Picture]:
-    """The figure of a correction as a PNG file in the folder."""
+    """Draw the figure of a correction as a PNG file in the folder."""
     from tmlattice.plots.correction import CAPTION, plot_correction
 
     if correction is None:
@@ -138,7 +140,7 @@ def draw_correction(correction: Correction | None, folder: Path) -> list[Picture
 
 
 def correction_page(correction: Correction, folder: Path) -> str:
-    """The report of a correction as HTML; its figure goes into the folder."""
+    """The report of a correction as HTML; its figure is written into the folder."""
     from tmlattice import __version__
 
     (picture,) = draw_correction(correction, folder)
@@ -180,7 +182,7 @@ def page(
         texts=correction_texts,
         notes=list(tables.notes(diagnosis, stated)),
         report=report,
-        dense=response_text,
+        fit=response_text,
         tables=tables,
         pictures={picture.name: picture for picture in pictures},
         interactive={name: _inlined(one) for name, one in figures(diagnosis).items()},
@@ -195,6 +197,6 @@ LIBRARY = "vendor/plotly-basic.min.js"
 
 
 def _inlined(figure: Any) -> str:
-    """As JSON that may stand between the tags of a script."""
+    """JSON that is safe between the tags of a script."""
     text = json.dumps(figure, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
     return text.replace("<", "\\u003c")

@@ -122,7 +122,7 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
     if diagnosis.verdict == "none":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
         if rows:
-            seen = "Would have been seen, at half of the places where it can sit, from:"
+            seen = "Detection limits, at half of the places of each effect:"
             yield _Part(2, "sensitivity", [seen, *columns(rows, "   ")])
     if large := large_text(diagnosis):
         yield _Part(3, "notes", wrapped(f"{LARGE_TITLE}: {large}", "Note: ", width))

@@ -1,4 +1,4 @@
-"""What only a hierarchical fit reports: held-out figures, errors, what may be missing."""
+"""Sections that only a hierarchical fit reports: held-out residuals, errors, missing effects."""
 
 from collections.abc import Iterable
 
@@ -16,11 +16,12 @@ from tmlattice.report.text import columns, wrapped
 SHOWN = 8
 """Largest errors of each effect that are listed."""
 PULLS = 4
-"""Gradients that are pulled apart, of those that are listed."""
+"""Inconsistent gradients that are listed."""
 
 
 def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
-    """Effect (of the first step, what the model is), parameters, and held-out figures in µm."""
+    """Rows of the table of steps: effect (in the first step the model), parameters, held-out rms in
+    µm."""
     return [
         (
             (model if step.effect == "design" else "") or step.effect,
@@ -37,7 +38,7 @@ def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
 
 
 def three_digits(metres: float) -> str:
-    """Three digits; nothing where nothing was read."""
+    """A length in µm with three digits; empty where nothing was read."""
     return f"{1e6 * metres:.3g}" if np.isfinite(metres) else ""
 
 
@@ -51,7 +52,8 @@ HYPOTHESIS = (
 
 
 def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
-    """Each hypothesis: amount and its error (of several: rms, typical error), held-out figures."""
+    """Rows of the table of hypotheses: amount and error (of several: rms, typical error), held-out
+    rms."""
     return [
         (
             row.effect,
@@ -70,8 +72,8 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
 
 
 def largest(result: Diagnosis, effect: str) -> list[str]:
-    """The errors of an effect that the data determine, those furthest from zero, with their
-    posterior rms and how much of each comes from the data."""
+    """The largest errors of an effect that the data determine, with posterior rms and the share
+    that comes from the data."""
     supports = _supports_of(result, effect)
     rows = [row for row in _numbers_of(result, effect) if supports[row[0][0].element].determined]
     rows = sorted(rows, key=lambda row: -abs(row[0][0].amount))
@@ -84,8 +86,8 @@ def largest(result: Diagnosis, effect: str) -> list[str]:
 
 
 def undetermined(result: Diagnosis, effect: str) -> str:
-    """Numbers of an effect that the data do not determine, and what they are degenerate with; empty
-    if there are none."""
+    """Amounts of an effect that the data do not determine, with what they are degenerate with;
+    empty if there are none."""
     supports = _supports_of(result, effect)
     names = [
         (all_of([own.element for own in places], result.devices), supports[places[0].element])
@@ -103,7 +105,7 @@ NOT_DETERMINED = "not determined by the data"
 
 
 def _supports_of(result: Diagnosis, effect: str) -> dict[str | None, Support]:
-    """By element."""
+    """Support by element."""
     return {c.element: support for c, _, support in result.supported if c.effect == effect}
 
 
@@ -113,8 +115,8 @@ def _numbers_of(result: Diagnosis, effect: str) -> list[tuple[tuple[Cause, ...],
 
 
 def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
-    """By effect: how many amounts with the rms of those that the data determine, and the largest of
-    these; and which are not determined."""
+    """By effect: the number of amounts, the rms and the largest of those that the data determine,
+    and those that are not determined."""
     rows = []
     for effect in dict.fromkeys(cause.effect for cause in result.causes):
         supports = _supports_of(result, effect)
@@ -130,12 +132,13 @@ def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
 
 
 SURE = 0.95
-"""Probability of a reason from which on no doubt is told."""
-REASON = ("what shares an error", "gradients", "magnets", "chi2", "which would be made by")
+"""Probability of a common factor from which on its probability is not printed."""
+REASON = ("common factor", "gradients", "magnets", "chi2", "possible cause")
 
 
 def common_factor_rows(result: Diagnosis) -> list[tuple[str, ...]]:
-    """The few numbers behind the gradients: name, amount in %, magnets, chi-square, makes."""
+    """Rows of the table of common factors: name, amount in %, magnets, chi-square, possible
+    cause."""
     found = () if result.common_factors is None else result.common_factors.common_factors
     return [
         (
@@ -150,40 +153,43 @@ def common_factor_rows(result: Diagnosis) -> list[tuple[str, ...]]:
 
 
 def _doubted(own: Reason) -> str:
-    """What may stand in a reason's place, or else how likely it is there."""
+    """The alternative to a common factor, or else its probability."""
     if own.rivals:
         name, probability = own.rivals[0]
         return f" (or {name}, {100 * probability:.0f} %)"
-    return "" if own.probability > SURE else f" (likely to {100 * own.probability:.0f} %)"
+    return "" if own.probability > SURE else f" (probability {100 * own.probability:.0f} %)"
 
 
 def common_factors_sentence(result: Diagnosis) -> str:
-    """How much they hold, and what is left; empty where no gradients were fitted."""
+    """The share that common factors explain, and the scatter of single magnets; empty without
+    gradients."""
     own = result.common_factors
     if own is None:
         return ""
     families = (
-        f" Families differ by {100 * own.between:.2g} % (rms), each by a calibration of its own; "
-        "those are told that stand out by five standard deviations."
+        f" Families differ by {100 * own.between:.2g} % (rms), each by its calibration; "
+        "the table lists those above five standard deviations."
         if own.between
         else ""
     )
     if not own.common_factors:
         return (
-            "Nothing stands out that magnets share; their gradients scatter by "
+            "No common factor was detected; the gradients scatter by "
             f"{100 * own.scatter:.2g} % (rms).{families}"
         )
     return (
-        f"These few numbers hold {100 * own.share:.0f} % of the gradients' mean square; single "
-        f"magnets scatter about what they share by {100 * own.scatter:.2g} % (rms).{families}"
+        f"Common factors explain {100 * own.share:.0f} % of the gradients' mean square; single "
+        f"magnets scatter about them by {100 * own.scatter:.2g} % (rms).{families}"
     )
 
 
-INSTEAD = "The same gradients may be told otherwise:"
+INSTEAD = "Alternative common factors of the same gradients:"
+OUTLIERS = "Outliers, for which a fault other than a gradient error is likely:"
+REJECTED = "Rejected, because they increase the held-out residual or their amount is implausible:"
 
 
 def instead_texts(result: Diagnosis) -> list[str]:
-    """Other sets of reasons for the same gradients: what is otherwise in them."""
+    """Alternative sets of common factors: what differs in each of them."""
     found = result.common_factors
     if found is None:
         return []
@@ -204,7 +210,7 @@ def instead_texts(result: Diagnosis) -> list[str]:
 
 
 def outlier_texts(result: Diagnosis) -> list[str]:
-    """Magnets that no sound magnet is like, with the neighbours that they pull against."""
+    """Outlier magnets, with the neighbours that they are correlated with."""
     said = []
     for own in () if result.common_factors is None else result.common_factors.outliers[:SHOWN]:
         text = f"{own.element} {100 * own.amount:+.1f} ± {100 * own.amount_sigma:.1f} %"
@@ -212,53 +218,54 @@ def outlier_texts(result: Diagnosis) -> list[str]:
             f"{name} ({100 * amount:+.1f} %, correlation {correlation:+.2f})"
             for name, amount, correlation in own.against
         )
-        said.append(f"{text}; it pulls against {pulls}" if pulls else text)
+        said.append(f"{text}; it is correlated with {pulls}" if pulls else text)
     return said
 
 
 def inconsistency_texts(result: Diagnosis) -> list[str]:
-    """That the RF's orbit and the correctors disagree, and about which gradients."""
+    """The inconsistency of the RF's orbit with the correctors, and the gradients that it
+    concerns."""
     found = result.inconsistencies
     if found is None:
         return []
     first = (
-        "The RF's orbit and the correctors' responses pull gradients apart: by what the latter ask "
-        f"for, the former is missed by {1e6 * found.missed:.2g} µm, where gradients that make all "
-        f"of it would miss it by {1e6 * found.known:.2g} µm "
+        "The RF's orbit and the correctors' responses are inconsistent: with the gradients of the "
+        f"latter, the residual of the former is {1e6 * found.missed:.2g} µm; gradients fitted to "
+        f"it would leave {1e6 * found.known:.2g} µm "
         f"({found.chi2 / found.readings:.1f} of chi² per reading)."
     )
     return [
         first,
         *(
-            f"{own.name} {100 * own.correctors:+.2f} ± {100 * own.correctors_sigma:.2f} % by the "
-            f"correctors, {100 * own.with_rf:+.2f} ± {100 * own.with_rf_sigma:.2f} % if it has to "
-            f"make the RF's orbit ({abs(own.pull):.0f} standard deviations of the difference)"
+            f"{own.name} {100 * own.correctors:+.2f} ± {100 * own.correctors_sigma:.2f} % from the "
+            f"correctors, {100 * own.with_rf:+.2f} ± {100 * own.with_rf_sigma:.2f} % when the "
+            f"RF's orbit is fitted ({abs(own.pull):.0f} standard deviations of the difference)"
             for own in found.pulls[:PULLS]
         ),
     ]
 
 
 def left_sentence(result: Diagnosis) -> str:
-    """How many patterns hold the remaining residual."""
+    """The share of the remaining residual that eight patterns explain."""
     x, y = result.unexplained["patterns"]["low_rank"]
     return (
-        f"Eight patterns hold {100 * x:.0f} % of the remaining residual of fitted readings in x "
+        f"Eight patterns explain {100 * x:.0f} % of the remaining residual of fitted readings in x "
         f"and {100 * y:.0f} % in y."
     )
 
 
 def bad_monitors_text(result: Diagnosis) -> str:
-    """Their names."""
+    """The rejected BPMs in a sentence."""
     names = [labelled(name, result.devices) for name in result.bad_monitors]
     return f"Rejected BPMs: {', '.join(names) or 'none'}"
 
 
 def steps_text(result: Diagnosis, width: int) -> list[str]:
-    """The section of a plain text, in lines."""
+    """The section of the plain text, as lines."""
     lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
     lines += columns([HEAD, *step_rows(result.steps, result.ring.model)], right=True)
     if result.rejected_steps:
-        lines += ["", "Closed, for held-out readings are worse with them, or no beam has so much:"]
+        lines += ["", REJECTED]
         lines += columns([HEAD, *step_rows(result.rejected_steps)], right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.common_factors is not None:
@@ -274,7 +281,7 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
                 lines += wrapped(text, "   ", width)
         outliers = outlier_texts(result)
         if outliers:
-            lines += ["", "Further off than magnets are, so that something else is likely there:"]
+            lines += ["", OUTLIERS]
             for text in outliers:
                 lines += wrapped(text, "   ", width)
         for i, text in enumerate(inconsistency_texts(result)):
@@ -285,9 +292,9 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     if result.hypotheses:
         lines += [
             "",
-            "What may be missing: held-out rms in µm, each alone, and on top of those that help:",
+            "Missing effects: held-out rms in µm, each alone, and on top of those that improve:",
         ]
         lines += columns([HYPOTHESIS, *hypothesis_rows(result)], right=True)
     for said in result.degenerate:
-        lines += wrapped(f"Not settled by the data: {said}.", "", width)
+        lines += wrapped(f"Not determined by the data: {said}.", "", width)
     return lines

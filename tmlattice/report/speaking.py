@@ -1,4 +1,4 @@
-"""A diagnosis that is asked for its report: `diagnosis.report()`, `diagnosis.save(folder)`."""
+"""Report and files of a diagnosis: `diagnosis.report()`, `diagnosis.save(folder)`."""
 
 from contextlib import suppress
 from os import PathLike
@@ -46,8 +46,7 @@ def write_files(
     document: dict[str, Any],
     correction: Correction | None = None,
 ) -> None:
-    """The files of `save`, of a document that may state more than the diagnosis' own; and of a
-    correction the settings."""
+    """Write the files of `save` for a given document, with the settings of a correction."""
     pictures = draw(diagnosis, folder, correction)
     html = page(diagnosis, pictures, document["provenance"], correction)
     if correction is not None:
@@ -109,13 +108,13 @@ def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path
 
 
 def write_correction(correction: Correction, folder: Path) -> None:
-    """The files of `save_correction`, into a folder that is there."""
+    """Write the files of `save_correction` into an existing folder."""
     write_settings(correction, folder)
     (folder / "report.html").write_text(correction_page(correction, folder), encoding="utf-8")
 
 
 def write_settings(correction: Correction, folder: Path) -> None:
-    """The settings and what is expected of them."""
+    """Write the settings and the expected result."""
     (folder / "settings.csv").write_text(correction.table(), encoding="utf-8")
     (folder / "correction.txt").write_text(correction_text(correction) + "\n", encoding="utf-8")
     for name, suffix in (("madx", "madx"), ("at", "at.py"), ("elegant", "ele")):

@@ -1,4 +1,4 @@
-"""Tables of the page: every error with its own error, and all that a reader has to know.
+"""Tables of the page: every error with its standard error, and the notes.
 
 >>> [table.title for table in error_tables(diagnosis)]
 """
@@ -19,10 +19,10 @@ from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
 from tmlattice.report.text import times_usual
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
-"""By the group of an effect; all other elements are magnets."""
+"""Titles by the group of an effect; all other elements are magnets."""
 
 Supported = tuple[Cause, float, Support]
-"""A cause, its error, and how much of it comes from the data."""
+"""A cause, its standard error, and its support by the data."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class Table:
 
 
 def error_tables(diagnosis: Diagnosis) -> list[Table]:
-    """Magnets, monitors, correctors and the beam of a hierarchical fit, value and error of each."""
+    """Tables of magnets, BPMs, correctors and the beam of a hierarchical fit, value and error of
+    each."""
     grouped: dict[str, list[Supported]] = {}
     for row in diagnosis.supported:
         title = TITLES.get(find(row[0].effect).group, "Magnets")
@@ -54,15 +55,15 @@ def error_tables(diagnosis: Diagnosis) -> list[Table]:
     ]
 
 
-def _table(diagnosis: Diagnosis, title: str, told: Sequence[Supported]) -> Table:
-    effects = list(dict.fromkeys(cause.effect for cause, *_ in told))
+def _table(diagnosis: Diagnosis, title: str, supported: Sequence[Supported]) -> Table:
+    effects = list(dict.fromkeys(cause.effect for cause, *_ in supported))
     places = {element.name: element.s for element in diagnosis.ring.elements}
-    known = {(c.element or "", c.effect): (c.amount, sigma, own) for c, sigma, own in told}
+    known = {(c.element or "", c.effect): (c.amount, sigma, own) for c, sigma, own in supported}
     units = {}
     for effect in effects:
-        rms = np.sqrt(np.mean([c.amount**2 for c, *_ in told if c.effect == effect]))
+        rms = np.sqrt(np.mean([c.amount**2 for c, *_ in supported if c.effect == effect]))
         units[effect] = scaled(effect, float(rms))
-    names = list(dict.fromkeys(cause.element or "" for cause, *_ in told))
+    names = list(dict.fromkeys(cause.element or "" for cause, *_ in supported))
 
     def clearest(name: str) -> float:
         own = (known.get((name, effect), (0.0, 1.0, FREE)) for effect in effects)
@@ -95,7 +96,7 @@ def _table(diagnosis: Diagnosis, title: str, told: Sequence[Supported]) -> Table
 
 
 def _digits(error: float) -> int:
-    """That show an error with two digits."""
+    """Digits that show an error with two significant digits."""
     return int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
 
 
@@ -104,18 +105,17 @@ def _number(value: float, digits: int) -> str:
 
 
 MOST = 8
-"""Readings left out that a note names."""
+"""Outliers that a note names."""
 
 
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """The stored beam by the design and as found, of the energy that the magnets are set for
-    whatever it has: (what, design, found). The closed orbit only where it was measured or errors
-    that were found move it. Empty where no error of the ring was found."""
+    """The stored beam on energy, of the design and estimated: (quantity, design, estimated). The
+    closed orbit is listed where it was measured or is changed. Empty without errors of the ring."""
     effects = (find(cause.effect) for cause in diagnosis.causes)
     if not any(isinstance(own, RingEffect) and not own.acts_on_settings for own in effects):
         return []
-    told = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
-    moved = told.found is not None and max(told.found.orbit_rms) > SETTLED.orbit_rms[0]
+    beams = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
+    moved = beams.found is not None and max(beams.found.orbit_rms) > SETTLED.orbit_rms[0]
     orbit = moved or "closed_orbit" in diagnosis.assessment.measured
 
     def pair(values: Sequence[float] | None, factor: float, digits: int) -> str:
@@ -124,10 +124,10 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         return " / ".join(f"{factor * value:.{digits}f}" for value in values)
 
     def row(name: str, field: str, factor: float, digits: int) -> tuple[str, str, str]:
-        found: Beam | None = told.found
+        found: Beam | None = beams.found
         return name, "", pair(None if found is None else getattr(found, field), factor, digits)
 
-    tunes = pair(told.design, 1, 5), pair(None if told.found is None else told.found.tunes, 1, 5)
+    tunes = pair(beams.design, 1, 5), pair(None if beams.found is None else beams.found.tunes, 1, 5)
     return [
         ("fractional tunes, x / y", *tunes),
         row("beta beating, rms [%]", "beta_beat_rms", 100, 2),
@@ -139,28 +139,29 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 def optics_head(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Head of `optics_rows`."""
-    return "stored beam on energy", diagnosis.ring.model, "as found"
+    return "stored beam on energy", diagnosis.ring.model, "estimated"
 
 
 def number_head(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Head of `number_rows`."""
-    return "tunes", "read", diagnosis.ring.model, "as found"
+    return "tunes", "read", diagnosis.ring.model, "estimated"
 
 
 def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
-    """Tunes and chromaticities: (which, read with its error, of the design, of the ring as found).
+    """Tunes and chromaticities: (name, measured with its error, of the design, of the estimated
+    ring).
 
     With the measurement and the shot where there are several.
     """
     rows: list[tuple[str, ...]] = []
-    told = [part for part in diagnosis.parts if part.numbers]
-    for part in told:
+    with_numbers = [part for part in diagnosis.parts if part.numbers]
+    for part in with_numbers:
         several = len({number.shot for number in part.numbers}) > 1
         for number in part.numbers:
             kind, _, plane = number.quantity.partition("_")
             name = f"Q{plane}" if kind == "tune" else f"chromaticity {plane}"
             name += f", shot {number.shot + 1}" if several else ""
-            name = f"{part.label}: {name}" if len(told) > 1 else name
+            name = f"{part.label}: {name}" if len(with_numbers) > 1 else name
             digits = _digits(number.error)
             read, *models, error = (
                 f"{value:.{digits}f}"
@@ -171,11 +172,11 @@ def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
 
 
 LARGE = 3.0
-"""Times the usual size, from which on small errors are no longer what a sound ring has."""
+"""Ratio to the usual size from which on distributed errors can hide faults."""
 
 
 def large_text(diagnosis: Diagnosis) -> str:
-    """Small errors that are larger than a sound ring's: single faults may pass for them."""
+    """A sentence about distributed errors that are large enough to hide single faults."""
     if diagnosis.by_steps:
         return ""
     large = []
@@ -188,18 +189,18 @@ def large_text(diagnosis: Diagnosis) -> str:
     text = f"{', '.join(large)}: they can hide faults"
     if diagnosis.assessment.reference:
         return text
-    return f"{text}, which a measurement of this machine from before (--reference) would show"
+    return f"{text}, which an earlier measurement of this machine (--reference) would show"
 
 
-LARGE_TITLE = "small errors larger than usual"
+LARGE_TITLE = "large distributed errors"
 
 
 def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """All that limits what was said, in one place: (what, text).
+    """Notes on what limits the diagnosis: (title, text).
 
     Args:
         diagnosis: of `diagnose`.
-        provenance: its own, or one that also says what was assumed of files.
+        provenance: its own, or one that also states what was assumed of files.
     """
     for warning in diagnosis.warnings:
         yield "warning", warning
@@ -215,10 +216,10 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
             for row in diagnosis.outliers
         ]
         more = f" and {len(places) - MOST} more" if len(places) > MOST else ""
-        yield "readings left out", ", ".join(places[:MOST]) + more
+        yield "outliers", ", ".join(places[:MOST]) + more
     for name in diagnosis.provenance["options"].get("assume", ()):
         yield "assumed of the data", f"{name}: {ASSUMPTIONS[name].words}"
     for said in provenance.get("assumed_of_files", ()):
         yield "assumed of the files", said
     for said in diagnosis.degenerate:
-        yield "not settled by the data", said
+        yield "not determined by the data", said

@@ -1,4 +1,4 @@
-"""What a diagnosis says, in the words of a control room.
+"""Sentences and rows of a report, for the terminal (`plain.report_text`) and the HTML page.
 
 The same sentences and rows stand in the terminal (`plain.report_text`) and in the HTML page.
 """
@@ -36,7 +36,7 @@ __all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  #
 
 # --- words for parts ------------------------------------------------------------------------------
 def place_text(finding: Finding) -> str:
-    """Where a finding sits: metres, and the monitors on both sides."""
+    """The place of a finding: metres, and the BPMs on both sides."""
     devices = finding.devices
     if finding.s is None and finding.elements:
         return f"at {' and '.join(labelled(name, devices) for name in finding.elements)}"
@@ -56,12 +56,12 @@ def place_text(finding: Finding) -> str:
 
 
 HARDLY = 0.5
-"""Relative error of the rms of small errors above which the readings do not determine it."""
+"""Relative error of an rms above which the readings do not determine it."""
 
 
 def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Small errors everywhere: (effect, rms; and, where the readings determine it, how many times
-    the usual one)."""
+    """Distributed errors: (effect, rms; where the readings determine it, its ratio to the usual
+    one)."""
     rows = []
     for name, rms in diagnosis.priors.items():
         if name in CATALOGUE and not diagnosis.by_steps:
@@ -76,8 +76,8 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 def times_usual(diagnosis: Diagnosis, name: str) -> float | None:
-    """The rms of small errors of an effect over the usual one; None where that is not determined:
-    its relative error is too large, or the model lacks an effect, which they would take up."""
+    """The rms of distributed errors of an effect over the usual one; None where it is not
+    determined, by a large relative error or because an effect is missing from the model."""
     usual = CATALOGUE[name].background if name in CATALOGUE else None
     error = diagnosis.prior_errors.get(name, np.inf)
     if not usual or error > HARDLY or diagnosis.assessment.remainder == "effect_missing":
@@ -87,7 +87,7 @@ def times_usual(diagnosis: Diagnosis, name: str) -> float | None:
 
 # --- the sentences --------------------------------------------------------------------------------
 def verdict_sentence(diagnosis: Diagnosis) -> str:
-    """What was found, in a sentence."""
+    """The verdict, as a sentence."""
     text = diagnosis.assessment.sentence("verdict") or _verdict_sentence(diagnosis)
     if not diagnosis.since_reference or diagnosis.verdict == "none":
         return text
@@ -110,24 +110,24 @@ def _located_sentence(diagnosis: Diagnosis) -> str:
     found = diagnosis.findings
     unknown = [f.where for f in found if f.effect is None and f.where and not f.words]
     where = "; ".join(f"{low:.1f} m to {high:.1f} m" for low, high in unknown)
-    acts = f"Something acts at s = {where}, and no effect of the catalogue explains it."
-    told = [f"{f.words[0].upper()}{f.words[1:]}." for f in found if f.words]
+    acts = f"Unexplained kick at s = {where}: no effect of the catalogue fits."
+    stated = [f"{f.words[0].upper()}{f.words[1:]}." for f in found if f.words]
     named = [_short(f) for f in found if f.effect is not None]
-    also = [f"Besides: {'; '.join(named)}."] if named else []
+    also = [f"Together with: {'; '.join(named)}."] if named else []
     also += [steps_sentence(diagnosis)] if _errors_in_steps(diagnosis) else []
-    return " ".join([*([acts] if unknown else []), *told, *also])
+    return " ".join([*([acts] if unknown else []), *stated, *also])
 
 
 def _errors_in_steps(diagnosis: Diagnosis) -> bool:
-    """Whether steps were kept that are errors of the ring, and no drifts since a reference."""
+    """Whether accepted steps are errors of the ring, not drifts since a reference."""
     return len(diagnosis.steps) > 1 and not diagnosis.since_reference
 
 
 def steps_sentence(diagnosis: Diagnosis) -> str:
-    """How far the steps go."""
+    """The residuals before and after all steps."""
     first, last = diagnosis.steps[0], diagnosis.steps[-1]
     return (
-        "Small errors all along the ring, or of correctors: with them the gap of fitted correctors "
+        "Distributed errors of the ring or of correctors: the rms residual of fitted correctors "
         f"falls from {micrometres(diagnosis.fit_before.rms)} to "
         f"{micrometres(diagnosis.fit_after.rms)}, that of held-out ones from "
         f"{micrometres(first.heldout_rms_in_plane)} to {micrometres(last.heldout_rms_in_plane)}"
@@ -138,7 +138,7 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
             else ""
         )
         + (
-            ", and that of the RF's response from "
+            ", of the RF's response from "
             f"{micrometres(first.dispersion_rms)} to {micrometres(last.dispersion_rms)}."
             if np.isfinite(last.dispersion_rms)
             else "."
@@ -151,7 +151,7 @@ def _short(finding: Finding) -> str:
         if finding.words:
             return finding.words
         low, high = finding.where or (float("nan"), float("nan"))
-        return f"something unnamed at {low:.1f} m to {high:.1f} m"
+        return f"an unexplained kick at {low:.1f} m to {high:.1f} m"
     return action_text(finding.recommended_action)
 
 
@@ -160,7 +160,7 @@ SAID = 2
 
 
 def _open(finding: Finding) -> str:
-    """A finding, and what else it may be."""
+    """A finding with its alternatives."""
     text, others = _short(finding), finding.recommended_actions[1:]
     if not others:
         return text
@@ -172,12 +172,11 @@ def _open(finding: Finding) -> str:
 
 
 def _after_families(diagnosis: Diagnosis) -> str:
-    """What to do after a fit of families: of the suspects, the gradients and the missing effect
-    those that there are."""
-    lacks = diagnosis.assessment.remainder == "effect_missing" and diagnosis.hypotheses is None
+    """The next step after a hierarchical fit: suspects, missing effect, gradients."""
+    missing = diagnosis.assessment.remainder == "effect_missing" and diagnosis.hypotheses is None
     steps = ["inspect the suspects"] if diagnosis.suspects else []
-    if lacks and not diagnosis.since_reference:
-        steps.append("weigh which effect the model lacks (--missing)")
+    if missing and not diagnosis.since_reference:
+        steps.append("compare missing effects (--missing)")
     if any(cause.effect == "quadrupole_gradient" for cause in diagnosis.causes):
         steps.append("set the gradients that --corrected-out writes")
     if not steps:
@@ -187,7 +186,7 @@ def _after_families(diagnosis: Diagnosis) -> str:
 
 
 def advice(diagnosis: Diagnosis) -> str:
-    """What to do next, where the result leaves something open and no shot was proposed."""
+    """What to do next if the result is open and no shot was proposed."""
     everywhere = _after_families(diagnosis)
     if diagnosis.verdict == "distributed" and diagnosis.by_steps:
         return everywhere
@@ -206,7 +205,7 @@ def advice(diagnosis: Diagnosis) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """What was found, short where the findings are listed below."""
+    """The verdict; short where the findings are listed below."""
     found = diagnosis.findings
     if len(found) < 2:
         return verdict_sentence(diagnosis)
@@ -222,7 +221,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def to_do(diagnosis: Diagnosis) -> list[str]:
-    """What to do next, the first first: repairs, then what would tell more."""
+    """What to do next, in order: corrections, then further measurements."""
     recommended_actions = [
         finding.recommended_action
         for finding in diagnosis.findings
@@ -239,20 +238,20 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 
 
 def gap_sentence(diagnosis: Diagnosis) -> str:
-    """How far the gap falls on the validation set."""
+    """The rms residual before and after, on the validation set."""
     rows = gap_rows(diagnosis)
-    judges = rows if diagnosis.heldout is None else rows[-1:]
-    return "; ".join(f"{name}: from {before} to {after}" for name, before, after in judges)
+    shown = rows if diagnosis.heldout is None else rows[-1:]
+    return "; ".join(f"{name}: from {before} to {after}" for name, before, after in shown)
 
 
 # --- the rows -------------------------------------------------------------------------------------
 def finding_rows(finding: Finding) -> list[tuple[str, str]]:
-    """What is known of a finding: (name, text)."""
+    """Rows of a finding: (name, text)."""
     rows = []
     recommended_action = finding.recommended_action
     if recommended_action is not None:
         rows += [
-            ("recommended_action", recommended_action.action),
+            ("recommended action", recommended_action.action),
             ("check", find(recommended_action.effect).to_check),
         ]
     elif finding.to_check:
@@ -266,12 +265,12 @@ def finding_rows(finding: Finding) -> list[tuple[str, str]]:
     rows.append(("seen", _seen_text(finding)))
     if finding.seen_by is not None and len(finding.seen_by) > 1:
         by = sorted(finding.seen_by.items(), key=lambda pair: -pair[1])
-        told = ", ".join(f"{100 * share:.0f} % {name}" for name, share in by if share > 0.005)
-        rows.append(("seen by", told))
+        shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in by if share > 0.005)
+        rows.append(("seen by", shares))
     if recommended_action is not None:
         rows.append(("mechanism", mechanism_text(recommended_action)))
     if len(finding.recommended_actions) > 1:
-        rows.append(("or else", or_text(finding, MOST)))
+        rows.append(("alternatives", or_text(finding, MOST)))
     return rows
 
 
@@ -293,12 +292,13 @@ def gap_head(diagnosis: Diagnosis) -> tuple[str, str, str]:
     if diagnosis.since_reference:
         model = "reference"
     elif gap is not None and gap.baseline:
-        model = f"{model} with small errors" if diagnosis.priors else "before"
-    return "readings less model, rms", model, "with what was found"
+        model = f"{model} with distributed errors" if diagnosis.priors else "before"
+    return "readings less model, rms", model, "with the findings"
 
 
 def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """The gap: (which readings, before, after), rms in µm and chi-square per reading."""
+    """Residuals of fitted and held-out readings, before and after: rms in µm and chi-square per
+    reading."""
     what = "correctors" if diagnosis.by_steps else "readings" if diagnosis.parts else "shots"
     rows = [(f"{what} of the fit", diagnosis.fit_before, diagnosis.fit_after)]
     if len(diagnosis.parts) > 1:
@@ -320,7 +320,7 @@ def _misfit_text(misfit: Misfit) -> str:
 
 
 def heldout_text(diagnosis: Diagnosis) -> str:
-    """Which readings are held out."""
+    """The held-out readings."""
     if diagnosis.kind == "trajectory":
         return f"shots {', '.join(map(str, diagnosis.heldout_shots))}"
     if not diagnosis.by_steps:
@@ -333,7 +333,7 @@ def _chi2(value: float) -> str:
 
 
 def noise_text(diagnosis: Diagnosis) -> str:
-    """The noise of a reading; empty where no monitor reads."""
+    """The noise of a reading; empty without readings."""
     if not np.isfinite(diagnosis.noise).any():
         return ""
     x, y = (micrometres(sigma) if np.isfinite(sigma) else "no reading"
@@ -353,17 +353,17 @@ def tune_texts(diagnosis: Diagnosis) -> tuple[str, str]:
 def sensitivity_rows(
     diagnosis: Diagnosis, effects: Iterable[str] | None = None
 ) -> list[tuple[str, str]]:
-    """By effect in words, the least amount that would have been seen at half of its places."""
+    """Detection limits: by effect, the least amount detectable at half of its places."""
     known = diagnosis.sensitivity
     chosen = known if effects is None else effects
     return [(words(name), least_text(name, known[name])) for name in chosen if name in known]
 
 
-SUSPECTS = "Suspects, no findings: where to look first for a fault that was not detected."
+SUSPECTS = "Suspects, no findings: the first places to inspect for an undetected fault."
 
 
 def suspect_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """Where to look first for a fault that was not detected: (kind, where, which effect)."""
+    """Rows of the suspects: (kind, place, effect)."""
     return [(one.kind, _suspected(diagnosis, one), _suspicion(one)) for one in diagnosis.suspects]
 
 
@@ -390,7 +390,7 @@ CORRELATED = "Correlated amounts: the data determine a combination of the two be
 
 
 def correlation_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """Pairs of amounts that the data hardly separate: (one, other, correlation)."""
+    """Strongly correlated amounts: (one, other, correlation)."""
 
     def named(effect: str, element: str | None) -> str:
         return f"{words(effect)}, {labelled(element or 'the beam', diagnosis.devices)}"
@@ -403,7 +403,7 @@ def correlation_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 # --- lines of text --------------------------------------------------------------------------------
 def columns(rows: Sequence[Sequence[str]], indent: str = "", *, right: bool = False) -> list[str]:
-    """Cells under one another; all but the first to the right, or to the left."""
+    """Cells in aligned columns; all but the first aligned to the right, or all to the left."""
     sizes = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         indent
@@ -416,7 +416,7 @@ def columns(rows: Sequence[Sequence[str]], indent: str = "", *, right: bool = Fa
 
 
 def wrapped(text: str, label: str, width: int) -> list[str]:
-    """Lines of at most this width, the label before the first one."""
+    """Text wrapped to this width, with the label before the first line."""
     return textwrap.wrap(
         text,
         width,

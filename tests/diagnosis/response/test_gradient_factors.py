@@ -183,7 +183,7 @@ def test_other_sets_are_told_by_what_is_otherwise_in_them():
     told = SimpleNamespace(common_factors=found)
     assert [row[0] for row in common_factor_rows(told)] == [
         "qa",
-        "qb (likely to 60 %)",
+        "qb (probability 60 %)",
         "qc (or qd, 40 %)",
     ]
     assert instead_texts(told) == [

@@ -113,7 +113,7 @@ def test_small_errors_beside_it_are_told_too_and_it_takes_nobody_s_place(small_r
     assert [own.elements for own in found.findings if own.words] == [("v5",)]
     assert [own.element for own in found.findings if own.effect] == ["QD::5"]
     text = " ".join(found.report().split())
-    assert "Small errors all along the ring" in text
+    assert "Distributed errors" in text
     assert "--corrected-out" in text
 
 
