@@ -81,10 +81,9 @@ KINDS = {
     "drift": slice(WAVES, WAVES + 1),
     "place": slice(WAVES + 1, None),
 }
-"""Common modes of a step, by their patterns: beam jitter, a drift of the energy, and the field of
-the corrector at another place."""
-WAVED = ("waves in plane", "waves across")
-"""Names of the waves' kind, by block: they are admitted in each by itself."""
+"""Common modes of a step, by their patterns: beam jitter (in the plane that is not kicked: in the
+kicked plane it would absorb what gradients and the energy explain), a drift of the energy, and the
+field of the corrector at another place (in the kicked plane)."""
 DRIFT = 1e-4
 """First guess of the rms drift of the energy within a step, in RF steps."""
 PLACE = 3e-3
@@ -106,8 +105,7 @@ class Noise:
         size: prior rms of the amount of each common mode, [block, column, pattern].
         scale: of the kinds of common modes, [block, plane that is read, kind].
         waves: orbits of unit rms, [plane that is read, pattern, monitor].
-        kinds: of common modes that are admitted, names of `KINDS` or `WAVED`. Waves are admitted by
-            validation alone: they absorb what gradients should explain.
+        kinds: of common modes that are admitted, names of `KINDS`; waves by validation alone.
     """
 
     column: Array
