@@ -159,7 +159,7 @@ class State:
         kept: rows of the ring's variables, reused until the ring has moved.
         apart: numbers that are wrong alone.
         guessed: rms of the logarithm of a family's scale about its first guess.
-        closed: families that the validation set, or physics, has closed: their numbers are taken
+        rejected: families that the validation set, or physics, rejects: their numbers are taken
             for zero, and stated errors know that they may not be (those of the ring, where they are
             few).
         outcome: how the last fit ended.
@@ -177,7 +177,7 @@ class State:
     kept: Mapping[str, Kept] = field(default_factory=dict)
     apart: tuple[Apart, ...] = ()
     guessed: float = SCALE_SPREAD
-    explained: tuple[Family, ...] = ()
+    rejected: tuple[Family, ...] = ()
     outcome: Outcome | None = None
 
     def of_block(self, block: int) -> tuple[Family, ...]:
@@ -236,7 +236,7 @@ def allow(state: State, families: Sequence[Family]) -> State:
     more = [family for family in families if not state.allows(family.name)]
     state = replace(
         state, families=(*state.families, *more), values={**values, **state.values},
-        explained=tuple(family for family in state.explained if family.name not in names),
+        rejected=tuple(family for family in state.rejected if family.name not in names),
     )  # fmt: skip
     return state.moved(state.values) if begun else state
 
@@ -248,8 +248,8 @@ def forbid(state: State, families: Sequence[Family]) -> State:
     left = tuple(family for family in state.families if family.name not in names)
     values = {f.variable: state.values[f.variable] for f in left}
     groups = {name: group for name, group in state.groups.items() if name not in gone}
-    explained = (*state.explained, *families)
-    return replace(state, families=left, groups=groups, explained=explained).moved(values)
+    rejected = (*state.rejected, *families)
+    return replace(state, families=left, groups=groups, rejected=rejected).moved(values)
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:

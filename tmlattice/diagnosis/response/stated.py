@@ -73,11 +73,11 @@ def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -
 
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
-    """What unknown prior scales add to the covariance, those of closed families, too: F, of F F^T,
+    """What unknown prior scales add to the covariance, those of rejected families, too: F, of F F^T,
     [parameter, direction]; see `stated`."""
     tried = [
         family
-        for family in state.explained
+        for family in state.rejected
         if family.block == block and family.per == "ring" and family.size(state.data) <= MAX_MEMBERS
     ]
     whole = linear(allow(state, tried), block) if tried else there
