@@ -114,9 +114,9 @@ def one_action(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | No
         return None
     if result["verdict"] != "named" or len(result["findings"]) != 1:
         return False
-    told, true = result["findings"][0]["remedy"], leading(ring, cause)
-    places = (pieces_of(ring, name) for name in (told["element"], true.element))
-    return told["effect"] == true.effect and next(places) == next(places)
+    actions, true = result["findings"][0]["remedy"], leading(ring, cause)
+    places = (pieces_of(ring, name) for name in (actions["element"], true.element))
+    return actions["effect"] == true.effect and next(places) == next(places)
 
 
 def oracle_one_action(evaluated: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
@@ -124,8 +124,8 @@ def oracle_one_action(evaluated: Mapping[str, Any], cause: Cause, ring: Ring) ->
     (oracle,) = evaluated["oracles"]
     members = [m for m in oracle["posterior"] if m["probability"]]
     causes = [Cause(m["effect"], m["element"], m["amount"]) for m in members]
-    told = remedies_of(ring, causes, [m["probability"] for m in members])
-    first = max(told, key=lambda remedy: remedy.probability, default=None)
+    actions = remedies_of(ring, causes, [m["probability"] for m in members])
+    first = max(actions, key=lambda remedy: remedy.probability, default=None)
     if not oracle["detected"] or first is None or first.probability < DEFAULT.mass:
         return False
     true = leading(ring, cause)
