@@ -237,9 +237,9 @@ def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
     ("- {knob: QF, low: 2, high: 1}", "limits are 2 and 1"),
     ("- {knob: QF, curve: '0:0 1:1 2:0.5', unit: A, present: 1}", "must rise, or fall"),
     ("- {knob: QF, unit: A}", "state its present setting"),
-    ("- {knob: QF, step: much}", "no number"),
+    ("- {knob: QF, step: much}", "not a number"),
     ("- {knob: QF, colour: red}", "unknown column"),
-    ("- {knob: QF}\n- {knob: QF}", "stands twice"),
+    ("- {knob: QF}\n- {knob: QF}", "occurs twice"),
     ("- {knob: q, members: QF::1, kind: pump}", "no kind 'pump'"),
     ("knob: QF", "no list of knobs"),
 ])  # fmt: skip
