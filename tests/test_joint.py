@@ -347,10 +347,10 @@ def test_what_is_known_is_written_beside_the_lattice(small_ring, monday, tmp_pat
     assert (tmp_path / "twin.json.known.json").is_file()
     told = tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=0)
     assert told.stdout.startswith("NOTHING")
-    assert "is missing" not in told.stderr
+    assert "is not there" not in told.stderr
     (tmp_path / "twin.json").rename(tmp_path / "moved.json")
     moved = tmlattice("diagnose", "moved.json", "tuesday", cwd=tmp_path, check=0)
-    assert "'moved.json.known.json' is missing" in moved.stderr
+    assert "'moved.json.known.json' is not there" in moved.stderr
     (tmp_path / "moved.json").rename(tmp_path / "twin.json")
     tmlattice("diagnose", "twin.json", "tuesday", "--json", "twin.json.known.json",
               cwd=tmp_path, check=2)  # fmt: skip
