@@ -273,7 +273,7 @@ def test_written_folder_reads_back_as_the_measurement(simulation, tmp_path):
     )  # fmt: skip
 
 
-def test_folder_tells_nothing_of_the_truth(simulation, tmp_path):
+def test_folder_contains_nothing_of_the_truth(simulation, tmp_path):
     simulation.write(tmp_path / "day", progress=False)
     files = sorted(path.name for path in (tmp_path / "day").iterdir())
     assert files == ["measurement.json", "readings.csv"]

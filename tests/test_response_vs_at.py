@@ -207,7 +207,7 @@ def test_refusals(small_ring):
     model = ResponseModel(small_ring)
     with pytest.raises(UnknownNameError, match="did you mean"):
         model.response(["v33"])
-    with pytest.raises(MeasurementError, match="no corrector"):
+    with pytest.raises(MeasurementError, match="not a corrector"):
         model.response(["QF::0"])
     with pytest.raises(EffectError, match="does not act on the ring"):
         derivatives(model, [("monitor_gain_x", "last_a")])

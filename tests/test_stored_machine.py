@@ -212,7 +212,7 @@ def test_same_seed_same_readings_and_more_shots_keep_the_first(tiny):
     assert not np.array_equal(one, readings(shots=2, seed=5))
 
 
-def test_truth_says_what_was_done(tiny):
+def test_truth_states_what_was_done(tiny):
     simulation = simulate_turns(tiny, CAUSES, turns=20, particles=2, background={"all": None})
     truth = simulation.truth()
     assert [e["effect"] for e in truth["effects"]] == [c.effect for c in CAUSES]

@@ -259,7 +259,7 @@ def test_symplectic_directions_are_all_and_only_those_without_defect(small_netwo
     assert np.abs(conditions @ rows.T).max() < 1e-5 * size  # OCELOT's own defect is 2e-6
 
 
-def test_the_designs_network_says_nothing(small_ring, small_network, measurement, effects):
+def test_the_designs_network_has_no_score(small_ring, small_network, measurement, effects):
     reading = read_network(small_ring, small_network, measurement, effects)
     assert not reading.raw.any()
     assert not reading.amount.any()

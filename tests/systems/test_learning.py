@@ -49,7 +49,7 @@ def test_error_is_the_spread_of_repeated_measurements():
     assert abs(np.mean(found) - weights_of(truth)[1, 1]) < 4 * np.mean(errors) / np.sqrt(40)
 
 
-def test_missing_observations_are_left_out():
+def test_missing_observations_are_ignored():
     truth = taylor_map_of_ode(DAMPED, 3, 0.3)
     seen = follow(truth, [0.5, 0.0], 40)
     seen[5:9] = np.nan

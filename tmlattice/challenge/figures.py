@@ -107,8 +107,8 @@ def together(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _known_share(rows: Sequence[Row], name: str) -> dict[str, Any]:
     """Rate over the cases in which this flag is known."""
-    told = [row.get(name) for row in rows]
-    return rate([flag for flag in told if flag is not None])
+    flags = [row.get(name) for row in rows]
+    return rate([flag for flag in flags if flag is not None])
 
 
 def _exact(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:

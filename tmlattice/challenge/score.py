@@ -107,7 +107,7 @@ def score(
                 results[name], truths[name], evaluated.get(name), guessed.get(name), places
             )
             row |= clean_gap(ring, partial(read_case, folder, name), truths[name], results[name])
-            summary([row], described["tier"])  # values that nobody can count spoil no other case
+            summary([row], described["tier"])  # invalid values spoil no other case
         except (
             ArithmeticError, LookupError, TypeError, ValueError, AttributeError, TmlatticeError
         ) as error:  # fmt: skip

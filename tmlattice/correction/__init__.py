@@ -146,7 +146,7 @@ def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
 
 
 def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
-    """What the result says."""
+    """Fields of the result."""
     problem, targets = end.problem, end.problem.targets
     rows = targets.rows(begin.open)
     change = 2 * rows @ (begin.rows - end.rows)

@@ -14,13 +14,13 @@ ALIKE = 3.0
 def advice(methods: Sequence[MethodFit]) -> str:
     """Return a few sentences: the recommended method, and why the others differ."""
     best = trusted(methods)
-    told = [_recommended(methods, best)]
+    sentences = [_recommended(methods, best)]
     for method in methods:
         if method.method != "adam" and method is not best and best is not None:
-            told.append(_compared(method, best))
+            sentences.append(_compared(method, best))
         elif method.method == "adam":
-            told.append(_recipe(method))
-    return " ".join(sentence for sentence in told if sentence)
+            sentences.append(_recipe(method))
+    return " ".join(one for one in sentences if one)
 
 
 def _recommended(methods: Sequence[MethodFit], best: MethodFit | None) -> str:

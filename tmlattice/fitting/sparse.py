@@ -237,9 +237,9 @@ def _refined(found: Explanation) -> Fit:
 
 def _spread(turn: RingTunes, best: Fit, tunes: Array, found: Explanation) -> Array:
     """Standard error of the tunes [2] over all explanations refitted last."""
-    others = [rival.fit for named in found.named for rival in named.alternatives[1:]]
+    others = [one.fit for named in found.named for one in named.alternatives[1:]]
     total, weights = np.zeros((2, 2)), 0.0
-    for one in [best, *others, *(rival.fit for rival in found.beyond)]:
+    for one in [best, *others, *(one.fit for one in found.beyond)]:
         weight = float(np.exp(one.log_evidence - best.log_evidence))
         if not weight > NEGLIGIBLE:
             continue

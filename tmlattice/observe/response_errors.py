@@ -175,10 +175,10 @@ class ResponseGlobalErrors:
     def verdicts(self, most: int = 4) -> list[ResponseVerdict]:
         """Return global errors one after another, each with those before it corrected."""
         found: list[ResponseVerdict] = []
-        judge = self
-        while len(found) < most and (own := judge.verdict()) is not None:
+        search = self
+        while len(found) < most and (own := search.verdict()) is not None:
             found.append(own)
-            judge = judge.corrected(own.names)
+            search = search.corrected(own.names)
         return found
 
     def corrected(self, names: Names) -> "ResponseGlobalErrors":

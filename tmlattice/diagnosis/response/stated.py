@@ -73,7 +73,7 @@ def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -
 
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
-    """What unknown prior scales add to the covariance, those of rejected families, too: F, of F F^T,
+    """What unknown prior scales add to the covariance, rejected families included: F, of F F^T,
     [parameter, direction]; see `stated`."""
     tried = [
         family
