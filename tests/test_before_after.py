@@ -446,7 +446,7 @@ def test_a_change_is_one_of_the_ring_at_its_beams_energy(small_ring):
     assert {(own.effect, own.element.casefold()) for own in change.findings} == {
         (own.effect, own.element.casefold()) for own in CHANGED
     }
-    (told,) = [said for said in change.warnings if "off the nominal energy by" in said]
+    (told,) = [said for said in change.warnings if "differs from the nominal energy by" in said]
     assert float(told.split(" by ")[1].split()[0]) == pytest.approx(
         energy.amount, rel=0.1
     )  # gradients take some

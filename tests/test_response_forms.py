@@ -60,7 +60,7 @@ def of_plane(plane):
     [
         (in_plane_alone, "no corrector is read in the other plane"),
         (of_plane("y"), "no corrector kicks in x"),
-        (y_monitors, "no monitor reads x"),
+        (y_monitors, "no BPM reads x"),
     ],
     ids=["in-plane readings alone", "y alone", "monitors of y alone"],
 )
@@ -170,6 +170,6 @@ def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_
         response[place] += 20 * np.nanstd(response)
     data = replace(whole, response=response)
     measured, (said,) = without_gross(data, response_data(small_ring, data))
-    assert said.endswith(f"left out: 4; most at {whole.correctors[2]} (2)")
+    assert said.endswith(f"rejected: 4; most at {whole.correctors[2]} (2)")
     gone = np.isnan(measured.response) & np.isfinite(response)
     assert [tuple(place) for place in np.argwhere(gone)] == places

@@ -87,7 +87,7 @@ def test_readings_that_went_wrong_are_left_out_by_the_fit_and_their_monitors_sta
     fit = fit_families(data, split, FAMILIES[:4])
     (said,) = fit.messages
     assert said.startswith("single readings that differ from the fit by 20 times")
-    assert "left out: 12" in said
+    assert "rejected: 12" in said
     assert np.isnan(fit.state.data.orbits).sum() == 12
     assert fit.state.good.all()
     assert fit.steps[-1].heldout_chi2_per_dof < 1.5
@@ -131,7 +131,7 @@ def test_steps_that_some_monitors_read_too_early_are_left_out_and_named(small_ri
     ).messages  # gains may break triples, too
     fit = fit_families(data, split, FAMILIES[:4])
     (said,) = fit.messages
-    told_of = said.split("left out: ")[1].split(";")[0].split(", ")
+    told_of = said.split("rejected: ")[1].split(";")[0].split(", ")
     assert sorted(own.split(" (")[0] for own in told_of) == sorted(names[c] for c in columns)
     assert fit.steps[-1].heldout_chi2_per_dof < 1.5
     assert not fit.state.split.held[columns].any()
@@ -291,8 +291,8 @@ def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
     (told_of,) = swapped_monitors(fitted(small_ring, wrong), clean.monitors)
     assert sorted(told_of) == sorted(pair)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
-    assert any("monitors that answer each as the other one should" in s for s in found.warnings)
-    assert not any("resemble nothing" in said for said in found.warnings)
+    assert any("monitors with swapped labels, corrected" in s for s in found.warnings)
+    assert not any("cannot describe" in said for said in found.warnings)
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
 
 
@@ -319,7 +319,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     assert found.verdict == "localised"
     (one,) = found.findings
     assert set(one.elements) == set(pair)
-    assert one.words == f"{what} {' and '.join(one.elements)} answer each as the other one should"
+    assert one.words == f"{what} {' and '.join(one.elements)} respond each as the other one should"
     # chi-square as it was read, less that of sound readings: a free gain has taken some of it
     own = response_data(small_ring, wrong)
     model = Predicted(own, Errors.none(own)).read

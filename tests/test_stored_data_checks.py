@@ -52,7 +52,7 @@ def test_small_errors_are_nothing_global(small_ring, sound, kind):
 
 
 CHANGES = {
-    "planes are exchanged": lambda values: values[..., ::-1],
+    "planes are swapped": lambda values: values[..., ::-1],
     "shifted by +1": lambda values: np.roll(values, 1, axis=-2),
     "shifted by -2": lambda values: np.roll(values, -2, axis=-2),
     "reverse order": lambda values: values[..., ::-1, :],
@@ -71,7 +71,7 @@ def test_turns_that_are_numbered_backwards(small_ring, sound):
 
 def test_a_sign_a_unit_and_the_planes_of_a_dispersion(small_ring, sound):
     data = sound["dispersion"]
-    assert "exchanged" in wrong_in(small_ring, step(data, lambda values: values[..., ::-1]))
+    assert "swapped" in wrong_in(small_ring, step(data, lambda values: values[..., ::-1]))
     assert "the sign" in wrong_in(small_ring, step(data, lambda values: -values))
     assert "1000 times too small" in wrong_in(small_ring, step(data, lambda v: 1e-3 * v))
 
@@ -108,7 +108,7 @@ def test_orbits_whose_correctors_were_set_tell_their_sign(small_ring):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda q: q[:, ::-1], "the tunes are exchanged"),
+        (lambda q: q[:, ::-1], "the tunes are swapped"),
         (lambda q: 1 - q, "both are 1 - Q"),
         (lambda q: np.array([[1 - q[0, 0], q[0, 1]]]), "Qx is 1 - Qx"),
         (lambda q: np.full((1, 2), 0.44), "not the ring's"),

@@ -101,17 +101,17 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
     there = assembly(ring)
     design = _optics(there, {})
     found = _relative(design, _optics(there, _changed(ring, ring, causes)))
-    told: dict[Hypothesis, Consequences] = {}
+    each: dict[Hypothesis, Consequences] = {}
     for cause in felt:
         others = [c for c in causes if c is not cause]
-        mended, by_hand = compensated(ring, [cause])
-        changed = _changed(ring, mended, others if by_hand else causes)
-        told[cause.effect, cause.element] = Consequences(
+        corrected, by_hand = compensated(ring, [cause])
+        changed = _changed(ring, corrected, others if by_hand else causes)
+        each[cause.effect, cause.element] = Consequences(
             None if design is None else _pair(design.tunes),
             found,
             _relative(design, _optics(there, changed)),
         )
-    return told
+    return each
 
 
 def beam_with(ring: Ring, causes: Sequence[Cause]) -> Consequences:
@@ -139,11 +139,11 @@ def _felt(effect: str) -> bool:
     return isinstance(kind, RingEffect) and not kind.acts_on_settings and not kind.natural
 
 
-def _changed(ring: Ring, mended: Ring, causes: Sequence[Cause]) -> dict[int, Element]:
+def _changed(ring: Ring, corrected: Ring, causes: Sequence[Cause]) -> dict[int, Element]:
     """Elements that differ from the ring's where causes act on a ring with other settings."""
-    both = enumerate(zip(ring.elements, mended.elements, strict=True))
+    both = enumerate(zip(ring.elements, corrected.elements, strict=True))
     settings = {i: new for i, (old, new) in both if new is not old}
-    return settings | changed_elements(mended, causes)
+    return settings | changed_elements(corrected, causes)
 
 
 def _optics(there: Assembly, changed: Mapping[int, Element]) -> StoredOptics | None:

@@ -182,11 +182,11 @@ def with_consequences(
     """
     if not findings:
         return ()
-    told = consequences(ring, faults_of(findings, causes))
+    effects = consequences(ring, faults_of(findings, causes))
     return tuple(
         replace(
             f,
-            consequences=told.get((f.recommended_action.effect, f.recommended_action.element))
+            consequences=effects.get((f.recommended_action.effect, f.recommended_action.element))
             if f.recommended_action
             else None,
         )

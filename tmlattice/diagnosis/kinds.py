@@ -1,4 +1,4 @@
-"""Every kind of measurement as a part of one diagnosis: its problem, and who judges.
+"""Each kind of measurement as a part of one diagnosis: its problem and its validation set.
 
 A new kind is a record in `measurement`, a problem in `observe`, and a line in `KINDS`.
 """
@@ -45,7 +45,7 @@ Measured = Measurement | OrbitResponse | TurnByTurn | ClosedOrbit | Dispersion |
 
 @dataclass(frozen=True)
 class How:
-    """What a part has to know of the diagnosis.
+    """Options of the diagnosis that a part needs.
 
     Attributes:
         ring: the design.
@@ -80,7 +80,7 @@ class Part:
         label: what the user calls it.
         kind: as its folder has it.
         problem: what is fitted.
-        heldout: what judges; None where nothing is held out.
+        heldout: the validation set; None where nothing is held out.
         estimated: whether its noise comes from the data.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
         said: what a reader should know.
@@ -103,7 +103,7 @@ class Part:
 
 
 def part_of(label: str, measured: Measured, how: How) -> Part:
-    """A measurement as a part of a diagnosis.
+    """Return a measurement as a part of a diagnosis.
 
     Raises:
         MeasurementError: data that cannot be used; the sentence names the label.
@@ -116,8 +116,8 @@ def part_of(label: str, measured: Measured, how: How) -> Part:
 
 
 def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> CombinedProblem:
-    """Measurements as one problem, beside those of a reference; stored beams of the same machine
-    share the models made of it."""
+    """Measurements with those of a reference as one problem; stored beams of one machine share its
+    models."""
     cache = ModelCache()
     first, then = (
         [
@@ -154,7 +154,7 @@ def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
     options = (how.radiation, how.effects, how.judgement)
     ready = prepare(ring, measured, before, *options)
     estimated = ready.estimated
-    if before is not None and estimated:  # of the same electronics: from all shots
+    if before is not None and estimated:  # the same electronics: from all shots
         noise = scatter(ready.problem.data, ready.before.point.view)
         if np.isfinite(noise).all():
             measured, before = (_with_noise(own, noise) for own in (measured, before))
@@ -173,7 +173,7 @@ def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
 
 
 def _with_noise(measured: Measurement, noise: Array) -> Measurement:
-    """The measurement with this noise, m, [2], where it states none."""
+    """The measurement with this noise, m, [2], where none is stated."""
     stated = np.full((len(measured.monitors), 2), np.nan)
     stated = stated if measured.noise is None else np.asarray(measured.noise)
     return replace(measured, noise=np.where(np.isfinite(stated), stated, noise))
@@ -191,7 +191,7 @@ def _response(label: str, kind: str, measured: Any, how: How) -> Part:
         return Part(label, kind, whole, messages=messages)
     split = split_columns(data, min(how.holdout, 0.2), np.random.default_rng(how.seed))
     held = np.append(split.held[:-1], False)[:, None]
-    # a held-out corrector gives half of its monitors: nothing else tells what it does itself
+    # half of a held-out corrector's BPMs is fitted, to determine its own kick
     fitted, judges = (
         Response(base=base, used=there & which[:, :, None], places=how.places,
                  judgement=how.judgement)
@@ -201,7 +201,7 @@ def _response(label: str, kind: str, measured: Any, how: How) -> Part:
 
 
 def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]:
-    """A kind whose shots are held out where there are enough of them."""
+    """A kind whose shots are held out if there are enough of them."""
 
     def made(label: str, kind: str, measured: Any, how: How) -> Part:
         shots = list(measured.shots)
@@ -225,7 +225,7 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
 
 
 def _alone(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]:
-    """A kind of which nothing is held out."""
+    """A kind without a validation set."""
 
     def made(label: str, kind: str, measured: Any, how: How) -> Part:
         _check_assumed(label, kind, how)
@@ -240,7 +240,8 @@ def _alone(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]
 def _check_assumed(label: str, kind: str, how: How) -> None:
     if how.assume:
         raise MeasurementError(
-            f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: mend the "
+            f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
+            "correct the "
             "data themselves"
         )
 
@@ -253,4 +254,4 @@ KINDS: Mapping[str, tuple[type, Callable[[str, str, Any, How], Part]]] = {
     "dispersion": (Dispersion, _alone(dispersion)),
     "tunes": (TuneReading, _alone(tune_readings)),
 }
-"""Records and what makes a part of them, by the kind that a folder states."""
+"""Records and their part functions, by the kind that a folder states."""

@@ -1,9 +1,8 @@
-"""The kind of measurement, of those that were not taken, that best parts two explanations.
+"""The kind of measurement that best separates two explanations.
 
-For each kind the readings are predicted under both, in a noise that such measurements usually have;
-what of their difference neither nuisances, nor the amounts, nor small errors can absorb is the
-separation. Its square grows with the time that a measurement is given, so the kinds compare by that
-square a minute.
+For each kind that was not taken, the readings are predicted under both explanations, with the usual
+noise. The separation is the difference that neither nuisances, nor amounts, nor distributed errors
+can absorb. Its square grows with machine time, so kinds compare by that square per minute.
 """
 
 import logging
@@ -54,19 +53,19 @@ NOISE, TURN_NOISE = 2e-6, 2e-5
 TUNE, CHROMATICITY = 1e-4, 0.1
 """rms of what is read of them."""
 TURNS, AMPLITUDE = 1000, 3e-4
-"""Of a kicked beam, and m at the monitors where it is largest."""
+"""Amplitude of a kicked beam, m, at the BPMs where it is largest."""
 KICK, ENERGY_ORBIT = 1e-4, 1.3e-3
-"""Of each corrector, rad; orbit change by the RF's step, m rms."""
+"""Kick of each corrector, rad; orbit change by the RF's step, m rms."""
 
 ROOM = 2**26
-"""Numbers of the signatures of all small errors: where there are more, nothing is proposed."""
+"""Most signatures of distributed errors: with more, nothing is proposed."""
 
 
 def leading(
     ring: Ring, explanation: Explanation, mass: float
 ) -> tuple[Alternative, Alternative] | None:
-    """The first finding's likeliest explanation, and the likeliest one that another action takes
-    away: which of two mechanisms with one recommended action it is changes nothing."""
+    """The first finding's most probable explanation, and the most probable one with another
+    action."""
     for named in explanation.named:
         first, *others = credible(named.alternatives, mass)[0]
         done = recommended_action(ring, first.cause)
@@ -81,7 +80,8 @@ def leading(
 def next_kind(
     ring: Ring, explanation: Explanation, taken: Sequence[str], how: How, fixed: tuple[Cause, ...]
 ) -> NextMeasurement | None:
-    """What to measure next; None where nothing is open, or no kind parts it by `LEAST`.
+    """Recommend the next measurement; None where nothing is ambiguous or no kind separates it by
+    `LEAST`.
 
     Args:
         ring: the design.
@@ -119,20 +119,20 @@ def minutes_of(ring: Ring, kind: str) -> float:
 
 
 def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Problem:
-    """Among the small errors that are left open."""
+    """The separation given the undetermined distributed errors."""
     among = explanation.problem
     if not isinstance(among, DistributedProblem):
         return problem
     rows = int(problem.valid.sum())
     if rows * len(among.known.hypotheses) > ROOM:
-        raise TmlatticeError("too many readings among small errors")
+        raise TmlatticeError("too many readings for the distributed errors")
     known = among.learnt(explanation.fit)
     causes = [c for c in first.fit.causes if problem.sees((c.effect, c.element))]
     return fit_distributed_errors(problem, known, problem.first, causes, learn=False).problem
 
 
 def _separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> float:
-    """In standard deviations; 0 where one of them has no stored beam."""
+    """The separation in standard deviations; 0 where one of the explanations has no stored beam."""
     each = [
         [c for c in one.fit.causes if problem.sees((c.effect, c.element))] for one in pair
     ]  # fmt: skip
@@ -145,14 +145,14 @@ def _separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> floa
     for rival, causes, point in zip(pair, each, (first, second), strict=True):
         if find(rival.cause.effect).discrete or rival.cause not in causes:
             continue
-        # another amount would explain some of it, as far as it is not known
+        # another amount would explain a part of it
         row = first.projection.out(problem.slope(point, causes.index(rival.cause)))
         known = 1 / max(float(rival.fit.covariance[-1, -1]), 1e-300)
         square -= float(row @ clean) ** 2 / (float(row @ row) + known) / 2
     return float(np.sqrt(max(square, 0.0)))
 
 
-# --- what would be measured: only its noise counts, and how far a beam is kicked ------------------
+# --- simulated measurements: their noise and the amplitude of kicks count ------------------
 def _monitors(ring: Ring) -> tuple[tuple[str, ...], Array]:
     names = tuple(monitor.name for monitor in ring.monitors)
     return names, np.zeros((len(names), 2))

@@ -1,8 +1,8 @@
-"""The measurement that would best tell two explanations apart.
+"""The measurement that best separates two explanations.
 
-Candidates are launches of other phases and amplitudes, another energy, and a change of the setting
-of a magnet that is under suspicion. For each the readings are predicted under both explanations;
-what of their difference neither the launch nor the amount can absorb is the separation.
+Candidates are launches of other phases and amplitudes, another energy, and a changed setting of a
+suspected magnet. For each the readings are predicted under both explanations. The separation is the
+difference that neither the launch nor the amount can absorb.
 """
 
 from collections.abc import Sequence
@@ -30,18 +30,18 @@ CHANGES = {
     "hcorrector": {"kick": 5e-5},
     "vcorrector": {"kick": 5e-5},
 }
-"""What is changed of a magnet under suspicion."""
+"""Relative changes of a suspected magnet's setting."""
 
 LEAST = 2.0
-"""Standard deviations below which a shot is not worth its time: it would tell nothing."""
+"""Least separation of a recommended shot, in standard deviations."""
 
 AMPLITUDE = 1e-3
-"""Of the proposed launches where those measured are on the axis, m."""
+"""Amplitude of the proposed launches where those measured are on the axis, m."""
 
 
 @dataclass(frozen=True)
 class NextMeasurement:
-    """What to measure, and what it would bring.
+    """A recommended measurement, and its separation.
 
     Attributes:
         launch: x, px, y, py, delta of one more shot; None of another kind of measurement.
@@ -60,7 +60,7 @@ class NextMeasurement:
     minutes: float | None = None
 
     def as_json(self) -> dict[str, object]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {
             "launch": self.launch,
             "settings": {name: dict(value) for name, value in self.settings.items()},
@@ -78,7 +78,8 @@ def next_measurement(
     known: Sequence[Cause] = (),
     seed: int = 0,
 ) -> NextMeasurement | None:
-    """The most telling shot between two rivals; None where no candidate parts them by `LEAST`.
+    """Return the shot with the largest separation of two alternatives; None where none reaches
+    `LEAST`.
 
     Args:
         ring: the design.
@@ -136,7 +137,7 @@ def _absorbed(
     rival: Alternative,
     clean: Array,
 ) -> Array:
-    """What of the difference another amount would explain, given how well it is known, [shot]."""
+    """The part of the difference that another amount would explain, given its prior, [shot]."""
     cause = rival.cause
     effect = find(cause.effect)
     if effect.discrete:
@@ -157,7 +158,7 @@ def _absorbed(
 def _candidates(
     ring: Ring, data: Data, rivals: Sequence[Alternative], seed: int
 ) -> tuple[Array, list[Settings]]:
-    """Launches [shot, 5] and settings; none of them starts on the axis."""
+    """Candidate launches [shot, 5] and settings; no launch starts on the axis."""
     measured = data.launches[data.active]
     launches = [row for row in measured[:2] if np.any(row[:4])]
     try:

@@ -1,4 +1,4 @@
-"""Readings that no monitor makes alone, a tune or a chromaticity: what each model says of them."""
+"""Readings without a BPM, tunes and chromaticities, with the prediction of each model."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,12 +9,12 @@ from tmlattice.inference.problem import Point, Problem
 from tmlattice.observe.tune_readings import TuneReadings
 
 QUANTITIES = ("tune_x", "tune_y", "chromaticity_x", "chromaticity_y")
-"""As the columns of `TuneReadings`, and as in the files."""
+"""Quantities in the order of the columns of `TuneReadings`, named as in the files."""
 
 
 @dataclass(frozen=True)
 class NumberRead:
-    """One number, as read and as two models have it. A tune is a fraction.
+    """One number, as measured and by two models. A tune is a fraction.
 
     Attributes:
         shot: its place among those of the fit.
@@ -31,12 +31,12 @@ class NumberRead:
     after: float
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return dict(vars(self))
 
 
 def numbers_read(own: Problem, before: Point, after: Point) -> tuple[NumberRead, ...]:
-    """Those of a problem of tunes; of any other none.
+    """The numbers of a problem of tunes; empty for any other.
 
     Args:
         own: the problem of one measurement.
@@ -44,10 +44,10 @@ def numbers_read(own: Problem, before: Point, after: Point) -> tuple[NumberRead,
     """
     if not isinstance(own, TuneReadings):
         return ()
-    told = []
+    read_numbers = []
     for shot, column in np.argwhere(own.valid).tolist():
         values = [float(one[shot, column]) for one in (own.data, before.orbit, after.orbit)]
         read, *models = (value % 1.0 for value in values) if column < 2 else values
         error = float(own.errors[shot, column])
-        told.append(NumberRead(shot, QUANTITIES[column], read, error, *models))
-    return tuple(told)
+        read_numbers.append(NumberRead(shot, QUANTITIES[column], read, error, *models))
+    return tuple(read_numbers)

@@ -1,4 +1,4 @@
-"""What took no part in a diagnosis, in words: monitors without a reading, rejected readings."""
+"""Messages about what was not fitted: BPMs without readings, rejected readings."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,12 +17,12 @@ from tmlattice.speaks import micrometres
 
 
 def with_silent(ring: Ring, part: Part, measured: Any) -> Part:
-    """The part, saying which monitors of its measurement read nothing that can be used.
+    """The part, with a message about BPMs of its measurement without usable readings.
 
     Args:
         ring: with the monitors.
-        part: made of the measurement; what it found dead becomes a finding, and is not said again.
-        measured: of any kind; one without monitors has nothing to say.
+        part: made of the measurement; dead BPMs become findings, and are not reported again.
+        measured: of any kind; one without monitors has no message.
     """
     problem = part.problem
     owners = problem.owner()
@@ -34,12 +34,12 @@ def with_silent(ring: Ring, part: Part, measured: Any) -> Part:
     silent = [name for name in names if name not in heard]
     if not silent:
         return part
-    messages = f"no reading that can be used of {', '.join(silent)}: left out"
+    messages = f"no usable reading of {', '.join(silent)}: rejected"
     return replace(part, messages=(*part.messages, messages))
 
 
 def spikes(parts: Sequence[Part], problem: CombinedProblem, found: Explanation) -> Iterator[str]:
-    """A sentence for each measurement with single readings that the search left out."""
+    """A message for each measurement with single readings that the search rejected."""
     ends = np.cumsum([part.valid.size for part in problem.parts])
     own: dict[int, list[int]] = {}
     for reading in found.outliers:
@@ -52,7 +52,7 @@ def spikes(parts: Sequence[Part], problem: CombinedProblem, found: Explanation) 
         start = int(ends[index]) - one.valid.size
         count = Counter(one.monitors[owners[flat - start]] for flat in own[index])
         notes = [name if many == 1 else f"{name} ({many})" for name, many in count.items()]
-        yield f"{part.label}: single readings left out as spikes: {', '.join(notes)}"
+        yield f"{part.label}: outliers, rejected: {', '.join(notes)}"
 
 
 # --- of first turns -------------------------------------------------------------------------------
@@ -72,35 +72,36 @@ def rejected_readings(part: Part, found: Explanation) -> tuple[dict[str, Any], .
 
 
 def noise_text(noise: tuple[float, float]) -> str:
-    """That the noise of both planes, m, was estimated."""
+    """A message that the noise of both planes, m, was estimated."""
     both = zip(noise, "xy", strict=True)
     levels = [f"{micrometres(own)} in {plane}" for own, plane in both if np.isfinite(own)]
     return f"the noise was estimated from the data: {', '.join(levels)}"
 
 
 def about_launches(part: Part, findings: Sequence[Finding]) -> list[str]:
-    """What the launches that were read leave open of the findings, in sentences."""
+    """Messages about what these launches leave undetermined of the findings."""
     assert isinstance(part.problem, FirstTurns)
     notes, data = [], part.problem.data
     if not data.planes.all() and any(finding.effect is None for finding in findings):
         unread, other = ("x", "y") if data.planes[1] else ("y", "x")
         notes.append(
-            f"what is located may begin upstream in {unread}, which sextupoles pass on to {other}"
+            f"a localised error may begin upstream in {unread}, which sextupoles couple into "
+            f"{other}"
         )
     if data.active.sum() == 1 and findings:
         notes.append(
-            "one trajectory gives one kick at each place: it locates, but any single multipole "
-            "explains it; two or more launches name the effect"
+            "one trajectory gives one kick at each place: any single multipole "
+            "explains it; two or more launches identify the effect"
         )
     return notes
 
 
 SHOWN = 4
-"""Readings left out that a warning names."""
+"""Outliers that a warning names."""
 
 
 def about_rejected(outliers: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A sentence about rejected readings, if there are any."""
+    """A message about outliers, if there are any."""
     if not outliers:
         return []
     some = "; ".join(
@@ -110,4 +111,4 @@ def about_rejected(outliers: Sequence[Mapping[str, Any]]) -> list[str]:
         for row in outliers[:SHOWN]
     )
     more = f"; and {len(outliers) - SHOWN} more" if len(outliers) > SHOWN else ""
-    return [f"{len(outliers)} single readings are wrong for once and were left out: {some}{more}"]
+    return [f"{len(outliers)} single readings are outliers and were rejected: {some}{more}"]

@@ -1,4 +1,4 @@
-"""Where something sits, told by the monitors on both sides."""
+"""Places by the BPMs on both sides."""
 
 from collections.abc import Sequence
 
@@ -7,11 +7,11 @@ import numpy as np
 from tmlattice.lattice import Ring
 
 Span = tuple[tuple[float, float], tuple[str, ...]]
-"""From where to where, m, and the names of the monitors there."""
+"""The interval, m, and the names of its BPMs."""
 
 
 def between(ring: Ring, positions: Sequence[float]) -> Span:
-    """From the last monitor before to the first one behind."""
+    """The interval from the last BPM before to the first one behind."""
     s = np.array([monitor.s for monitor in ring.monitors])
     low, high = min(positions), max(positions)
     before = int(np.searchsorted(s, low, side="left")) - 1

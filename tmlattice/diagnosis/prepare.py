@@ -1,7 +1,7 @@
-"""Before the search: data and model made ready, and what is said of them already.
+"""Preparation of the search: data and model, and the messages about them.
 
-Nothing here decides what the fault is: monitors without a signal are set aside, the noise is
-estimated where nobody states it, and data of another ring are declined.
+BPMs without a signal are rejected, the noise is estimated where none is stated, and data of another
+ring are refused.
 """
 
 from collections.abc import Sequence
@@ -29,26 +29,26 @@ from tmlattice.observe.noise import estimate, local_misfit
 Array = NDArray[np.float64]
 
 FLOOR = 2e-4
-"""Share of the orbit below which no noise is taken: second-order maps leave 2e-5 of an orbit of a
-millimetre and 7e-5 of one of three, the same in every reading of a turn. A fault that is found with
-this is found with less."""
+"""Lower limit of the noise, as a share of the orbit. Second-order maps leave 2e-5 of an orbit of a
+millimetre and 7e-5 of one of three, the same in every reading of a turn."""
 ROUGH = 1e-4
-"""m; stands for a noise that is not known yet, while the launches are fitted for the first time."""
+"""Noise, m, while it is unknown and the launches are fitted for the first time."""
 SMALL = 1e-5
-"""m and, a tenth of it, rad: launches of trajectories on which sextupoles mix no planes."""
+"""Amplitude, m (and a tenth of it in rad), of trajectories on which sextupoles couple no planes."""
 ALONE = 1e-6
-"""Square of the share of a signature in a plane below which there is nothing of it: sextupoles make
-1e-8 along small trajectories, and coupling of the thousandth part of an orbit is seen."""
+"""Square of the share of a signature in a plane below which it counts as zero. Sextupoles make 1e-8
+along small trajectories; coupling of a thousandth of an orbit is detectable."""
 PASSED_ON = 0.05
-"""Share of a signature's square that turns its sign with the other plane's orbit, above which an
-unknown orbit is part of the amount; of a gradient where a tenth of the orbit couples it is 0.02."""
+"""Share of a signature's square that changes sign with the other plane's orbit above which an
+unknown orbit is part of the amount. It is 0.02 for a gradient with coupling of a tenth."""
 CHUNK = 256
-"""Hypotheses whose signatures are made at a time."""
+"""Hypotheses whose signatures are computed at a time."""
 COPIES = 16
-"""Of all tangents, which are held at once: they, their inverses, and those of every rival."""
+"""Share of all tangents that is in memory at once: tangents, inverses, and those of every
+alternative."""
 MEMORY = 2e9
 """Bytes that the trajectories of a measurement may take: 3,700 shots of a turn in a hundred
-magnets, 280 in fifteen hundred, which say more than maps of second order are good for."""
+magnets, 280 in fifteen hundred."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def prepare(
     effects: Sequence[str] | None,
     judgement: Judgement,
 ) -> Prepared:
-    """Data, model and launches.
+    """Return data, model and launches.
 
     Raises:
         MeasurementError: data that cannot be used, or that are of another lattice.
@@ -117,15 +117,15 @@ def prepare(
 
 
 def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurement:
-    """Readings that are a signal, of as many shots as find room, evenly taken.
+    """Return the readings with a signal, of as many shots as fit into memory, evenly spaced.
 
     Args:
         ring: the design.
         measurement: any number of shots.
-        said: which shots are left out is told here.
+        said: receives a message about omitted shots.
 
     Raises:
-        MeasurementError: not one shot finds room.
+        MeasurementError: not one shot fits.
     """
     names = [monitor.name for monitor in ring.monitors]
     measurement = beam_lost(in_beam_order(measurement, names)).without
@@ -140,12 +140,14 @@ def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurem
     if shots <= room:
         return measurement
     taken = np.linspace(0, shots - 1, room).round().astype(int)
-    messages.append(f"{room} of {shots} shots are used, evenly taken: the others find no room")
+    messages.append(
+        f"{room} of {shots} shots are used, evenly spaced: the others do not fit into memory"
+    )
     return measurement.select(shots=[measurement.shots[i] for i in taken])
 
 
 def _determined(ring: Ring, hypotheses: Sequence[Hypothesis], data: Data) -> list[Hypothesis]:
-    """Those that the planes that were read determine.
+    """Hypotheses that the measured planes determine.
 
     In the other plane the orbit is unknown all along the ring, so what acts there alone cannot be
     determined by what sextupoles make of it. Along small trajectories that part vanishes. The
@@ -176,7 +178,7 @@ def _determined(ring: Ring, hypotheses: Sequence[Hypothesis], data: Data) -> lis
 def _on_its_way(start: Fit, ring: Ring) -> Fit:
     if start.point.lost:
         raise BeamLostError(
-            f"{start.point.lost} in '{ring.name}' without any fault: check the launches' units (m, "
+            f"{start.point.lost} in the design of '{ring.name}': check the launches' units (m, "
             "rad), the settings, and whether this is the machine's lattice"
         )
     return start
@@ -185,8 +187,8 @@ def _on_its_way(start: Fit, ring: Ring) -> Fit:
 def _dead_monitors(
     model: Model, data: Data, listed: set[str], judgement: Judgement
 ) -> tuple[tuple[tuple[int, float], ...], Data, tuple[str, ...]]:
-    """Monitors without a signal (1) or with a frozen one (2), the data without the latter, and what
-    is to be said."""
+    """BPMs without a signal (1) or with a frozen one (2), the data without the latter, and the
+    messages."""
     count = len(model.at)
     readings = data.readings.reshape(-1, count, 2)
     valid = data.valid.reshape(-1, count, 2)
@@ -217,7 +219,7 @@ def _dead_monitors(
     elif half:
         messages.append(f"{len(half)} monitors read one plane only: {first_of(half, 3)}")
     if len(silent) > judgement.silent * count:
-        messages.append(f"{len(silent)} monitors have no signal; they count as not there")
+        messages.append(f"{len(silent)} BPMs have no signal; they are ignored")
         silent = []
     dropped = np.zeros(data.valid.shape, dtype=bool)
     for m in frozen:
@@ -253,13 +255,13 @@ def noise_of(data: Data) -> tuple[float, float]:
 def _above_the_floor(
     data: Data, noise: tuple[float, float]
 ) -> tuple[Data, tuple[float, float], tuple[str, ...]]:
-    """The data with no noise below what second-order maps leave, its rms, and what is said."""
+    """The data with noise not below the residual of second-order maps, its rms, and messages."""
     floor = FLOOR * _rms(data.readings[data.valid])
     if not (data.sigma[data.valid] < floor).any():
         return data, noise, ()
     data = replace(data, sigma=np.maximum(data.sigma, floor))
     messages = (
-        f"the noise, {1e6 * min(noise):.2g} µm, is less than what second-order maps leave of such "
+        f"the noise, {1e6 * min(noise):.2g} µm, is below the error of second-order maps for such "
         f"an orbit: {1e6 * floor:.2g} µm is taken"
     )
     return data, (max(noise[0], floor), max(noise[1], floor)), (messages,)
@@ -270,7 +272,8 @@ def _rms(values: Array) -> float:
 
 
 def _check_lattice(ring: Ring, data: Data, start: Fit, judgement: Judgement) -> None:
-    """A few errors leave most monitors in agreement with their neighbours."""
+    """Raise a MeasurementError if most BPMs contradict their neighbours: the data are of another
+    ring."""
     local = local_misfit(data, start.point.view)
     if not np.isfinite(local).sum() > 50:
         return
@@ -279,14 +282,15 @@ def _check_lattice(ring: Ring, data: Data, start: Fit, judgement: Judgement) -> 
     noise = float(np.median(data.sigma[data.valid]))
     if size > max(judgement.alien * orbit, 5 * noise):
         raise MeasurementError(
-            f"the readings do not follow from '{ring.name}': even between neighbouring monitors "
-            f"the model errs by {1e6 * size:.0f} µm where the orbit is {1e6 * orbit:.0f} µm; name "
+            f"the readings do not match '{ring.name}': even between neighbouring BPMs "
+            f"the error of the model is {1e6 * size:.0f} µm where the orbit is {1e6 * orbit:.0f} "
+            "µm; name "
             "the lattice of this machine, and check units and the names of the monitors"
         )
 
 
 def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
-    """Held-out readings of the monitors that the fit kept.
+    """Held-out readings of the BPMs that the fit kept.
 
     Args:
         other: of the held-out shots.

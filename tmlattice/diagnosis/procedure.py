@@ -81,11 +81,11 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 MOST_OF_IT = 0.5
-"""Share of the gap that one cause has to make to be put aside before sizes are learnt."""
+"""Share of the gap that one cause has to explain to be separated before prior scales are learnt."""
 
 CROWDED = 1.5
-"""What half of the monitors leave at least of their noise where a few causes with names were tried,
-from which on nothing without a name is: errors are everywhere."""
+"""Misfit of half of the BPMs, in units of the noise, from which errors are distributed, if a sparse
+fit of named causes failed."""
 
 
 def diagnose_together(
@@ -105,7 +105,7 @@ def diagnose_together(
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """Where the gap between a ring and its measurements lies, what causes it, how far it shrinks.
+    """Locate the gap between a ring and its measurements, identify its causes, and validate them.
 
     Args:
         ring: the design.
@@ -114,7 +114,7 @@ def diagnose_together(
         background: small errors, as of `diagnose`.
         known: of the small errors beforehand, from an earlier diagnosis whose ring as found this
             is: see `twin`. Then no background is asked for.
-        holdout: share of shots, or of correctors, that judge.
+        holdout: share of shots, or of correctors, in the validation set.
         heldout: of first turns alone: those shots themselves, instead of a share.
         effects: names of those that may be the cause; else all usual ones.
         max_effects: findings at most.
@@ -122,7 +122,7 @@ def diagnose_together(
         false_alarm: share of faultless data sets in which something may be found.
         assume: what was written down wrongly everywhere, see `measurement.assume`.
         seed: of the split and of the threshold's simulation.
-        progress: told what is being done.
+        progress: called with the name of each stage.
 
     Raises:
         MeasurementError: data that cannot be used; the sentence says which.
@@ -200,7 +200,7 @@ def _named(label: str, measured: Measured, how: How) -> Part:
 
 
 def _seen(ring: Ring, effects: Sequence[str], parts: Sequence[Part]) -> list[Hypothesis]:
-    """Every effect at every place where any measurement sees it."""
+    """Every effect at every place where any measurement is sensitive to it."""
     return [
         (name, place) for name in effects for place in find(name).places(ring)
         if any(part.problem.sees((name, place)) for part in parts)
@@ -216,12 +216,11 @@ def _chosen(ring: Ring, effects: Sequence[str] | None, turns: bool) -> list[str]
 
 
 def _of_launches(effect: Effect) -> bool:
-    """Whether it is the launches' alone; what shifts all of them is not the stored beam's, nor seen
-    where each shot has a launch of its own."""
+    """Whether a hypothesis is of launches alone, which a stored beam or free launches absorb."""
     return isinstance(effect, LaunchEffect) and (effect.shifts is not None or not effect.responds)
 
 
-# --- what is told ----
+# --- results ----
 def _report(
     ring: Ring,
     parts: Sequence[Part],
@@ -244,12 +243,12 @@ def _report(
     fitted = Block("fitted readings", result.chi2, freedom(found.problem, result))
     verdict, findings, messages = verdict_of(found, findings, fitted.p_value, estimated, judgement)
     if verdict == "none" and small is not None and small.errors and problem.alone:
-        verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
+        verdict = "distributed"  # the gap is of distributed errors; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
-        messages = (*messages, f"the amounts are not settled: {result.outcome.value}")
+        messages = (*messages, f"the fit of the amounts did not converge: {result.outcome.value}")
     causes = () if verdict == "distributed" else result.causes
     left = found.left if causes or (found.kicks and findings) else found.first_kicks
-    if result.causes and not causes:  # nothing is explained: what is left is what was there
+    if result.causes and not causes:  # nothing is explained: the gap stays
         fitted = Block(fitted.name, found.before.chi2, freedom(found.problem, found.before))
     kept = problem.without(found.dropped)
     stages = stages_of(kept, found, small, causes)
@@ -260,20 +259,20 @@ def _report(
     rejected: tuple[dict[str, Any], ...] = ()
     if turns is None:
         heldout = held_out(parts, problem.fixed, stages, aside, since)
-        # what small errors leave undetermined is not in the errors of held-out readings
+        # errors of held-out readings do not include undetermined distributed errors
         compared = compared_of(fitted, heldout if small is None else None)
-        told = (f"{part.label}: {one}" for part in parts for one in part.messages)
+        stated = (f"{part.label}: {one}" for part in parts for one in part.messages)
         notes = list(spikes(parts, problem, found))
     else:
         heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
-        told = (one for one in turns.messages)
+        stated = (one for one in turns.messages)
         rejected = rejected_readings(turns, found)
         notes = about_rejected(rejected)
         if turns.estimated:
             notes.append(noise_text(_noise(parts)))
         notes += about_launches(turns, findings)
-    warnings = [*told, *notes, *messages, *too_large(stages)]
+    warnings = [*stated, *notes, *messages, *too_large(stages)]
     corrected = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     return Diagnosis(
@@ -322,7 +321,7 @@ def _report(
 def _next(
     ring: Ring, found: Explanation, parts: Sequence[Part], how: How, fixed: tuple[Cause, ...]
 ) -> NextMeasurement | None:
-    """What to measure next: of first turns one more shot, else another kind."""
+    """The recommended next measurement: of first turns one more shot, else another kind."""
     one = parts[0].problem
     if len(parts) > 1 or not isinstance(one, FirstTurns):
         return next_kind(ring, found, [part.kind for part in parts], how, fixed)
@@ -337,14 +336,14 @@ def _next(
 
 
 def _by_ring(ring: Ring, problem: CombinedProblem, found: Explanation) -> Explanation:
-    """Monitors that were set aside, by their place in the ring."""
+    """Rejected BPMs, by their place in the ring."""
     at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
     aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}
     return replace(found, monitors=aside)
 
 
 def _noise(parts: Sequence[Part]) -> tuple[float, float]:
-    """rms noise of a reading, m, of the first measurement that has monitors."""
+    """rms noise of a reading, m, of the first measurement with BPMs."""
     for part in parts:
         if isinstance(part.problem, FirstTurns):
             return noise_of(part.problem.data)

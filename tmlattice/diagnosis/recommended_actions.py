@@ -1,10 +1,10 @@
-"""What is to be done about a finding: explanations that the same adjustment takes away are one.
+"""Recommended actions: explanations that the same adjustment corrects are one action.
 
-A thin gradient in the middle of a quadrupole and a wrong strength of it are two hypotheses and one
-line in a logbook: the gradient of that magnet. Which effects share a action at an element, and in
-which amount, the catalogue says (`Effect.stands_for`). A magnet that stands in pieces is one.
+A thin gradient in the middle of a quadrupole and a wrong strength of it are two hypotheses with one
+action: set the gradient of that magnet. The catalogue lists which effects share an action, and in
+which amount (`Effect.stands_for`). The pieces of a magnet are one.
 
->>> action = recommended_actions(ring, rivals, probability)[0]
+>>> action = recommended_actions(ring, alternatives, probability)[0]
 >>> action.action, action.amount, action.probability
 """
 
@@ -23,12 +23,12 @@ from tmlattice.lattice import Element, Kind, Ring
 Array = NDArray[np.float64]
 
 STRENGTHS = {"k1": "1/m2", "k2": "1/m3"}
-"""Strengths that a recommended action tells before and after, with their units."""
+"""Strengths reported before and after, with their units."""
 
 
 @dataclass(frozen=True)
 class Strength:
-    """What a magnet is designed to have and what it was found to have."""
+    """The designed and the estimated strength of a magnet."""
 
     name: str
     unit: str
@@ -38,7 +38,7 @@ class Strength:
 
 @dataclass(frozen=True)
 class RecommendedAction:
-    """What takes a finding away at one place.
+    """A correction at one place.
 
     Attributes:
         effect, element: that the recommended action is named for; None for the beam.
@@ -46,9 +46,9 @@ class RecommendedAction:
             beam.
         kind: of the element; of a family that of its members.
         amount, amount_sigma: in that effect's unit: its own where it is among the explanations,
-            else that of the likeliest one.
+            else that of the most probable one.
         probability: of all explanations that share it.
-        mechanisms: their effects with their probabilities, the likeliest first.
+        mechanisms: their effects with their probabilities, the most probable first.
         strength: of the magnet, designed and found, where the effect scales one.
         device: what the control system calls the element; None: unknown.
     """
@@ -66,16 +66,16 @@ class RecommendedAction:
 
     @property
     def cause(self) -> Cause:
-        """What is told to be wrong."""
+        """The cause that the action corrects."""
         return Cause(self.effect, self.element, self.amount)
 
     @property
     def action(self) -> str:
-        """What to do, in words."""
+        """The action in words."""
         return action(self.effect, self.pieces)
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         effect = find(self.effect)
         return {
             "action": self.action,
@@ -96,19 +96,19 @@ class RecommendedAction:
 
 
 def action(effect: str, pieces: Sequence[str]) -> str:
-    """What takes an effect away, in words."""
+    """The correction of an effect, in words."""
     return find(effect).recommended_action.replace("{}", " + ".join(pieces) or "the ring")
 
 
 def pieces_of(ring: Ring, name: str | None) -> tuple[str, ...]:
-    """Of the magnet that an element is a piece of; a family's name, or an element's, alone."""
+    """The pieces of an element's magnet; a family's name, or an element's, alone."""
     if name is None:
         return ()
     return ring.pieces(name) if _is_element(ring, name) else (name,)
 
 
 def leading(ring: Ring, cause: Cause) -> Cause:
-    """The cause whose action takes this one away too, with the amount that does as much."""
+    """The cause whose action corrects this one too, with the equivalent amount."""
     if cause.element is None or not _is_element(ring, cause.element):
         return cause
     effect, scale = find(cause.effect).corrected_as(ring[cause.element])
@@ -116,7 +116,7 @@ def leading(ring: Ring, cause: Cause) -> Cause:
 
 
 def recommended_action(ring: Ring, cause: Cause) -> str:
-    """What takes a cause away, in words: the same for causes that one adjustment takes away."""
+    """The correction of a cause, in words; equal for causes with one action."""
     lead = leading(ring, cause)
     return action(lead.effect, pieces_of(ring, lead.element))
 
@@ -127,11 +127,11 @@ def recommended_actions(
     probability: Sequence[float] | Array,
     sigma: float | None = None,
 ) -> tuple[RecommendedAction, ...]:
-    """The recommended actions of rival explanations.
+    """Return the recommended actions of alternative explanations.
 
     Args:
         ring: the design.
-        causes: of the rivals, likeliest first.
+        causes: of the alternatives, most probable first.
         probability: of each.
         sigma: standard error of the first one's amount.
 
@@ -150,7 +150,7 @@ def recommended_actions(
             )
             thin = known.effect not in [effect for effect, _ in found[key].mechanisms]
             if thin and cause.effect == lead.effect and lead.element == known.element:
-                # its own fit is better than a thin one converted
+                # its own fit is better than a converted thin one
                 known = replace(known, amount=lead.amount, strength=_strength(ring, lead))
             found[key] = known
             continue
@@ -168,7 +168,7 @@ def recommended_actions(
 
 
 def _more(known: RecommendedAction, mechanism: tuple[str, float]) -> tuple[tuple[str, float], ...]:
-    """Mechanisms with one more, those of the same effect (in other pieces) added up."""
+    """Mechanisms with one more; those of the same effect (in other pieces) added up."""
     shares = dict(known.mechanisms)
     shares[mechanism[0]] = shares.get(mechanism[0], 0.0) + mechanism[1]
     return tuple(shares.items())
@@ -177,7 +177,7 @@ def _more(known: RecommendedAction, mechanism: tuple[str, float]) -> tuple[tuple
 def credible(
     recommended_actions: Sequence[RecommendedAction], mass: float
 ) -> tuple[RecommendedAction, ...]:
-    """The fewest that hold the mass, the first with them."""
+    """The fewest actions whose probabilities reach the mass, the first one first."""
     order = sorted(
         recommended_actions, key=lambda recommended_action: -recommended_action.probability
     )
@@ -190,7 +190,7 @@ def _is_element(ring: Ring, name: str) -> bool:
 
 
 def _members(ring: Ring, name: str | None) -> list[Element]:
-    """The element of this name, or the family's."""
+    """The element of this name, or of the family's."""
     own = [element for element in ring.elements if element.name == name]
     families = (effect for effect in CATALOGUE.values() if isinstance(effect, FamilyEffect))
     shared = (effect.members(ring, name) for effect in families)
@@ -203,7 +203,7 @@ def element_kind(ring: Ring, name: str | None) -> Kind | None:
 
 
 def _strength(ring: Ring, cause: Cause) -> Strength | None:
-    """Of the magnets that an effect scales, where they all have the same."""
+    """The common strength of the magnets that an effect scales; None where they differ."""
     effect = find(cause.effect)
     if not isinstance(effect, StrengthEffect) or effect.strength not in STRENGTHS:
         return None
@@ -217,16 +217,16 @@ def _strength(ring: Ring, cause: Cause) -> Strength | None:
 
 
 def compensated(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause, ...]]:
-    """The ring with the settings that take causes away, and the causes that no setting does.
+    """Return the ring with settings that correct the causes, and the causes that no setting
+    corrects.
 
     With the causes in it, a magnet of the returned ring acts as the given ring's does: a quadrupole
-    that gives 20 % less than it is told is told 25 % more. What has to be moved, turned, calibrated
-    or mended, and what is wrong with monitors or the beam, is handed back; known physics that is no
-    fault is passed over.
+    that is 20 % too weak is set 25 % higher. The second result has what must be moved, turned,
+    calibrated or repaired, and errors of BPMs or the beam. Natural effects are ignored.
     """
     settings: dict[int, Element] = {}
     by_hand: list[Cause] = []
-    for cause in reversed(causes):  # the last that acts is undone first
+    for cause in reversed(causes):  # the last that acts is corrected first
         effect = find(cause.effect)
         if effect.natural:
             continue
@@ -234,9 +234,11 @@ def compensated(ring: Ring, causes: Sequence[Cause]) -> tuple[Ring, tuple[Cause,
             by_hand.append(cause)
             continue
         places = effect.members(ring, cause.element)
-        told = [effect.compensated(settings.get(i, ring.elements[i]), cause.amount) for i in places]
-        if any(element is None for element in told):
+        corrected = [
+            effect.compensated(settings.get(i, ring.elements[i]), cause.amount) for i in places
+        ]
+        if any(element is None for element in corrected):
             by_hand.append(cause)
             continue
-        settings |= {i: e for i, e in zip(places, told, strict=True) if e is not None}
+        settings |= {i: e for i, e in zip(places, corrected, strict=True) if e is not None}
     return ring.with_elements(settings), tuple(reversed(by_hand))

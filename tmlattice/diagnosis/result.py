@@ -1,5 +1,5 @@
-"""What a diagnosis says, whatever was measured: findings with what else each could be, amounts with
-errors, the gap, and the file format."""
+"""The result of a diagnosis: findings with alternatives, amounts with errors, the gap, the file
+format."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -46,10 +46,10 @@ _MEASURES = {
     "dispersion": ("dispersion",),
     "tunes": ("tunes",),
 }
-"""Quantities of the stored beam that a kind of measurement holds."""
+"""Quantities of the stored beam that a kind of measurement contains."""
 
 VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
-"""From the most certain to the least."""
+"""Verdicts from the most certain to the least."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,13 @@ class Member:
     device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {key: value for key, value in vars(self).items() if key != "device" or value}
 
 
 @dataclass(frozen=True, repr=False)
 class Finding(ShownFinding):
-    """One thing that is wrong.
+    """One error, or one localised but unexplained deviation.
 
     Attributes:
         effect, element: None where something is there and the catalogue does not explain it, and
@@ -93,9 +93,9 @@ class Finding(ShownFinding):
         near: the names of those monitors.
         credible_set: explanations that the data do not exclude, the first is this finding.
         mass: the sum of their probabilities.
-        recommended_actions: what takes it away, then what else might, until they hold the mass of
-            a credible set; empty without an effect.
-        consequences: what it does to the stored beam, and what is left of that after the repair.
+        recommended_actions: its correction, then the alternatives in the credible set; empty
+            without an effect.
+        consequences: its effect on the stored beam, before and after the correction.
         seen_by: share of each measurement in what is known of its amount, where there are several.
         words, to_check, elements: what it is, what to look at, and which elements it is of, where
             that is known and no effect of the catalogue is it; else empty.
@@ -126,7 +126,7 @@ class Finding(ShownFinding):
 
     @property
     def label(self) -> str:
-        """What it is of, where there is little room."""
+        """The element, or the place, for short labels."""
         return self.element or ", ".join(self.elements) or "unnamed"
 
     @property
@@ -138,16 +138,16 @@ class Finding(ShownFinding):
 
     @property
     def recommended_action(self) -> RecommendedAction | None:
-        """What takes it away."""
+        """The most probable recommended action."""
         return self.recommended_actions[0] if self.recommended_actions else None
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         found = self.detection
         where = None
         if self.where is not None:
             where = {"s_from": self.where[0], "s_to": self.where[1]}
-        told = {"words": self.words, "to_check": self.to_check, "elements": list(self.elements)}
+        stated = {"words": self.words, "to_check": self.to_check, "elements": list(self.elements)}
         return {
             "effect": self.effect,
             "element": self.element,
@@ -174,7 +174,7 @@ class Finding(ShownFinding):
             ],
             "consequences": None if self.consequences is None else self.consequences.as_json(),
             **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
-            **(told if self.words else {}),
+            **(stated if self.words else {}),
             **_device(self.device),
             **({"devices": dict(self.devices)} if self.devices else {}),
         }
@@ -197,7 +197,7 @@ def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cau
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis(ShownDiagnosis):
-    """What a measurement says of a ring. See `as_json` for the file format.
+    """The result of a diagnosis. See `as_json` for the file format.
 
     Attributes:
         verdict: the least certain of the findings', see `VERDICTS`.
@@ -207,7 +207,7 @@ class Diagnosis(ShownDiagnosis):
         heldout_shots: their ids, of trajectories.
         unexplained: p-value of what is left, where it sits, and its patterns (orbit response).
         tunes: fractions of Qx, Qy of the design and of the ring with the causes; None: unstable.
-        next: the shot that would tell the likeliest rivals apart, or None.
+        next: the shot that would tell the most probable alternatives apart, or None.
         sensitivity: by effect, the amount that would be seen at half of its places.
         warnings: what a reader should know.
         outliers: single readings that the search left out: shot, turn, monitor, plane.
@@ -219,11 +219,11 @@ class Diagnosis(ShownDiagnosis):
             in it; monitors and correctors are in `calibration`. See `as_found` and `repair`.
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
-        view: what figures need; it says what was measured.
-        steps: of a dense fit, those kept; the first is the design's, the last the result's.
-        rejected_steps: families that are closed, with the figures with them.
-        bad_monitors: names of those left out.
-        priors: rms of small errors, as the data have them or as they were told, by family.
+        view: what figures need, with what was measured.
+        steps: of a hierarchical fit, those accepted, from the design to the result.
+        rejected_steps: families that were rejected, with the residuals with them.
+        bad_monitors: names of the rejected BPMs.
+        priors: rms of small errors, learnt or stated, by family.
         prior_errors: relative error of those that were learnt; above one half the readings hardly
             see the family.
         degenerate: what the data alone do not settle, in words.
@@ -327,7 +327,7 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def kind(self) -> str:
-        """Of the measurement, as its folder has it; "together" of several."""
+        """The kind of measurement, as its folder has it; "together" of several."""
         if isinstance(self.view, StoredView):
             return self.view.kind
         if isinstance(self.view, JointView):
@@ -353,12 +353,12 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def since_reference(self) -> bool:
-        """Whether what is told is a change from an earlier measurement (but of trajectories)."""
+        """Whether the result is a change from an earlier measurement (except of trajectories)."""
         return self.kind != "trajectory" and self.has_reference
 
     @property
     def has_reference(self) -> bool:
-        """Whether a measurement from before was given."""
+        """Whether a reference was given."""
         return bool(self.provenance["options"].get("reference"))
 
     @property
@@ -392,7 +392,7 @@ class Diagnosis(ShownDiagnosis):
         """
         self._read()
         if not isinstance(self.view, TrajectoryView | JointView):
-            raise TypeError("an orbit response was fitted by families: there was no search")
+            raise TypeError("an orbit response has a hierarchical fit: there was no search")
         return self.view.explanation
 
     def _read(self) -> None:
@@ -404,10 +404,10 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def calibration(self) -> tuple[Cause, ...]:
-        """What monitors and correctors do, for `write_calibration`."""
+        """Gains and calibrations, for `write_calibration`."""
         bad = (Cause("monitor_dead", name, 1.0) for name in self.bad_monitors)
         own = [c for c in self.causes if c.effect in CALIBRATES]
-        # a fit by steps is of readings whose planes were exchanged back
+        # a hierarchical fit is of readings with swapped planes corrected
         swaps = (Cause(f.effect, f.element, 1.0) for f in self.findings
                  if f.effect == "monitor_swap" and self.by_steps)  # fmt: skip
         return (*own, *swaps, *bad)
@@ -442,12 +442,12 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def as_found(self) -> Ring:
-        """The design with the faults in it: the machine as it is."""
+        """The estimated ring: the design with the faults in it."""
         faults = self.faults
         return self.corrected if faults == self.causes else apply(self.ring, faults)
 
     def repair(self) -> tuple[Ring, tuple[Cause, ...]]:
-        """The design with the settings that take the faults away, and what settings do not mend.
+        """The design with the settings that correct the faults, and the causes that none corrects.
 
         Loaded into the machine as it was found, these settings make it the design again: see
         `recommended_actions.compensated`.
@@ -456,7 +456,7 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def gap(self) -> dict[str, Any]:
-        """Before and after on the fit's readings and on held-out ones.
+        """Residuals before and after, of fitted and of held-out readings.
 
         Where there are small errors and findings, before is with the small errors alone; the
         design's own is the first of the steps.
@@ -488,7 +488,9 @@ class Diagnosis(ShownDiagnosis):
             },
             "fit": both(self.fit_before, self.fit_after),
             "heldout": heldout,
-            "explained": None if gap is None else gap.explained,  # null where nothing was put in
+            "explained": None
+            if gap is None
+            else gap.explained,  # null without amounts in the model
             "explained_interval": interval,
         }
 

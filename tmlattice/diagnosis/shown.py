@@ -1,4 +1,4 @@
-"""What a diagnosis and its findings show of themselves."""
+"""Short representations of a diagnosis and its findings."""
 
 from typing import Any
 
@@ -6,11 +6,11 @@ from tmlattice.late import ClassMethod, Method
 from tmlattice.speaks import Speaks, last_part
 
 MOST = 4
-"""Findings in the line that a diagnosis shows."""
+"""Findings in the line of a diagnosis."""
 
 
 class ShownFinding(Speaks):
-    """A finding's line; the attributes are `Finding`'s."""
+    """The line of a finding; the attributes are `Finding`'s."""
 
     effect: str | None
     element: str | None
@@ -27,7 +27,7 @@ class ShownFinding(Speaks):
 
     @property
     def in_short(self) -> str:
-        """Effect, element and amount, as the catalogue calls them; else what it is in words."""
+        """Effect, element and amount, as the catalogue names them; else the finding's words."""
         if self.words:
             return self.words
         what = " ".join(word for word in (self.effect or "no known effect", self.element) if word)
@@ -38,7 +38,7 @@ class ShownFinding(Speaks):
 
 
 class ShownDiagnosis(Speaks):
-    """A diagnosis' line, its report and figures; the attributes are `Diagnosis`'."""
+    """The line of a diagnosis, its report and figures; the attributes are `Diagnosis`'."""
 
     report = Method("tmlattice.report.speaking", "report", "The report as text.")
     save = Method(

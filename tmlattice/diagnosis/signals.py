@@ -1,4 +1,4 @@
-"""What is said of the monitors' signals before any model: silent, frozen, copied, cut off."""
+"""Checks of the BPMs' signals without a model: silent, frozen, copied, cut off."""
 
 from collections.abc import Sequence
 
@@ -16,30 +16,30 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 NAMED = 3
-"""Names of monitors that a sentence has at most."""
+"""Names of BPMs in a sentence at most."""
 CUT = FEWEST
-"""Monitors without a reading, the last ones of a shot, from which the beam is said to be lost."""
+"""Silent BPMs at the end of a shot from which on the beam counts as lost."""
 ALIKE = 0.5
-"""Share of the signals that never change, from which the data are no readings."""
+"""Share of constant signals from which on the data are no readings."""
 STRAY = 0.02
-"""Share of a turn's readings below which a turn far behind the others is a slip of the pen."""
+"""Share of a turn's readings below which a turn far behind the others is a wrong number."""
 
 
 def some(names: Sequence[str]) -> str:
-    """The first few of several names."""
+    """The first of several names."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 
 
 def not_reached(silent: Flags) -> Flags:
-    """Which of the silent monitors [monitor], in beam order, are behind a lost beam: a run of the
-    last ones."""
+    """Which of the silent BPMs [monitor], in beam order, follow a lost beam: a run of the last
+    ones."""
     run = np.cumprod(silent[::-1])[::-1].astype(bool)
     return np.asarray(run & (run.sum() >= CUT))
 
 
 def one_plane(unread: str) -> str:
-    """What is said where nothing was read in a plane."""
+    """The message about a plane without readings."""
     return (
         f"no BPM reads {unread}: the orbit in {unread} is unknown, and errors that act in {unread} "
         "alone are not determined"
@@ -54,7 +54,7 @@ def planes(read: Flags) -> Check:
 
 
 def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True) -> list[Check]:
-    """Silent, frozen and copied monitors.
+    """Check for silent, frozen and copied BPMs.
 
     Args:
         ring: that they are of.
@@ -72,13 +72,13 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own
     ]
     if len(silent) > DEFAULT.silent * len(names):
-        text = f"{len(silent)} of {len(names)} monitors have no reading; they count as not there"
+        text = f"{len(silent)} of {len(names)} BPMs have no reading; they are ignored"
         checks.append(note("silent monitors", text))
     elif silent:
         text = f"no reading of {some(silent)}"
         checks.append(note("silent monitors", text))
     else:
-        checks.append(fine("silent monitors", f"each of {len(names)} monitors has a reading"))
+        checks.append(fine("silent monitors", f"each of {len(names)} BPMs has a reading"))
     many = there.sum(axis=0) > 2
     with np.errstate(invalid="ignore"):
         high = np.where(there, values, -np.inf).max(axis=0)
@@ -91,7 +91,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     ]
     if moved and stuck.sum() > ALIKE * max(int(many.sum()), 1):
         text = (
-            f"{len(frozen)} of {len(names)} monitors read the same in every shot and turn: one "
+            f"{len(frozen)} of {len(names)} BPMs read the same in every shot and turn: one "
             "reading was copied over the others; give what was read each time"
         )
         checks.append(wrong("frozen monitors", text))
@@ -99,19 +99,18 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         text = f"the same reading in every shot and turn: {some(frozen)}; leave the signal out"
         checks.append(note("frozen monitors", text))
     else:
-        checks.append(fine("frozen monitors", "no monitor always reads the same"))
+        checks.append(fine("frozen monitors", "no BPM is frozen"))
     copies = _copies(ring, names, values, stuck)
     if copies:
         text = f"the same readings, to the last digit, of {some(copies)}; one of them is a copy"
         checks.append(note("copied monitors", text))
     else:
-        checks.append(fine("copied monitors", "no two monitors read the same"))
+        checks.append(fine("copied monitors", "no two BPMs read the same"))
     return checks
 
 
 def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> list[str]:
-    """Signals [monitor, plane] that are equal wherever they are, in pairs; but for monitors in one
-    place, which read the same where there is no noise."""
+    """Pairs of equal signals [monitor, plane], except of BPMs in one place."""
     seen: dict[bytes, tuple[str, float]] = {}
     found = []
     for m, name in enumerate(names):
@@ -129,7 +128,7 @@ def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> li
 
 
 def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
-    """What first turns have beyond that: turns that are none, beams that are lost.
+    """Check first turns for invalid turn numbers and lost beams.
 
     Args:
         ring: the design.
@@ -150,7 +149,7 @@ def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
         others = f"; so have {len(stops) - 1} others" if len(stops) > 1 else ""
         text = (
             f"shot {data.shots[shot]} has no reading behind {_place(ring, data, last[shot][-1])}"
-            f"{others}: the beam was lost there, or the monitors behind did not record; it is "
+            f"{others}: the beam was lost there, or the BPMs behind did not record; it is "
             "used up to there"
         )
         checks.append(note("lost beam", text))
@@ -160,7 +159,7 @@ def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
 
 
 def _no_signal(ring: Ring, lost: LostBeam) -> str:
-    """Where the beam was lost, by constant readings."""
+    """The message where the beam was lost, by constant readings."""
     data, shots = lost.without, lost.shots
     ends = sorted(set(lost.last[shots].tolist()))
     names = [_place(ring, data, end) if end >= 0 else "the start" for end in ends]
@@ -170,7 +169,7 @@ def _no_signal(ring: Ring, lost: LostBeam) -> str:
     return (
         f"no signal: beam lost {where}"
         + (f" in {which}" if number > 1 else "")
-        + "; the BPMs read a constant from there on, and these readings are left out"
+        + "; the BPMs read a constant from there on, and these readings are rejected"
     )
 
 
@@ -183,7 +182,7 @@ def _place(ring: Ring, data: Measurement, reading: int) -> str:
 
 
 def _turns(there: Flags) -> Check:
-    """Turns far behind the others with next to nothing in them."""
+    """The check for turns far behind the others with few readings."""
     count = there.sum(axis=(0, 2))
     read = np.flatnonzero(count)
     full = count.max()
@@ -193,14 +192,14 @@ def _turns(there: Flags) -> Check:
         return wrong(
             "turns",
             f"nothing was read between turn {first} and turn {last}, which has {count[last]} of "
-            f"{full} readings: a wrong number in the column 'turn'; mend that row",
+            f"{full} readings: a wrong number in the column 'turn'; correct that row",
         )
     turns = f"turns {read[0]} to {read[-1]} were" if len(read) > 1 else f"turn {read[0]} was"
     return fine("turns", f"{turns} read")
 
 
 def few(ring: Ring, data: Measurement | OrbitResponse) -> Check | None:
-    """Too few monitors for anything, if they are."""
+    """The check for too few BPMs."""
     if not ring.monitors:
         return wrong(
             "monitors", f"'{ring.name}' has no monitor; name those elements of the lattice that "

@@ -1,6 +1,6 @@
-"""What a joint diagnosis leaves of each measurement, model after model, and who judges.
+"""Residuals of each measurement for each model of a joint diagnosis, and their validation.
 
-The models are the design, the design with small errors, and that with what was found.
+The models are the design, the design with distributed errors, and that with the findings.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 GAP = 0.05
-"""Chi-square per reading beyond the noise below which there is no gap to close."""
+"""Chi-square per reading beyond the noise below which there is no gap."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ def stages_of(
     small: FittedErrors | None,
     causes: tuple[Cause, ...],
 ) -> list[Stage]:
-    """The design; then with small errors and with the causes among them, or with one cause after
-    the other."""
+    """The models: the design; then with distributed errors and with the causes, or with one cause
+    after another."""
     models: list[tuple[tuple[Cause, ...], tuple[Cause, ...], Array]] = [((), (), problem.first)]
     about: dict[Hypothesis, float] = {}
     if small is not None:
@@ -80,7 +80,7 @@ def stages_of(
 
 
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
-"""Of the way to the likeliest small errors, with which a beam may not be stored."""
+"""The share of the step to the most probable distributed errors that stores a beam."""
 
 
 def _settled(
@@ -100,24 +100,23 @@ def _settled(
         if not point.lost or not static:
             break
     if point.lost:
-        raise MeasurementError(f"{point.lost}, with what was found: too much to be explained")
+        raise MeasurementError(f"{point.lost}, with the findings: the errors are too large")
     return Stage(some, own, point, share)
 
 
 def too_large(stages: Sequence[Stage]) -> list[str]:
-    """A sentence where the last model has not all of the small errors: what it leaves is then no
-    measure of them."""
+    """The message that the last model lacks a part of the distributed errors, or empty."""
     share = stages[-1].share
     if share == 1:
         return []
     return [
-        f"no beam is stored with all of the small errors that were learnt: the figures of what is "
-        f"left are for {share:.4g} of the last step to them"
+        f"no beam is stored with all of the estimated distributed errors: the residuals "
+        f"are for {share:.4g} of the last step to them"
     ]
 
 
 def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:
-    """Residuals in units of the noise, and the noise, of the readings of a problem (of some)."""
+    """Residuals in units of the noise, and the noise, of all or some readings of a problem."""
     there = problem.valid if among is None else problem.valid & among
     rows = problem.as_rows(there.astype(float))
     own = rows > 0
@@ -127,7 +126,7 @@ def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[A
 def views_of(
     parts: Sequence[Part], problem: CombinedProblem, stages: Sequence[Stage]
 ) -> tuple[PartView, ...]:
-    """What each measurement leaves before and after."""
+    """Residuals of each measurement before and after."""
     views = []
     for i, (part, own) in enumerate(zip(parts, problem.parts, strict=False)):
         points = [stage.point.view[i] for stage in (stages[0], stages[-1])]
@@ -147,7 +146,7 @@ def views_of(
 
 
 def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = ()) -> Misfit:
-    """Of all readings, those in metres for the rms."""
+    """The misfit of all readings; the rms of those in metres."""
     left, sizes = [], []
     for i, (problem, point) in enumerate(pairs):
         some = among[i] if among else problem.valid
@@ -163,7 +162,7 @@ def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = (
 def pairs_of(
     parts: Sequence[Part], problem: CombinedProblem, stage: Stage
 ) -> list[tuple[Problem, Point]]:
-    """Of the measurements themselves, not of their reference."""
+    """The misfit of the measurements without their reference."""
     return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
 
 
@@ -174,8 +173,8 @@ def held_out(
     aside: set[str],
     since: int,
 ) -> Gap | None:
-    """Half of the monitors gives a held-out shot its nuisances, the other half judges; monitors
-    that were set aside do neither."""
+    """Held-out shots: half of the BPMs determines the nuisances, the other half is the validation
+    set. Rejected BPMs are in neither."""
     judges = []
     for part in parts:
         if (judge := part.heldout) is not None:
@@ -214,7 +213,7 @@ def held_out_shots(
     stages: Sequence[Stage],
     since: int,
 ) -> Gap | None:
-    """The gap on held-out first turns, in the covariance of their prediction.
+    """Return the gap on held-out first turns, in the covariance of their prediction.
 
     Of the design; with the small errors, as the fit without causes leaves them; with the findings,
     one by one where there are no small errors.
@@ -242,7 +241,7 @@ def held_out_shots(
 
 
 def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stage) -> Array | None:
-    """Covariance of what is not known of other shots, once these have been explained.
+    """Return the covariance of the prediction of other shots.
 
     Of the small errors what the readings leave open, and of the amounts of the causes: as in
     universal kriging (Matheron 1969), whose drift launches and amounts are.
@@ -281,7 +280,7 @@ def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stag
 def trajectory_view(
     problem: CombinedProblem, found: Explanation, stages: Sequence[Stage]
 ) -> TrajectoryView:
-    """What plots of first turns need."""
+    """The view of first turns, for plots."""
     (own,) = problem.parts
     assert isinstance(own, FirstTurns)
     before, after = (stages[i].point.view[0].view.readings for i in (0, -1))
@@ -292,7 +291,7 @@ def trajectory_view(
 def seen_by(
     parts: Sequence[Part], problem: CombinedProblem, point: Point, finding: Finding
 ) -> dict[str, float] | None:
-    """Share of each measurement in what is known of a finding's amount."""
+    """The share of each measurement in the information on a finding's amount."""
     own = [i for i, c in enumerate(point.causes)
            if (c.effect, c.element) == (finding.effect, finding.element)]  # fmt: skip
     if not own or point.projection is None or find(point.causes[own[0]].effect).discrete:

@@ -1,8 +1,8 @@
 """The data checks of a stored beam: turns, closed orbits, dispersion and tunes, as a whole.
 
-Small errors of a ring leave its lines, its dispersion and its orbits' changes nearly those of the
-design; exchanged planes, a wrong sign or unit, monitors in another order do not, and another ring
-has others altogether. What differs is a share of the whole, so no noise has to be known.
+Distributed errors leave its lines, dispersion and orbit changes close to the design's. Swapped
+planes, a wrong sign or unit, BPMs in another order, or another ring do not. The difference is a
+share of the whole, so no noise has to be known.
 """
 
 from collections.abc import Callable
@@ -30,12 +30,12 @@ ComplexArray = NDArray[np.complex128]
 Flags = NDArray[np.bool_]
 
 OTHER = 0.3
-"""Share that differs from the design's from which data are not those of the ring as stated: strong
-errors everywhere (a beta beat of a half) leave 0.1."""
+"""Share of difference from which on the data do not match the ring as stated; strong distributed
+errors (a beta beat of a half) leave 0.1."""
 CORRECTED = 0.35
-"""Share of that at most which is left where a global error is undone."""
+"""Share of that difference at most after a global error is corrected."""
 TUNE = 0.1
-"""From the design's tune to one that is another ring's, or of the other plane."""
+"""Distance of tunes from which on one is another ring's, or of the other plane."""
 SHIFTS = (-3, -2, -1, 1, 2, 3)
 GLOBAL = "signs, units and order"
 
@@ -45,8 +45,8 @@ Change = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class GlobalError:
-    """Something that may be wrong everywhere: its words, what mends it, how it is undone in data
-    [..., monitor, plane, ...]."""
+    """A possible global error: its words, its correction, and its inverse for data [..., monitor,
+    plane, ...]."""
 
     words: str
     correction: str
@@ -54,13 +54,12 @@ class GlobalError:
 
 
 SWAPPED = GlobalError(
-    "the planes are exchanged everywhere", "exchange x and y", lambda data: data[..., ::-1]
+    "the planes are swapped everywhere", "swap x and y", lambda data: data[..., ::-1]
 )
 
 
 def _of_lines() -> list[GlobalError]:
-    """Of lines [shot, mode, monitor, plane]. An orbit is too smooth to tell the order of monitors:
-    the dispersion of a machine with small errors is as near to that of the next ones."""
+    """Global errors of lines [shot, mode, monitor, plane]."""
     turned = GlobalError(
         "the turns are numbered backwards", "number them from the kick on", np.conj
     )
@@ -103,14 +102,14 @@ UNITS = [
     )
 ]  # fmt: skip
 WHOLE = [*SIGNS, *UNITS, SWAPPED]
-"""What an orbit's change tells."""
+"""Global errors of an orbit's change."""
 
 
 def raise_if_wrong(ring: Ring, data: StoredData, problem: Stored) -> None:
-    """Whether something is wrong everywhere that can be undone: no diagnosis means anything then.
+    """Raise an error if a global error can be corrected.
 
     Raises:
-        MeasurementError: what it is, and its mend.
+        MeasurementError: the error, and its correction.
     """
     turns = problem if isinstance(problem, ManyTurns) else None
     for check in stored_checks(ring, data, turns):
@@ -119,7 +118,7 @@ def raise_if_wrong(ring: Ring, data: StoredData, problem: Stored) -> None:
 
 
 def stored_checks(ring: Ring, data: StoredData, turns: ManyTurns | None = None) -> list[Check]:
-    """What is wrong with a measurement of a stored beam, one after another.
+    """Return the checks of a measurement of a stored beam.
 
     Args:
         ring: the design.
@@ -150,7 +149,7 @@ def stored_checks(ring: Ring, data: StoredData, turns: ManyTurns | None = None) 
         return [*checks, wrong("data", str(error))]
     if not any(data.settings) or len(own.data) < 2:
         text = (
-            "one orbit is the sum of all errors: it tells neither signs nor the order of monitors"
+            "one orbit is the sum of all errors: it determines neither signs nor the order of BPMs"
         )
         return [*checks, fine(GLOBAL, text)]
     changes = own.data - own.data.mean(axis=0)
@@ -158,7 +157,7 @@ def stored_checks(ring: Ring, data: StoredData, turns: ManyTurns | None = None) 
 
 
 def _values(data: TurnByTurn | ClosedOrbit | Dispersion) -> Array:
-    """[reading, monitor, 2], m."""
+    """Readings of an orbit's change, [reading, monitor, 2], m."""
     if isinstance(data, TurnByTurn):
         return data.readings.reshape(-1, *data.readings.shape[2:])
     return data.orbit if isinstance(data, ClosedOrbit) else data.orbits
@@ -168,7 +167,7 @@ def _values(data: TurnByTurn | ClosedOrbit | Dispersion) -> Array:
 def _of_orbits(
     ring: Ring, problem: Stored, data: Array, what: str, corrections: list[GlobalError]
 ) -> list[Check]:
-    """Data [state, monitor, 2] beside what the design does."""
+    """Check data [state, monitor, 2] against the design's."""
     design = problem.read(problem.view(()), NOTHING)
     if what != "dispersion":
         design = design - design.mean(axis=0)
@@ -176,7 +175,7 @@ def _of_orbits(
     noise = 2 * float(np.sum(problem.errors[problem.used] ** 2))
 
     def share(own: Array) -> float:
-        """Of what is read, and of the design's there, beyond the noise."""
+        """The shares of the readings and of the design beyond the noise."""
         there = np.isfinite(own)
         left = np.sum(np.where(there, own - design, 0.0) ** 2)
         size = np.sum(np.where(there, own, 0.0) ** 2) + np.sum(np.where(there, design, 0.0) ** 2)
@@ -190,7 +189,8 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
     modes = np.stack([np.moveaxis(b.shown.modes, -1, 0) for b in problem.view(()).beams])
 
     def share(own: ComplexArray) -> float:
-        """Of the lines, up to one complex factor a mode, that are not the model's."""
+        """The share of the lines, up to one complex factor a mode, that differs from the
+        model's."""
         seen = np.isfinite(own)
         read, model = (np.where(seen, one, 0.0) for one in (own, modes))
         inner = np.abs(np.sum(read.conj() * model, axis=(2, 3))) ** 2
@@ -199,7 +199,7 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
         return float(np.median(left[sizes > 0])) if (sizes > 0).any() else 1.0
 
     def swaps(_: ComplexArray) -> ComplexArray:
-        """Anew: each line is looked for near to the tune of its plane."""
+        """The lines, searched for near the tune of each plane."""
         try:
             other = replace(data, readings=data.readings[..., ::-1], noise=None)
             return _lines(many_turns(ring, other, problem.places))
@@ -213,7 +213,7 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
 
 
 def _lines(problem: ManyTurns) -> ComplexArray:
-    """Complex amplitudes [shot, mode, monitor, plane], NaN where none is known."""
+    """Complex amplitudes [shot, mode, monitor, plane]; NaN where unknown."""
     used = problem.used[:, :LINES]
     both = np.where(used, problem.data[:, :LINES], np.nan)
     both = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
@@ -221,16 +221,16 @@ def _lines(problem: ManyTurns) -> ComplexArray:
 
 
 def _near(ring: Ring, tunes: Array, used: Flags) -> Check:
-    told = ", ".join(
+    measured = ", ".join(
         f"Q{'xy'[mode]} = {np.mean(tunes[used[:, mode], mode]) % 1:.4f}"
         for mode in (0, 1) if used[:, mode].any()
     )  # fmt: skip
-    return fine("tunes", f"{told}, near to those of '{ring.name}'")
+    return fine("tunes", f"{measured}, near to those of '{ring.name}'")
 
 
 # --- tunes ----------------------------------------------------------------------------------------
 def _tunes(near: Array, data: TuneReading, ring: Ring) -> list[Check]:
-    """Tunes [shot, 2], beside those of the design."""
+    """Check tunes [shot, 2] against those of the design."""
     from tmlattice.optics import ring_tunes
 
     design = ring_tunes(ring)
@@ -244,31 +244,33 @@ def _tunes(near: Array, data: TuneReading, ring: Ring) -> list[Check]:
 
     x, y = read
     others = {
-        "the tunes are exchanged": ((y, x), "exchange Qx and Qy"),
-        "Qx is 1 - Qx": ((1 - x, y), "give 1 - Qx: a spectrum does not tell Q from 1 - Q"),
-        "Qy is 1 - Qy": ((x, 1 - y), "give 1 - Qy: a spectrum does not tell Q from 1 - Q"),
-        "both are 1 - Q": ((1 - x, 1 - y), "give 1 - Q: a spectrum does not tell Q from 1 - Q"),
+        "the tunes are swapped": ((y, x), "swap Qx and Qy"),
+        "Qx is 1 - Qx": ((1 - x, y), "give 1 - Qx: a spectrum does not separate Q from 1 - Q"),
+        "Qy is 1 - Qy": ((x, 1 - y), "give 1 - Qy: a spectrum does not separate Q from 1 - Q"),
+        "both are 1 - Q": ((1 - x, 1 - y), "give 1 - Q: a spectrum does not separate Q from 1 - Q"),
     }  # fmt: skip
     stated = off(read)
-    told = f"Qx = {x:.4f}, Qy = {y:.4f}; '{ring.name}' has {design[0]:.4f} and {design[1]:.4f}"
+    measured = f"Qx = {x:.4f}, Qy = {y:.4f}; '{ring.name}' has {design[0]:.4f} and {design[1]:.4f}"
     if stated < TUNE:
-        return [fine("tunes", told)]
+        return [fine("tunes", measured)]
     words = min(others, key=lambda name: off(np.array(others[name][0])))
     if off(np.array(others[words][0])) < CORRECTED * stated:
-        return [wrong(GLOBAL, f"{words}: {told}; {others[words][1]}")]
-    return [wrong("tunes", f"the tunes are not the ring's: {told}; name the lattice as it is set")]
+        return [wrong(GLOBAL, f"{words}: {measured}; {others[words][1]}")]
+    return [
+        wrong("tunes", f"the tunes are not the ring's: {measured}; name the lattice as it is set")
+    ]
 
 
-# --- what is said ---------------------------------------------------------------------------------
+# --- messages ---------------------------------------------------------------------------------
 def _judged(
     ring: Ring, what: str, share: Callable[[Any], float], data: Any, corrections: list[GlobalError]
 ) -> list[Check]:
-    """The share that differs as stated, and with each thing undone that may be wrong."""
+    """The check of the difference as stated, and with each global error corrected."""
     stated = share(data)
     text = f"the typical {what} is the design's to {100 * np.sqrt(stated):.0f} % of its size"
     if stated < OTHER:
         return [
-            fine(GLOBAL, "no global error would make the data agree better"), fine("lattice", text)
+            fine(GLOBAL, "no global error would improve the agreement"), fine("lattice", text)
         ]  # fmt: skip
     left = [share(one.undo(data)) for one in corrections]
     best = int(np.argmin(left))
@@ -280,7 +282,7 @@ def _judged(
                 GLOBAL,
                 f"{one.words}: the typical {what} differs from the design's by "
                 f"{100 * np.sqrt(stated):.0f} % of its size as stated, by {after:.0f} % with that "
-                f"undone; {one.correction}",
+                f"corrected; {one.correction}",
             )
         ]
     return [
@@ -288,6 +290,6 @@ def _judged(
             "lattice",
             f"the data are not those of '{ring.name}': the typical {what} differs from the "
             f"design's by {100 * np.sqrt(stated):.0f} % of its size; name the lattice of this "
-            "machine, and check the names and the order of the monitors",
+            "machine, and check the names and the order of the BPMs",
         )
     ]

@@ -1,10 +1,10 @@
 """A sparse solution alone, or together with distributed errors: what the data determine.
 
-A machine has small errors everywhere. Where the noise hides them, a few causes explain the readings
-alone; that is tried first, unless neighbouring monitors disagree all along the ring. Where it
-leaves more than noise, the variance components of the distributed errors are learnt from what is
-left, and their evidence decides whether they are in the model. The same steps serve every kind of
-measurement, and several together.
+Every machine has distributed errors. Where the noise exceeds them, a sparse solution alone explains
+the readings; it is tried first, unless neighbouring BPMs disagree all along the ring. Where it
+leaves more than noise, the variance components of the distributed errors are learnt, and the
+marginal likelihood decides whether they are in the model. Every kind of measurement, and several
+together, take the same steps.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,37 +30,38 @@ from tmlattice.inference.search import Explanation, Search, explain, on_readings
 Array = NDArray[np.float64]
 
 FEW = 3
-"""Causes that are sought alone before anybody asks for small errors."""
+"""Causes of a sparse solution before distributed errors are tried."""
 
 CROWDED = 1.5
-"""Median misfit between neighbouring monitors, or of monitors, in units of the noise, above which
-faults are not sparse: a few leave most monitors as the design has them."""
+"""Median misfit between neighbouring BPMs, in units of the noise, above which faults are not
+sparse."""
 
 MOST_OF_IT = 0.5
-"""Share of the gap that one cause explains, from which on small errors are learnt without it."""
+"""Share of the gap of one cause from which on variance components are learnt without it."""
 
 DOUBT = 8.0
-"""Statistic of the likeliest fault from which on it is weighed with sizes learnt without it."""
+"""Statistic of the most probable fault from which on it is compared, with prior scales learnt
+without it."""
 
 OUTLYING = 5.0
-"""Times its usual size from which a small error that outweighs its family is weighed as a fault:
-of machines in good order one in a million has it."""
+"""Ratio of an amount to the usual rms from which on an outlier of its family is compared as a
+fault; one in a million of healthy machines has it."""
 
 AMOUNT = 5.0
-"""Log evidence that an amount costs which may be anything: even over four decades, of both signs,
+"""Log evidence that an unconstrained amount costs: log-uniform over four decades, of both signs,
 known to some per cent."""
 
 POOR = 0.01
-"""Chance that noise leaves as much as an explanation, below which its small errors are doubted."""
+"""Probability of so large a residual by noise below which distributed errors are compared."""
 
 NEAR = 7.0
-"""Log evidence by which a rival is behind that sizes learnt with the fault among them may hide."""
+"""Log evidence by which an alternative may be behind while prior scales include the fault."""
 
 SETTLED = 3
-"""How often small errors are taken again along what was found, until no rival of it leads."""
+"""Most relinearisations of the distributed errors, until no alternative leads."""
 
 CLEAR = 10.0
-"""Log evidence above which small errors are there."""
+"""Log evidence above which distributed errors are in the model."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def sought(
     known: DistributedErrors | None = None,
     earlier: Found | None = None,
 ) -> Found:
-    """Return what explains the data.
+    """Return the explanation of the data.
 
     Args:
         search: what is searched.
@@ -134,13 +135,13 @@ def sought(
         learn = False
     tried: list[FittedErrors] = []
     for causes in asides:
-        with suppress(UnstableRingError):  # then they are none that anybody learns
+        with suppress(UnstableRingError):  # then they are not learnt
             tried.append(fit_distributed_errors(
                 problem, first, begun.nuisances, causes, learn=learn, noisy=noisy,
                 linearised_at=amounts,
             ))  # fmt: skip
     if not tried or (learn and max(small.log_evidence for small in tried) < CLEAR):
-        if few is None:  # errors all along the ring: a few names at most
+        if few is None:  # distributed errors: a sparse set of causes at most
             few = explain(replace(search, most=min(FEW, search.most), unnamed=False), start)
         elif few.full and few.count < search.most:
             few = explain(search, start, few)
@@ -159,7 +160,7 @@ def sought(
 MOST_COMMON = 8
 """Causes of a reference at most."""
 ROUNDS = 3
-"""How often something that is found in the measurement may turn out to be in its reference too."""
+"""Most findings of the measurement that may turn out to be in its reference too."""
 
 
 def sought_since(
@@ -171,12 +172,11 @@ def sought_since(
     learn: bool,
     noisy: bool = False,
 ) -> Found:
-    """Return what explains a measurement and is not in its reference.
+    """Return the explanation of a measurement that is not in its reference.
 
-    What is in both and large is no small error: it has to be in the model, or its every change from
-    launch to launch passes for a fault. So the reference is diagnosed alone first. What it shows
-    too weakly for that is found in the measurement; it is in both where the readings are likelier
-    so.
+    A large error of both has to be in the model, or its change from launch to launch looks like a
+    fault. So the reference is diagnosed alone first. An error that it shows too weakly is found in
+    the measurement, and is in both if that makes the readings more probable.
 
     Args:
         search: of the measurement and its reference.
@@ -203,7 +203,7 @@ def _of_ring(causes: Sequence[Cause]) -> tuple[Cause, ...]:
 
 
 def _in_both(explanation: Explanation) -> tuple[Cause, ...]:
-    """Of what was found in the measurement, what the reference rather has than lacks."""
+    """Findings of the measurement that are more probably in the reference too."""
     problem, result = explanation.problem, explanation.fit
     shared = []
     for i, cause in enumerate(result.causes):
@@ -218,12 +218,12 @@ def _in_both(explanation: Explanation) -> tuple[Cause, ...]:
 def _among(
     search: Search, small: FittedErrors, learn: bool, noisy: bool
 ) -> tuple[Explanation, FittedErrors]:
-    """The small errors, linearised again at what is found where that misleads."""
+    """The distributed errors, linearised again at the findings where needed."""
     problem = search.problem
     unnamed = search.unnamed and bool(len(problem.kick_places))
     search = replace(search, unnamed=unnamed)
-    few = min(2, search.most)  # two findings say already whether it has to be taken again
-    stale = learn  # what is found made sizes too large
+    few = min(2, search.most)  # two findings show already whether it has to be linearised again
+    stale = learn  # the findings made the prior scales too large
     search.progress("scan")
     narrow = replace(search, most=few, labelled_first=True)
     explanation = explain(replace(narrow, problem=small.problem), small.before)
@@ -233,16 +233,16 @@ def _among(
             break
         search.progress("small errors with what was found")
         beside, causes = doubt
-        weigh = not explanation.count and beside is explanation.fit  # one of the small errors
+        weigh = not explanation.count and beside is explanation.fit  # one of the distributed errors
         try:
             again, causes = _linearised(small, beside, causes, learn, noisy, weigh)
         except UnstableRingError:
-            break  # what was found is no place from which they can be taken again
+            break  # no linearisation exists at the findings
         if again.outlier_evidence is not None and again.outlier_evidence > AMOUNT:
             narrow = replace(narrow, established=frozenset((c.effect, c.element) for c in causes))
         other = explain(replace(narrow, problem=again.problem), again.before)
         if not explanation.count and not other.count:
-            break  # it was a small error after all
+            break  # it is one of the distributed errors
         small, explanation, stale = again, other, False
     if explanation.full and search.most > few:
         whole = replace(search, problem=small.problem, established=narrow.established)
@@ -289,7 +289,7 @@ def _linearised(
 def _parted(
     causes: Sequence[Cause], amounts: Array, known: DistributedErrors, problem: Problem
 ) -> tuple[tuple[Cause, ...], Array]:
-    """Causes, and small errors without a share in both: all is the cause's.
+    """Causes, and distributed errors without a share in them: the causes have it all.
 
     Small errors are in a reference too, and causes are not: there both have their own.
     """
@@ -308,7 +308,7 @@ def _parted(
 def _settled(
     search: Search, explanation: Explanation, small: FittedErrors, learn: bool, noisy: bool
 ) -> tuple[Explanation, FittedErrors]:
-    """Small errors linearised at all that was found, its amounts among them, and its rivals too.
+    """Distributed errors linearised at all findings with their amounts, and the alternatives too.
 
     What they took up of a fault before it was found spoils the slopes at which its rivals were
     weighed: by ten in the log evidence, for a fault of 50 times the noise.
@@ -323,13 +323,13 @@ def _settled(
     if not again.good:
         return explanation, small
     settled = replace(explanation, problem=problem, fit=again, before=about.before)
-    if _left(settled) < POOR:  # so large that they are linear nowhere: slopes as good as any
+    if _left(settled) < POOR:  # too large to be linear anywhere
         return settled, about
     return revised(replace(search, problem=about.problem, keep=True), settled), about
 
 
 def _undecided(explanation: Explanation) -> bool:
-    """Whether something at another place does nearly as well as what was found."""
+    """Whether an alternative at another place explains nearly as much."""
     for named in explanation.named:
         best = named.alternatives[0]
         for other in named.alternatives[1:]:
@@ -342,12 +342,12 @@ def _undecided(explanation: Explanation) -> bool:
 def _given(
     explanation: Explanation, small: FittedErrors, learn: bool
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
-    """Given which fit, and which causes, small errors have to be taken again; None: they stand.
+    """The fit and the causes to linearise the distributed errors at; None where they stay.
 
     A strong fault's orbit makes small errors look like further faults, so the strongest finding is
     taken along. A monitor that was set aside has errors of its own that took up what they could: it
     starts anew. And sizes that were learnt with a fault among them are too large, so that it passes
-    for a small error: where nothing was found the likeliest fault has to be weighed without it.
+    for a small error: where nothing was found the most probable fault has to be weighed without it.
     """
     if not explanation.count:
         if not learn:
@@ -356,8 +356,10 @@ def _given(
         amounts = small.problem.estimate(explanation.fit.clean).tolist()
         estimate = [Cause(*h, a) for h, a in zip(known.hypotheses, amounts, strict=True)]
         cause = outlier(estimate, small.sizes)
-        if cause is not None and small.plain.alone:  # else it is in the reference too
-            return explanation.fit, (replace(cause, amount=0.0),)  # so far all is a small error's
+        if cause is not None and small.plain.alone:  # else the reference has it too
+            return explanation.fit, (
+                replace(cause, amount=0.0),
+            )  # so far it is all in the distributed errors
         cause = _most_probable(explanation)
         if cause is None:
             return None
@@ -367,20 +369,20 @@ def _given(
     doubtful = explanation.count > 1 or _left(explanation) < POOR
     if not (explanation.monitors or (found.causes and doubtful)):
         return None
-    # the others may be the background's
+    # the others may be distributed errors
     return found, (strongest(explanation),) if explanation.named else ()
 
 
 # --- weighing ------------------------------------------------------------------------------------
 def _likelier(few: Explanation, among: Explanation) -> bool:
-    """Whether faults alone explain all, and clearly better than fewer among small errors do, on
-    the readings that both keep."""
+    """Whether faults alone explain all, and better than fewer with distributed errors, on common
+    readings."""
     dropped = few.dropped | among.dropped
     return explained(few) and _log_marginal(few, dropped) > CLEAR + _log_marginal(among, dropped)
 
 
 def _log_marginal(found: Explanation, dropped: NDArray[np.bool_] | None = None) -> float:
-    """Log evidence, nuisances and small errors integrated out, up to a constant of the readings."""
+    """Log evidence, nuisances and distributed errors integrated out, up to a constant."""
     problem = found.problem if dropped is None else found.problem.without(dropped)
     evidence, again = on_readings(problem, found)
     if not again.good:
@@ -389,25 +391,25 @@ def _log_marginal(found: Explanation, dropped: NDArray[np.bool_] | None = None) 
 
 
 def explained(found: Explanation) -> bool:
-    """Whether few causes leave nothing but noise."""
+    """Whether a sparse solution leaves only noise."""
     more, _ = found.problem.judgement.noise
     return _left(found) >= more
 
 
 def _left(found: Explanation) -> float:
-    """Chance that noise leaves as much."""
+    """Probability of so large a residual by noise."""
     return float(chi2.sf(found.fit.chi2, freedom(found.problem, found.fit)))
 
 
 def freedom(problem: Problem, result: Fit) -> int:
-    """Degrees of freedom: readings and priors, less what was fitted."""
+    """Degrees of freedom: readings and priors, less the fitted numbers."""
     amounts = sum(not find(cause.effect).discrete for cause in result.causes)
     kicks = sum(len(values) for values in result.kicks.values())
     return max(problem.freedom - amounts - kicks, 1)
 
 
 def _outstanding(few: Explanation) -> tuple[Cause, ...]:
-    """A cause that alone makes most of the gap: it would make all small errors too large."""
+    """A cause that alone explains most of the gap and would increase all prior scales."""
     if not few.named:
         return ()
     clear = max(named.detection.statistic for named in few.named)
@@ -416,7 +418,7 @@ def _outstanding(few: Explanation) -> tuple[Cause, ...]:
 
 
 def _crowded(found: Explanation) -> bool:
-    """Whether most monitors still read something else."""
+    """Whether most BPMs still disagree."""
     problem = found.problem
     left, _ = problem.left(found.fit.point)
     owner = problem.owner()[problem.valid]
@@ -429,19 +431,19 @@ def _crowded(found: Explanation) -> bool:
 
 
 def strongest(explanation: Explanation) -> Cause:
-    """The named cause that was seen most clearly."""
+    """The named cause with the largest statistic."""
     clear = [named.detection.statistic for named in explanation.named]
     return explanation.fit.causes[int(np.argmax(clear))]
 
 
 def outlier(estimate: Sequence[Cause], sizes: Mapping[str, float]) -> Cause | None:
-    """The small error that no machine in good order has: it outweighs its family by far.
+    """The outlier among the distributed errors: an amount far above its family's scale.
 
     A family of which the readings see few (four correctors that are set) takes its size from such a
     one, and so hides it.
 
     Args:
-        estimate: the likeliest small errors.
+        estimate: the most probable small errors.
         sizes: rms of their families, as learnt: where all are large, so is what is usual.
     """
     usual = {name: find(name).background or np.inf for name in sizes}
@@ -457,7 +459,7 @@ def outlier(estimate: Sequence[Cause], sizes: Mapping[str, float]) -> Cause | No
 
 
 def _most_probable(explanation: Explanation) -> Cause | None:
-    """What the scan sees most of, if that is to be doubted."""
+    """The leading hypothesis of the scan, if it is doubtful."""
     scan = explanation.first
     top = int(np.argmax(scan.statistic)) if len(scan.statistic) else -1
     if top < 0 or scan.statistic[top] < DOUBT:

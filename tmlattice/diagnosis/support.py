@@ -1,4 +1,4 @@
-"""How much of a fitted number comes from the data, and what it is degenerate with.
+"""The share of a fitted number that comes from the data, and its degeneracies.
 
 >>> support = diagnosis.support("quadrupole_gradient", "qd::12")
 >>> support.share_from_data, support.determined, support.degenerate_with
@@ -10,14 +10,13 @@ from typing import Any
 from tmlattice.effects import find
 
 DETERMINED = 0.5
-"""Share of a number from the data below which they do not determine it: the prior then knows more
-of it than they do (1 - posterior variance / prior variance is the data's share of the posterior
-precision)."""
+"""Share from the data below which a number is undetermined (1 - posterior variance / prior
+variance)."""
 
 
 @dataclass(frozen=True)
 class Support:
-    """Of one fitted number.
+    """The support of one fitted number by the data.
 
     Attributes:
         share_from_data: 1 - posterior variance / prior variance, from 0 to 1.
@@ -67,4 +66,4 @@ def share_of_fault(effect: str | None, sigma: float | None) -> float | None:
 
 
 FREE = Support(1.0)
-"""Of an amount with a log-uniform prior: any power of ten is as likely."""
+"""The support of an amount with a log-uniform prior."""

@@ -1,8 +1,8 @@
-"""Suspects: where to look first for a fault that was not detected.
+"""Suspects: the first places to inspect for an undetected fault.
 
-On a `distributed` verdict what the search found is rejected, or small errors everywhere explain the
-data; a fault among them is most probably where the scan's statistic is largest. In a fit of
-families of errors it is an amount that is an outlier of its family.
+On a `distributed` verdict the search has no accepted findings, or distributed errors explain the
+data. An undetected fault is most probable where the scan's statistic is largest. In a hierarchical
+fit it is an amount that is an outlier of its family.
 
 >>> [(one.kind, one.element) for one in suspects(ring, explanation, judgement)]
 >>> [(one.element, one.amount) for one in outliers(ring, causes, errors, findings)]
@@ -25,21 +25,21 @@ MOST = 3
 """Suspects of each kind."""
 
 FLOOR = 9.0
-"""Fall of chi-square from which on a hypothesis is suspect: 3 sigma of one looked at alone."""
+"""Fall of chi-square from which on a hypothesis is suspect: 3 sigma for a single test."""
 
 SuspectKind = Literal["monitor", "corrector", "magnet", "section"]
 
 OUTLIER = 5.0
-"""Distance from the median of its family, in units of the family's robust scatter and of its own
-error, above which an amount is an outlier."""
+"""Distance from the family's median, in units of its robust scatter and of the amount's error,
+above which an amount is an outlier."""
 
 ENOUGH, SHOWN = 8, 8
-"""Amounts of a family that show a scatter; outliers that are listed."""
+"""Amounts of a family that determine a scatter; outliers that are listed."""
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A monitor, a corrector, a magnet, or a section between two monitors.
+    """A BPM, a corrector, a magnet, or a section between two BPMs.
 
     Attributes:
         kind: which of them.
@@ -89,11 +89,11 @@ class Suspect:
 
 
 Candidate = tuple[str | None, str, float]
-"""Effect, element, statistic."""
+"""The effect, element and statistic of a candidate."""
 
 
 def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tuple[Suspect, ...]:
-    """The first of each kind: what the search found, then what the scan behind it sees most of.
+    """Return the first suspects of each kind: of the search, then of the scan.
 
     Args:
         ring: the design.
@@ -105,7 +105,7 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
     threshold = explanation.scan.threshold(judgement.false_alarm)
     for effect, name, statistic in _candidates(ring, explanation):
         if name not in places:
-            continue  # the beam, or a family: no place to look at
+            continue  # the beam, or a family: no place to inspect
         element = places[name]
         where, near = between(ring, [element.s])
         kind = _kind(element)
@@ -126,8 +126,8 @@ def _kind(element: Element) -> SuspectKind:
 def outliers(
     ring: Ring, causes: Sequence[Cause], errors: Sequence[float], named: Iterable[Hypothesis]
 ) -> tuple[Suspect, ...]:
-    """Amounts of a fit of families that are outliers of their family and no findings; the largest
-    distance first.
+    """Return the outliers of their families in a hierarchical fit that are no findings, the largest
+    first.
 
     Args:
         ring: the design.
@@ -135,9 +135,9 @@ def outliers(
         named: effect and element of the findings.
     """
     found: list[Suspect] = []
-    known, told = set(named), list(zip(causes, errors, strict=True))
+    known, fitted = set(named), list(zip(causes, errors, strict=True))
     for effect in dict.fromkeys(cause.effect for cause in causes):
-        own = numbers((c, s) for c, s in told if c.effect == effect and c.element is not None)
+        own = numbers((c, s) for c, s in fitted if c.effect == effect and c.element is not None)
         if len(own) < ENOUGH:
             continue
         amounts = np.array([places[0].amount for places, _ in own])
@@ -157,12 +157,12 @@ def outliers(
     return tuple(sorted(found, key=lambda one: -one.statistic)[:SHOWN])
 
 
-def numbers(told: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...], float]]:
-    """Amounts with their errors, those that are one number of several places (a magnet's pieces,
-    all dipoles of a type) together."""
+def numbers(amounts: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...], float]]:
+    """Amounts with their errors; those of several places with one number (a magnet's pieces)
+    together."""
     found: dict[tuple[float, float], list[Cause]] = {}
     sigmas: list[float] = []
-    for cause, sigma in told:
+    for cause, sigma in amounts:
         one = bool(cause.amount) and sigma > 0
         own = (round(cause.amount / sigma, 9), sigma) if one else (float(len(found)), -1.0)
         if own not in found:
@@ -173,15 +173,15 @@ def numbers(told: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...]
 
 
 def _candidates(ring: Ring, explanation: Explanation) -> Iterator[Candidate]:
-    """By falling statistic: of the search, then of the scan of what it leaves."""
-    told: list[Candidate] = [
+    """Candidates by falling statistic: of the search, then of the scan of its residual."""
+    amounts: list[Candidate] = [
         (cause.effect, cause.element, named.detection.statistic)
         for cause, named in zip(explanation.fit.causes, explanation.named, strict=True)
         if cause.element is not None
     ]
-    told += [(None, ring.magnets[k].name, d.statistic) for k, d in explanation.kicks.items()]
-    told += [(None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()]
-    yield from sorted(told, key=lambda candidate: -candidate[2])
+    amounts += [(None, ring.magnets[k].name, d.statistic) for k, d in explanation.kicks.items()]
+    amounts += [(None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()]
+    yield from sorted(amounts, key=lambda candidate: -candidate[2])
     scan = explanation.scan
     for i in np.argsort(-scan.statistic):
         if scan.statistic[i] < FLOOR:

@@ -1,8 +1,7 @@
-"""What a diagnosis leaves known of a machine, for the next one: a model that learns.
+"""The knowledge of a machine after a diagnosis, for the next one.
 
-The ring as found is a lattice file; beside it stands what is known of the rest: calibrations, and
-the small errors with the covariance that the readings left them. A diagnosis that starts from the
-lattice file starts from both.
+The estimated ring is a lattice file. A second file has calibrations, and the distributed errors
+with their posterior covariance. A diagnosis of the lattice file reads both.
 """
 
 import base64
@@ -38,28 +37,28 @@ PRODUCTS = 2e12
 """Readings times errors squared up to which the covariance of all small errors is taken from a
 response: some six minutes of processor (`docs/together.md`)."""
 HARDLY = 0.3
-"""Relative error of a family's size from which on the usual one is not made smaller: a response
-sees kicks by the orbit in the sextupoles alone, of which it is not linear."""
+"""Relative error of a family's scale above which the usual scale is kept: a response is sensitive
+to kicks by the orbit in sextupoles alone, which is not linear."""
 
 ROUNDED = 1e-4
 """Of the products of directions: single precision rounds them by 1e-6."""
 
 FORMAT = "tmlattice-known"
 SUFFIX = ".known.json"
-"""What the name of a lattice file ends in besides."""
+"""Suffix of the knowledge of a lattice file."""
 
 
 ESTIMATED = "estimated ring"
-"""What a lattice file says that it is whose knowledge stands in a file of its own."""
+"""Model name of a lattice file with a file of knowledge."""
 
 
 def knowledge_file(lattice: Path) -> Path:
-    """Where the knowledge of a lattice file stands."""
+    """The path of the knowledge of a lattice file."""
     return Path(f"{lattice}{SUFFIX}")
 
 
 def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
-    """What a diagnosis knows beside the ring as found; None: nothing of small errors.
+    """The knowledge with the estimated ring; None: nothing on distributed errors.
 
     The small errors with their covariance. Of an orbit response they are linear about its dense
     fit; where that leaves no stored beam, or takes too long, each error of the fit has its own
@@ -80,14 +79,14 @@ def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
             "--lattice-out, or a pickle of the diagnosis"
         )
     if not isinstance(view, ResponseView) or not diagnosis.steps or diagnosis.since_reference:
-        return None  # of a change the small errors are the reference's
+        return None  # of a change the distributed errors are the reference's
     usual = background_rms({"all": None})
     everywhere = [(name, place) for name in usual for place in find(name).places(diagnosis.ring)]
     if view.data.size * len(everywhere) ** 2 <= PRODUCTS:
         try:
             return _together(diagnosis, view, usual, everywhere)
-        except UnstableRingError:  # too far from its likeliest small errors for what is linear
-            log.info("no covariance of the small errors", exc_info=True)
+        except UnstableRingError:  # too far from its most probable distributed errors to be linear
+            log.info("no covariance of the distributed errors", exc_info=True)
     return _each_alone(diagnosis, usual, everywhere)
 
 
@@ -97,10 +96,11 @@ def _together(
     usual: Mapping[str, float],
     everywhere: Sequence[Hypothesis],
 ) -> DistributedErrors:
-    """All small errors that the readings of a response allow, about its dense fit."""
+    """All distributed errors that the readings of a response constrain, linearised at its
+    hierarchical fit."""
     ring = diagnosis.ring
     data = response_data(ring, view.measured)
-    # what the model lacks is no noise, but without it all would be known better than it is
+    # model discrepancy enters as noise, so that no error is understated
     lacks = np.sqrt(max(diagnosis.fit_after.chi2_per_dof, 1.0))
     data = replace(data, noise=data.noise * lacks)
     found = {(finding.effect, finding.element) for finding in diagnosis.findings}
@@ -128,7 +128,7 @@ def _together(
     known = posterior(
         problem, DistributedErrors.usual(everywhere, sizes), learn=False, linearised_at=start
     ).known
-    inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the ring as found has them
+    inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the estimated ring has them
     return replace(
         known,
         amounts=known.amounts - np.where(inside, start, 0.0),
@@ -139,7 +139,7 @@ def _together(
 def _each_alone(
     diagnosis: Diagnosis, usual: Mapping[str, float], everywhere: Sequence[Hypothesis]
 ) -> DistributedErrors:
-    """Each error of a dense fit with its own standard deviation."""
+    """Errors of a hierarchical fit with their own standard deviations."""
     own = {(c.effect, c.element): s
            for c, s in zip(diagnosis.causes, diagnosis.errors, strict=True)}  # fmt: skip
     rms = [own[h] if own.get(h, 0.0) > 0 else usual[h[0]] for h in everywhere]
@@ -151,19 +151,18 @@ def _each_alone(
 
 
 def _held_by_ring(cause: Cause) -> bool:
-    """Whether it stands beside the ring as found: first turns have energies of
-    their own."""
+    """Whether an error is kept with the estimated ring; first turns have energies of their own."""
     return not _in_ring(cause) and not isinstance(find(cause.effect), LaunchEffect)
 
 
 def _in_ring(cause: Cause) -> bool:
-    """Whether the ring as found has it, and not a calibration beside."""
+    """Whether the estimated ring has it, and not a calibration."""
     effect = find(cause.effect)
     return isinstance(effect, RingEffect) and not effect.calibrates
 
 
 def known_document(known: DistributedErrors, lattice: Path) -> dict[str, Any]:
-    """As it stands in a file, beside the lattice file that it belongs to."""
+    """The content of the file that belongs to the lattice file."""
     from tmlattice import __version__
 
     return {
@@ -189,7 +188,7 @@ def known_document(known: DistributedErrors, lattice: Path) -> dict[str, Any]:
 
 
 def read_known(path: Path, ring: Ring) -> DistributedErrors:
-    """What stands beside a lattice file.
+    """Read the knowledge of a lattice file.
 
     Raises:
         MeasurementError: it is damaged, or of another ring, or the lattice file was changed since.
@@ -204,7 +203,7 @@ def read_known(path: Path, ring: Ring) -> DistributedErrors:
         )
     rows = document["small_errors"]
     if len({(row["effect"], row["element"]) for row in rows}) < len(rows):
-        raise MeasurementError(f"{path}: a small error stands twice; write it anew")
+        raise MeasurementError(f"{path}: a distributed error is listed twice; write it anew")
     seen = _directions(path, document["seen"], len(rows))
     share = np.array(document["seen"]["share"], dtype=float)
     places: dict[str, set[str | None]] = {}
@@ -240,4 +239,6 @@ def _directions(path: Path, seen: Mapping[str, Any], errors: int) -> Array:
     gram = rows @ rows.T
     if np.abs(gram - np.eye(count)).max(initial=0.0) > ROUNDED:
         raise MeasurementError(f"{path}: its directions are damaged; write it anew")
-    return np.asarray(1.5 * rows - 0.5 * gram @ rows)  # Newton's step: what is left is the square
+    return np.asarray(
+        1.5 * rows - 0.5 * gram @ rows
+    )  # Newton's step: the remaining error is its square

@@ -1,4 +1,4 @@
-"""What a diagnosis keeps of its measurement, for plots and tables."""
+"""Parts of a measurement that a diagnosis keeps for plots and tables."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +16,7 @@ from tmlattice.observe.first_turns import FirstTurns
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryView:
-    """What only trajectories have, for plots.
+    """The view of trajectories, for plots.
 
     Attributes:
         explanation: the search.
@@ -40,7 +40,7 @@ class TrajectoryView:
 
 @dataclass(frozen=True, eq=False)
 class ResponseView:
-    """What only an orbit response has, for plots.
+    """The view of an orbit response, for plots.
 
     Attributes:
         measured: the response, its monitors in the ring's order.
@@ -60,7 +60,7 @@ class ResponseView:
 
 @dataclass(frozen=True, eq=False)
 class PartView:
-    """One of several measurements, before and after.
+    """One of several measurements, with residuals before and after.
 
     Attributes:
         label, kind: what the user calls it, and what it is.
@@ -82,7 +82,7 @@ class PartView:
     numbers: tuple[NumberRead, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {
             "name": self.label,
             "kind": self.kind,
@@ -112,7 +112,7 @@ class StoredView:
 
 @dataclass(frozen=True, eq=False)
 class JointView:
-    """What a stored beam's measurements, or several together, have for plots.
+    """The view of a stored beam's measurements, or of several together, for plots.
 
     Attributes:
         explanation: the search.

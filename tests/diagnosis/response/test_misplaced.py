@@ -87,7 +87,7 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(small_ring, further
     assert found.response.held[v5] == held
     assert found.verdict == "localised"
     (one,) = found.findings
-    assert one.words.startswith("corrector v5 answers as if it stood 0.2 m upstream")
+    assert one.words.startswith("corrector v5 responds like one 0.2 m upstream")
     assert one.elements == ("v5",)
     assert one.s == small_ring["v5"].s
     assert one.where[0] < one.s < one.where[1]

@@ -1,2 +1,1 @@
-"""Families of errors that a dense fit may have: each is one object, and `steps` says when it is
-tried."""
+"""Families of errors of a hierarchical fit: each is one object, and `steps` lists them."""

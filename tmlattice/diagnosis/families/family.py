@@ -1,4 +1,4 @@
-"""What a family of errors of a dense fit is; see `families`."""
+"""The interface of a family of errors of a hierarchical fit; see `families`."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar
@@ -16,7 +16,7 @@ StatedCause = tuple[Cause, float]
 """A cause and the posterior rms of its amount."""
 
 TAILS = 4.0
-"""Degree of freedom of priors with tails: one magnet in a hundred may be far off."""
+"""Degrees of freedom of heavy-tailed priors: one magnet in a hundred may be an outlier."""
 
 
 class Family(ABC):
@@ -24,13 +24,13 @@ class Family(ABC):
 
     Attributes:
         name: in options and logs; its priors' names begin so.
-        effects: of the catalogue, that it is told as.
+        effects: of the catalogue, as which it is reported.
         block: 0 in-plane, 1 coupling.
         per: whose numbers they are: "monitor", "column" or "ring".
         variable: the numbers that it moves; families that share one add up.
-        trust: rms by which one round may move a number.
-        gross: a column's number that is larger starts from what the column alone says: rounds
-            would take long to go there, and the column meanwhile counts for nothing.
+        trust: step bound of a number in one round, rms.
+        gross: limit above which a column's number starts from its own estimate; else
+            the column would have no weight until the rounds reach it.
     """
 
     name: ClassVar[str]
@@ -43,17 +43,17 @@ class Family(ABC):
 
     @property
     def title(self) -> str:
-        """Its effects, for people."""
+        """The names of its effects."""
         return ", ".join(self.effects)
 
     @property
     def largest(self) -> float:
-        """The largest fault of one member, in the unit of the numbers; 0: they have no members."""
+        """The largest fault of one member, in the unit of the numbers; 0: no members."""
         return find(self.effects[0]).largest
 
     @abstractmethod
     def size(self, data: ResponseData) -> int:
-        """How many numbers its variable has."""
+        """The number of parameters of its variable."""
 
     @abstractmethod
     def groups(self, data: ResponseData) -> list[Group]:
@@ -61,32 +61,32 @@ class Family(ABC):
 
     @abstractmethod
     def rows(self, at: Predicted, values: Array) -> Array:
-        """What readings of its block do, m: [number, column, monitor], or per column, or monitor,
-        each reading's own number alone, [column, monitor]."""
+        """Derivatives of the readings of its block, m: [number, column, monitor]; or, for numbers
+        of one column or BPM, [column, monitor]."""
 
     @abstractmethod
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """Errors with these, instead of none."""
+        """The errors with these values."""
 
     @abstractmethod
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """As causes, with errors."""
+        """The values as causes, with errors."""
 
     @abstractmethod
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """What a unit of each number is of the catalogue's effects (amounts, to their powers): of
-        small numbers."""
+        """The catalogue's effects (amounts, to their powers) of a unit of each number, for small
+        numbers."""
 
     def count(self, data: ResponseData) -> int:
-        """Parameters, for people."""
+        """The number of its parameters for a report."""
         return self.size(data)
 
     def lowest(self, data: ResponseData) -> Array | float:
-        """The least that each number can be; any can be zero."""
+        """The lower bound of each number; any can be zero."""
         return -np.inf
 
     def doubt(self, values: Array, data: ResponseData) -> str | None:
-        """Why numbers that were found cannot be what the family stands for; None: they can."""
+        """The reason why fitted values are implausible for the family; None: they are plausible."""
         return None

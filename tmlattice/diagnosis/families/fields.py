@@ -1,6 +1,6 @@
 """Families of errors of fields in the ring: gradients, skew gradients, vertical focusing.
 
-A magnet that stands in pieces is one number of a family.
+The pieces of a magnet are one number of a family.
 """
 
 from abc import abstractmethod
@@ -24,9 +24,10 @@ from tmlattice.observe.response_data import ResponseData
 Array = NDArray[np.float64]
 
 LARGEST_GRADIENT = 0.02
-"""Prior rms that one magnet may have at most, relative: a larger error is a broken magnet."""
+"""Largest prior rms of one magnet, relative: a larger error is a broken magnet."""
 FURTHEST = 0.05
-"""m, prior rms of the way to a corrector's field at most: further off is another corrector's."""
+"""Largest prior rms of the distance to a corrector's field, m: beyond is another corrector's
+field."""
 
 
 class _Magnets(Family):
@@ -35,10 +36,10 @@ class _Magnets(Family):
 
     @abstractmethod
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
-        """Of each magnet: its pieces, and what each of them has of the magnet's number."""
+        """The pieces of each magnet, and the share of each piece in the magnet's number."""
 
     def places(self, data: ResponseData) -> list[str]:
-        """Each magnet's first piece."""
+        """The first piece of each magnet."""
         return [next(iter(pieces)) for pieces in self.shares(data)]
 
     def size(self, data: ResponseData) -> int:
@@ -57,7 +58,7 @@ class _Magnets(Family):
         return out
 
     def units(self, values: Array) -> Array:
-        """Of each number: of how much of what the effect is relative to."""
+        """The effect, unit and relative strength of each number."""
         return np.ones(len(values))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
@@ -72,7 +73,7 @@ class _Magnets(Family):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """Of every piece."""
+        """The amount of every piece."""
         return [
             (Cause(self.effect, place, share * float(value)), abs(share) * float(error))
             for pieces, value, error in zip(self.shares(data), values, sigma, strict=True)
@@ -80,7 +81,7 @@ class _Magnets(Family):
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Of every piece."""
+        """The cause of every piece."""
         return [
             {(self.effect, place): share for place, share in pieces.items()}
             for pieces in self.shares(data)
@@ -95,36 +96,36 @@ class QuadrupoleGradient(_Magnets):
     block, variable, trust = 0, "gradient", 0.01
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
-        """Those that have a gradient."""
+        """Quadrupoles that have a gradient."""
         return [{e.name: 1.0 for e in own} for own in magnets(data.ring, ("quadrupole",), True)]
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each."""
+        """The prior of single quadrupoles."""
         eye = np.eye(self.size(data))
         return [Group(self.name, eye, 3e-3, TAILS, most=LARGEST_GRADIENT)]
 
     def units(self, values: Array) -> Array:
-        """Relative to the design's strength, not to the one found."""
+        """Gradients relative to the design's strength, not to the estimated one."""
         return np.asarray(1 / (1 + values))
 
 
 class FamilyGradient(QuadrupoleGradient):
-    """What quadrupoles of a family share: their supply's error."""
+    """The common error of a family's quadrupoles, by their supply."""
 
     name = "family_gradient"
     effects: ClassVar[tuple[str, ...]] = ("family_gradient",)
 
     def count(self, data: ResponseData) -> int:
-        """Families."""
+        """Number of families."""
         return len(supplied_alike(data.ring)[0])
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of families."""
+        """The prior of families."""
         return [Group("quadrupole_gradient of families", supplied_alike(data.ring)[1], 0.01)]
 
 
 class _Thin(_Magnets):
-    """Integrated fields, each piece with its share of the magnet's length."""
+    """Integrated fields; each piece has its share of the magnet's length."""
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("quadrupole",))
@@ -138,27 +139,27 @@ class _Thin(_Magnets):
 
 
 class BendGradient(_Magnets):
-    """Gradients of bends that have one, relative to the design's: one number a type."""
+    """Gradients of combined-function bends, relative to the design's: one number a type."""
 
     name = effect = "bend_gradient"
     effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
     block, variable, trust = 0, "bend_gradient", 0.01
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
-        """Of all bends of a type: one alone would run away against the quadrupoles beside it."""
+        """Zero: single bends of a type are degenerate with neighbouring quadrupoles."""
         types: dict[str, dict[str, float]] = {}
         for own in magnets(data.ring, ("bend",), powered=True):
             types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
         return list(types.values())
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each type."""
+        """The prior of types."""
         return [Group(self.name, np.eye(self.size(data)), 3e-3)]
 
 
 class SkewGradient(_Thin):
-    """Skew gradients in quadrupoles that are rolled, and in sextupoles: of windings, and of a beam
-    that passes above their axis."""
+    """Skew gradients in rolled quadrupoles, and in sextupoles: of windings, and of a vertical
+    orbit."""
 
     name = effect = "skew_gradient"
     effects: ClassVar[tuple[str, ...]] = ("skew_gradient",)
@@ -168,7 +169,7 @@ class SkewGradient(_Thin):
         return magnets(ring, ("quadrupole", "sextupole"))
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each, with a scale for either kind."""
+        """The priors of quadrupoles and sextupoles, each with its scale."""
         kinds = np.array([own[0].kind for own in self._places(data.ring)])
         each = np.eye(len(kinds))
         return [
@@ -178,7 +179,7 @@ class SkewGradient(_Thin):
 
 
 class OtherGradient(_Thin):
-    """Gradients beside the quadrupoles: of the orbit in sextupoles, of wigglers."""
+    """Gradients outside quadrupoles: of the orbit in sextupoles, of wigglers."""
 
     name = effect = "gradient_absolute"
     effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
@@ -188,12 +189,12 @@ class OtherGradient(_Thin):
         return magnets(ring, ("sextupole", "wiggler"))
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each."""
+        """The prior of sextupoles."""
         return [Group(self.name, np.eye(self.size(data)), 1e-4, TAILS)]
 
 
 class VerticalFocusing(_Thin):
-    """Of insertion devices, in wigglers and in straights."""
+    """Gradients of insertion devices, in wigglers and in straights."""
 
     name = effect = "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
@@ -201,7 +202,7 @@ class VerticalFocusing(_Thin):
 
     @property
     def title(self) -> str:
-        """Dipoles have it too."""
+        """The family in dipoles includes it."""
         return f"{self.effect} in straights"
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
@@ -212,25 +213,24 @@ class VerticalFocusing(_Thin):
         return sorted(devices, key=lambda own: own[0].s)
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each."""
+        """The prior of each device."""
         return [Group(self.name, np.eye(self.size(data)), 1e-4, 1.0)]
 
     def lowest(self, data: ResponseData) -> Array | float:
-        """A device focuses, whatever its field; only one that the design has may have too little of
-        it. What else would focus here pulls against the quadrupoles beside it."""
+        """Zero: a device focuses; only one of the design may focus less."""
         kinds = [data.ring[place].kind for place in self.places(data)]
         return np.where([kind == "wiggler" for kind in kinds], -np.inf, 0.0)
 
 
 class FocusingChange(VerticalFocusing):
-    """A device that was opened focuses less, and one that the lattice has as bends has no other
-    number here."""
+    """Lower bounds: an open device focuses less; one of bends in the lattice has no other
+    number."""
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return self._devices(ring, straights(ring, beside=True))
 
     def lowest(self, data: ResponseData) -> Array | float:
-        """Of any sign."""
+        """No bounds."""
         return -np.inf
 
 
@@ -247,22 +247,21 @@ class EdgeFocusing(_Thin):
 
     @property
     def largest(self) -> float:
-        """The edges of all bends of a type have one design."""
+        """Zero: the edges of all bends of a type have one design."""
         return 0.0
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("bend",))
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
-        """Of all dipoles of a type: what makes one of them alone is no edge, but something beside
-        it that would be made up with."""
+        """Zero: single dipoles of a type have no edge errors of their own."""
         types: dict[str, dict[str, float]] = {}
         for pieces in super().shares(data):
             types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
         return list(types.values())
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each type, as a share of what the edges of a rectangular one do."""
+        """The prior of types, as a share of a rectangular magnet's edges."""
         ring = data.ring
         largest = []
         for pieces in self.shares(data):
@@ -275,10 +274,10 @@ class EdgeFocusing(_Thin):
 
 
 class CorrectorPosition(_Magnets):
-    """Where the fields of correctors are: one number for all of a plane that stand between the same
-    two families of magnets, whose iron draws them as much further up or down.
+    """Positions of correctors' fields: one number for all of a plane between the same two families
+    of magnets, whose iron shifts their fields alike.
 
-    A corrector that stands so alone has no number: nobody else could confirm it.
+    A single corrector there has no number, because no other one could confirm it.
     """
 
     name = effect = "corrector_position"
@@ -295,11 +294,11 @@ class CorrectorPosition(_Magnets):
         return [correctors for correctors in alike.values() if len(correctors) > 1]
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each."""
+        """The prior of each number."""
         return [Group(self.name, np.eye(self.size(data)), 5e-3, most=FURTHEST)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """A kick that comes later has moved the beam by less, in its own column alone."""
+        """The jump of the orbit in the corrector's own column."""
         data = at.data
         kicks = data.kicks * (1 + at.errors.calibration)
         jump = -at.gain(0) * data.pick(at.jumps) * kicks[:, None]

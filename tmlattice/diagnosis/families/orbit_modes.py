@@ -1,8 +1,8 @@
-"""The closed orbit that small kicks make, as a family of a dense fit: what it does in sextupoles.
+"""A family of closed-orbit patterns of small kicks, which act in sextupoles.
 
-A response hardly sees a kick itself, but off their axis sextupoles focus and couple: on a ring with
-usual alignment by more than the quadrupoles' own errors do. One kick looks like another one, so the
-numbers are not kicks but patterns: those combinations of bends' kicks that focus most.
+A response is hardly sensitive to a kick itself, but off axis sextupoles focus and couple. With
+usual alignment that exceeds the quadrupoles' own errors. Single kicks are degenerate, so the
+numbers are amplitudes of patterns: the combinations of bends' kicks that focus most.
 
 >>> families = orbit_families(ring, model)
 """
@@ -25,9 +25,9 @@ from tmlattice.observe.response_data import ResponseData
 Array = NDArray[np.float64]
 
 LEAST = 0.02
-"""Patterns that focus by less than this share of the strongest are left to the quadrupoles."""
+"""Share of the strongest pattern below which a pattern is omitted; quadrupoles take it up."""
 TOGETHER = 32
-"""Bends whose rows are held at a time."""
+"""Bends whose rows are computed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +47,19 @@ class _Orbit(Family):
 
     @property
     def largest(self) -> float:
-        """Patterns have none: a single kick makes all of them."""
+        """Zero: a pattern has no members."""
         return 0.0
 
     def size(self, data: ResponseData) -> int:
-        """Of the patterns."""
+        """Number of patterns."""
         return len(self.patterns)
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """In units of what is usual."""
+        """Amplitudes in units of usual kicks."""
         return [Group(self.name, np.eye(len(self.patterns)), 1.0)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """Of all bends together."""
+        """Derivatives by the kicks of all bends."""
         out = np.zeros((len(self.patterns), at.data.orbits[..., 0].size))
         for start in range(0, len(self.places), TOGETHER):
             places = self.places[start : start + TOGETHER]
@@ -69,7 +69,7 @@ class _Orbit(Family):
         return np.asarray(out.reshape(-1, *at.data.shape) * at.gain(self.block))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """As kicks of the bends."""
+        """The errors with the kicks of the bends."""
         amounts = (values @ self.patterns).tolist()
         causes = [Cause(self.effect, *one) for one in zip(self.places, amounts, strict=True)]
         return replace(errors, ring=(*errors.ring, *(c for c in causes if c.amount)))
@@ -77,7 +77,7 @@ class _Orbit(Family):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """Nothing: other kicks make the same orbit."""
+        """No causes: single kicks are degenerate."""
         return []
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
@@ -87,21 +87,21 @@ class _Orbit(Family):
 
 
 class HorizontalOrbit(_Orbit):
-    """By fields of bends: it focuses."""
+    """The horizontal orbit by fields of bends: it focuses."""
 
     name, effect, effects = "horizontal orbit", "dipole_field", ("dipole_field",)
     block, variable = 0, "horizontal orbit"
 
 
 class VerticalOrbit(_Orbit):
-    """By rolls of bends: it couples."""
+    """The vertical orbit by rolls of bends: it couples."""
 
     name, effect, effects = "vertical orbit", "dipole_roll", ("dipole_roll",)
     block, variable = 1, "vertical orbit"
 
 
 def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
-    """One of each plane; none without sextupoles or bends.
+    """One family of each plane; none without sextupoles or bends.
 
     Args:
         ring: the design.

@@ -1,4 +1,4 @@
-"""Where magnets stand: between which others, and ways on which an insertion device may hide.
+"""Drifts and neighbours of magnets, and straights for insertion devices.
 
 >>> [way.name for way in straights(ring)]
 """
@@ -12,11 +12,11 @@ from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
 
 STRAIGHT = 1.0
-"""m; where so much way lies between two magnets an insertion device may stand."""
+"""Length of a straight, m, in which an insertion device is possible."""
 
 
 def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> list[str]:
-    """Of each corrector its plane and the families of the magnets before and behind it.
+    """Plane of each corrector, with the families of the magnets before and behind it.
 
     Args:
         ring: where they stand.
@@ -33,11 +33,11 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
 
 
 def straights(ring: Ring, beside: bool = False) -> list[Element]:
-    """Of every long way without a magnet the marker that is nearest to its middle, or the longest
-    drift where no marker stands; wherever the lattice begins.
+    """Markers nearest to the middle of each long straight, or its longest drift where there is no
+    marker.
 
-    A way beside a wiggler that the lattice has as bends to and fro has none: the wiggler's own
-    focusing is a number already, and two beside it would pull against it.
+    A straight next to a wiggler of alternating bends has none, because it is degenerate with
+    the wiggler's own focusing.
 
     Args:
         ring: the ring.
@@ -68,13 +68,13 @@ class _Placed(NamedTuple):
 
 
 def _parts(element: Element) -> bool:
-    """Whether the ways at its two ends are two."""
+    """Whether the straights at both ends differ."""
     return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
 
 
 def _around(ring: Ring) -> list[_Placed]:
-    """A turn from a magnet to itself, both of them in it: from one that is no bend, if one is, for
-    bends to and fro are a wiggler."""
+    """A turn from a magnet to itself, both included; it starts at no bend if possible, because
+    alternating bends are a wiggler."""
     own = ring.elements
     magnets = sorted(
         (i for i, e in enumerate(own) if _parts(e)), key=lambda i: (own[i].kind == "bend", i)
@@ -89,7 +89,7 @@ def _around(ring: Ring) -> list[_Placed]:
 
 
 def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:
-    """Ways among these bends, which no other magnet parts, but of a wiggler's."""
+    """Straights among these bends, without other magnets, except those of a wiggler."""
     return [] if bends and min(bends) < 0 < max(bends) else list(ways)
 
 

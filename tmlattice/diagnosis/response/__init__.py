@@ -1,9 +1,9 @@
-"""Diagnosis of an orbit response, whose ring has small errors everywhere.
+"""Diagnosis of an orbit response of a ring with distributed errors.
 
-In the order in which it happens: the data are checked (`strangers`, `exchanged`, `outliers`), few
-causes are sought alone (`few`), all families of errors are fitted at once (`hierarchical`; `state`
-and `weights` have the noise model, `rounds` the damped Gauss-Newton), validated on held-out
-readings (`judges`), single faults are sought among small errors (`singled_out`), and the result is
-reported: how well things are known (`stated`), which few numbers are behind many (`reasons`), and
-what is missing (`missing`). `procedure` is all of it; `before_after` is that of two measurements.
+In order: the data are checked (`unlike_model`, `swaps`, `outliers`), a sparse solution is tried
+(`sparse`), and all families of errors are fitted (`hierarchical`; noise model in `state` and
+`weights`, damped Gauss-Newton in `rounds`). The fit is validated (`validation`), and single faults
+are detected among distributed errors (`detected_faults`). Then errors are stated (`stated`), common
+factors (`common_factors`) and missing effects (`missing_effects`) are sought. `procedure` is the
+whole; `before_after` compares two measurements.
 """

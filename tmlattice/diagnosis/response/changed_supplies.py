@@ -38,24 +38,25 @@ Array = NDArray[np.float64]
 MOST = 40
 """Changes of a plane at most: many supplies may be changed on purpose."""
 REPRODUCED = 1e-4
-"""Relative: as well a magnet comes back, and half of it a supply; a smaller change is none."""
+"""Relative reproducibility of a magnet, and twice that of a supply; smaller changes are ignored."""
 STRAY = 3e-5
-"""1/m: as well a gradient beside the quadrupoles comes back: the orbit in a sextupole moves."""
+"""Reproducibility of a gradient outside quadrupoles, 1/m: the orbit in a sextupole moves."""
 USUAL = 1e-2
 """Prior rms of a change: relative, or of integrated gradients in 1/m."""
 ALONE = 2.0
-"""Log odds of a supply that changed against one of its magnets alone, or a field elsewhere."""
+"""Log odds of a changed supply against one of its magnets alone, or a field elsewhere."""
 AGAIN = 3
-"""How often it is asked anew what changed, beside what the ring's errors make of what was found."""
+"""Repetitions of the selection with the undetermined errors of the ring linearised at the
+findings."""
 FINER = 0.5
 """Steps in which less scatter is tried."""
 OTHERS = tuple(float(own) for own in np.geomspace(1e-4, 1e-2, 9))
-"""Rms of the changes of supplies that cannot be told, relative, that are tried."""
+"""Rms of undetermined changes of supplies, relative, that are tried."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
-    """What may have changed, as causes of amount one, and what each moves."""
+    """Candidates for a change, as causes of amount one, and their derivatives."""
 
     causes: tuple[tuple[str, str], ...]
     members: Array  # [number, candidate]
@@ -64,7 +65,7 @@ class _Candidates:
 
 @dataclass(frozen=True, eq=False)
 class _Weighed:
-    """Candidates beside some scatter, those that are there, and the log evidence of all that."""
+    """Candidates with some scatter, the selected ones, and their log evidence."""
 
     among: _Candidates
     there: GivenOthers
@@ -74,7 +75,7 @@ class _Weighed:
 def changed_supplies(
     state: State, judgement: Judgement, open_: Undetermined | None = None
 ) -> tuple[list[Finding], dict[str, float]]:
-    """Supplies, magnets and devices that changed: all of them, for what is left out is scatter.
+    """Return all supplies, magnets and devices that changed; the rest is scatter.
 
     Args:
         state: of a fit of the change.
@@ -105,8 +106,8 @@ def changed_supplies(
 
 
 def _blurred(problem: Response, open_: Undetermined, found: Sequence[Finding]) -> dict[int, Array]:
-    """What errors of the ring that are not known make of what changed, m, of each block [error,
-    column, monitor]."""
+    """Effects of undetermined errors of the ring on the changes, m, of each block [error, column,
+    monitor]."""
     data = problem.base.data
     causes = [cause_of(own) for own in found]
     spread = Blur(problem, strongest(problem, open_, causes)).of(causes)
@@ -141,7 +142,8 @@ def _found(
 def _by_evidence(
     state: State, block: int, there: Linear, fitted: Mapping[str, Family]
 ) -> tuple[dict[str, float], _Weighed]:
-    """The scatter of each family, at most what a fit of all has learnt, and what is there."""
+    """The scatter of each family, at most that of the hierarchical fit, and the selected
+    candidates."""
     information, pull = marginal(there, list(fitted))
     wider = _widened(state, block, there)
 
@@ -197,7 +199,7 @@ def _candidates(
 
 
 def _widened(state: State, block: int, there: Linear) -> float:
-    """By what errors grow, for the noise was learnt from readings that were fitted."""
+    """Factor on the errors, because the noise was learnt from fitted readings."""
     posterior = solve(there.normal, there.groups, there.start, rounds=0)
     fitted = float(np.sum(1 - np.diag(posterior.covariance)))
     count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())

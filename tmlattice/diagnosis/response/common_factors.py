@@ -33,38 +33,38 @@ Array = NDArray[np.float64]
 USUAL = 1e-2
 """Prior rms of a shared error, relative."""
 LEAST_SCATTER = 1e-4
-"""Relative: no two magnets are more alike."""
+"""Least scatter of single magnets, relative."""
 TOLERANCE = 0.02
-"""Relative: no sound magnet is further from its family."""
+"""Largest distance of a healthy magnet from its family, relative."""
 BETWEEN = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
-"""By how much families may differ from one another, relative rms."""
+"""Scatters of families, relative rms, that are tried."""
 MORE = 3.0
-"""Log evidence that is asked for them to differ at all."""
+"""Log evidence required for a scatter of families."""
 FEWEST = 3
-"""Families that tell by how much they differ."""
+"""Families required for their scatter."""
 MOST = 20
-"""Reasons at most: more are no explanation."""
+"""Common factors at most."""
 SETS, LIKELY = 3, 0.05
-"""Other sets of reasons that are told at most, and how likely they have to be."""
+"""Alternative sets that are reported at most, and their least probability."""
 AGAINST = 0.4
-"""Correlation from which magnets pull against each other."""
+"""Correlation from which on neighbours of an outlier are named."""
 SHOWN = 3
 """Neighbours that are named."""
 COST = {"all": 0.0, "focusing": 1.0, "region": 1.0, "type": 1.0, "family": 1.0, "magnet": 3.0}
-"""Log odds against a reason of each kind, beside those of how many there are."""
+"""Log prior odds against a common factor of each kind."""
 MAKES = {
-    "all": "the beam's energy is other than the magnets' by as much with the other sign, or all "
-    "gradients are calibrated so: the response does not part the two",
-    "focusing": "the calibration of one polarity: its supplies, or the tunes were set so",
+    "all": "the beam's energy differs from the magnets' by as much with the other sign, or all "
+    "gradients have this calibration: the response does not separate the two",
+    "focusing": "the calibration of one polarity: its supplies, or the set tunes",
     "region": "one supply, or one setting, of the magnets there; or the beam's orbit and fringe "
     "fields there are not the model's",
     "type": "the calibration or the fringe field of this type of magnet",
     "family": "their supply: its current, its calibration curve, or a wrong setting in the lattice "
     "file",
-    "magnet": "this magnet alone: a shorted turn, a wrong tap, or a field beside it that the "
-    "lattice does not have",
+    "magnet": "this magnet alone: a shorted turn, a wrong tap, or a nearby field that is not "
+    "in the lattice",
 }
-"""What would make a reason of each kind."""
+"""Possible causes of a common factor of each kind."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Reason:
     share_from_data: float = 1.0
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         rivals = [{"name": name, "probability": p} for name, p in self.rivals]
         return {**vars(self), "members": list(self.members), "rivals": rivals}
 
@@ -114,14 +114,14 @@ class Instead:
     amounts: tuple[tuple[str, float, float], ...]
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         common_factors = [{"name": n, "amount": a, "amount_sigma": e} for n, a, e in self.amounts]
         return {"probability": self.probability, "common_factors": common_factors}
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A magnet further from its reasons than magnets are.
+    """An outlier magnet, given the common factors.
 
     Attributes:
         element: its first piece.
@@ -137,7 +137,7 @@ class Outlier:
     share_from_data: float
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         against = [{"element": n, "amount": a, "correlation": c} for n, a, c in self.against]
         return {**vars(self), "against": against}
 
@@ -147,7 +147,7 @@ class CommonFactors:
     """What is behind the gradients.
 
     Attributes:
-        reasons: by falling chi-square; the likeliest set.
+        reasons: by falling chi-square; the most probable set.
         instead: other sets that are likely, by falling probability.
         outliers: by falling size.
         share: of the gradients' mean square, that the reasons hold.
@@ -164,7 +164,7 @@ class CommonFactors:
     between: float
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {
             "common_factors": [own.as_json() for own in self.common_factors],
             "instead": [own.as_json() for own in self.instead],
@@ -191,8 +191,8 @@ def explain_gradients(state: State) -> CommonFactors | None:
     rows = there.where[family.variable]
     spread = posterior.spread[rows]
     covariance = spread @ posterior.covariance @ spread.T
-    # what the stated errors have more than the posterior's is no scatter of the magnets; but it is
-    # in every error as that is
+    # the excess of the stated errors over the posterior's is no scatter of the magnets, but
+    # it is in every error
     plain = np.maximum(np.diag(covariance), 1e-24)
     wider = of_readings(state, 0, there, posterior)[rows] / np.sqrt(plain)
     sizes = of_sizes(state, 0, there)[rows]
@@ -204,7 +204,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
     found = [
         (one, chance)
         for one, chance in over_sets(levels, sets)
-        if one.statistic >= MIN_CHI2  # families that do not stand out are in the sets all the same
+        if one.statistic >= MIN_CHI2  # the sets include families below the detection limit
     ]
     places = [pieces[0].name for pieces in own]
     common_factors = tuple(

@@ -1,4 +1,4 @@
-"""One thing that is wrong alone among small errors of an orbit response, and how it is told."""
+"""A single fault among distributed errors of an orbit response, and its report."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """One that stands out.
+    """A detected fault.
 
     Attributes:
         cause: with its amount.
@@ -38,7 +38,7 @@ class Fault:
     evidence: Array
 
     def finding(self, ring: Ring, judgement: Judgement) -> Finding:
-        """As it is told."""
+        """The fault as a hypothesis of the report."""
         chance = np.exp(self.evidence - self.evidence.max())
         chance /= chance.sum()
         shown = self.rivals[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
@@ -47,13 +47,13 @@ class Fault:
 
 
 CLEARLY = 5.0
-"""Errors of what a corrector kicks in the other plane, by which it has to be seen there."""
+"""Standard errors of a corrector's kick in the other plane above which it is significant."""
 
 
 def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:
-    """A corrector that kicks more in the other plane than in its own, which has one number for
-    each, is told as turned: what its own plane lacks is no calibration. One that is off kicks in
-    neither."""
+    """The causes with a corrector that mainly kicks in the other plane reported as rolled: it has
+    one number for each plane, and its missing kick is no calibration. A corrector that is off kicks
+    in neither plane."""
     if fault.cause.effect != "corrector_calibration":
         return fault
     ring, name = data.ring, fault.cause.element

@@ -1,4 +1,4 @@
-"""What a hierarchical fit of an orbit response found, as causes with errors."""
+"""Causes with errors from a hierarchical fit of an orbit response."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -25,9 +25,9 @@ AGAINST, SHOWN = 0.4, 3
 def fitted_causes(
     state: State,
 ) -> tuple[list[StatedCause], tuple[Support, ...], tuple[str, ...], tuple[Correlation, ...], Array]:
-    """Causes with stated errors; how much of each comes from the data; what the data alone do not
-    settle, in words; the amounts that they hardly separate; and the covariance of the stated
-    errors, [cause, cause]: of one plane with the other none is taken."""
+    """Return causes with stated errors; their support by the data; messages on degeneracies;
+    strongly correlated amounts; and the covariance of the stated errors, [cause, cause], without
+    correlations between planes."""
     found: list[StatedCause] = []
     supports: list[Support] = []
     messages: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ def fitted_causes(
 
 
 def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: Array) -> Array:
-    """Of the causes of a block: correlations of the fit's numbers, and the stated errors."""
+    """Correlations of a block's numbers, and the stated errors of its causes."""
     place = {(cause.effect, cause.element): i for i, (cause, _) in enumerate(rows)}
     slopes = np.zeros((len(rows), len(covariance)))
     for number, moves in numbers.items():
@@ -72,8 +72,8 @@ def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: 
 def _correlated(
     state: State, families: Iterable[Family], there: Linear, covariance: Array
 ) -> tuple[Correlation, ...]:
-    """Amounts of the magnets' families that the readings hardly separate; each number is named for
-    the first that it moves."""
+    """Strongly correlated amounts of the magnets' families; each number is named for its first
+    cause."""
     amounts: list[Hypothesis] = []
     numbers: list[int] = []
     for family in families:
@@ -91,7 +91,7 @@ def _correlated(
 def with_support(
     state: State, families: Collection[Family], there: Linear, known: Stated
 ) -> Iterator[tuple[StatedCause, Support]]:
-    """Yield the causes of some families of a block, and how much of each comes from the data.
+    """Yield the causes of some families of a block, and their support by the data.
 
     Args:
         state, there: where the fit stands, and `linear` of the block.
@@ -112,7 +112,7 @@ Hypotheses = Mapping[int, Mapping[Hypothesis, float]]
 
 
 def _numbers(state: State, families: Iterable[Family], there: Linear) -> Hypotheses:
-    """What each number of the fit is of the catalogue's effects, by its place in the fit."""
+    """The catalogue's effects of each number of the fit, by its place in the fit."""
     numbers: dict[int, Mapping[Hypothesis, float]] = {}
     for family in families:
         first = there.where[family.variable].start
@@ -123,7 +123,7 @@ def _numbers(state: State, families: Iterable[Family], there: Linear) -> Hypothe
 def _support(
     row: StatedCause, prior: float, own: slice, covariance: Array, numbers: Hypotheses
 ) -> Support:
-    """Of one cause, with its error before the data; `own` are its family's numbers."""
+    """One cause, with its error before the data; `own` are its family's numbers."""
     cause, sigma = row
     support = Support(share_from_data(sigma, prior))
     if support.determined:
@@ -144,7 +144,7 @@ def _support(
 
 
 def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str, ...]:
-    """The scale that gains and calibrations share."""
+    """A message on the scale that gains and calibrations share."""
     messages = []
     columns, monitors = state.data.shape
     m = 2 * monitors

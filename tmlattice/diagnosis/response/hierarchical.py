@@ -1,14 +1,12 @@
-"""The hierarchical fit of an orbit response: all families of errors at once, validated on held-out
-data.
+"""The hierarchical fit of an orbit response: all families of errors at once, with validation.
 
 >>> fit = fit_families(data, split)
 >>> fit.heldout[1].in_plane                        # m, over held-out correctors
 
-Each family has a prior whose scale is learnt, so that one that is not needed shrinks. First all
-columns, and all monitors, have the same misfit, for who is wrong is unknown until the model has
-settled; then each its own. What is of second order, or of one orbit, is opened with the latter.
-Held-out correctors of the inner set, which are not fitted until that is decided, close what makes
-their readings worse.
+Each family has a prior whose scale is learnt, so that an unnecessary family vanishes. First all
+columns, and all BPMs, have one misfit, because outliers are unknown before convergence; then each
+has its own. Families of second order, or of one orbit, are added with the latter. An inner
+validation set of held-out correctors rejects families that increase its residuals.
 """
 
 import logging
@@ -56,21 +54,21 @@ Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 WORTH = 10.0
-"""Log evidence from which on waves of the orbit in each step are asked for."""
+"""Log evidence from which on orbit waves in each step are tried."""
 LEADS, ROUGH = 5e-3, 0.03
-"""Share of the cost that a round has to gain for another one, of a fit that leads to the next one;
-and of one that is compared."""
+"""Share of the cost that a round must gain for another one: of an intermediate fit, and of one that
+is compared."""
 ASTRAY, NEAR = 1.2, 1e-3
-"""So many times what the design leaves of the typical column's square no result may leave; or this
-share of it, if that is more."""
+"""Largest ratio of the fit's to the design's share of the typical column's square; or its largest
+value, if that is more."""
 SPOILT, SURELY, ENOUGH = 0.05, 2.0, 3
-"""By how much the logarithms of the validation scores may rise with all families, if that is more
-than so many of their standard errors, and inner correctors that it takes to say so."""
+"""Largest rise of the log validation scores by all families, with its least number of standard
+errors, and the least number of inner correctors."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """The gap of the design, of the fit, or with a single fault or without a closed family.
+    """Residuals of the design, of the fit, or with a single fault or a rejected family.
 
     Attributes:
         effect: what was fitted: "design", "all families", or a fault or a family by its effect.
@@ -81,7 +79,7 @@ class Step:
             gave its kick, m; NaN before rolls are fitted.
         heldout_chi2_per_dof: in-plane, by the readings' noise.
         dispersion_rms: of the RF's orbit in x on the half of the monitors not fitted, m.
-        kept: False of a family that is closed; its figures are those with it.
+        kept: False of a rejected family; the residuals are those with it.
     """
 
     effect: str
@@ -96,19 +94,19 @@ class Step:
 
     @classmethod
     def scored(cls, effect: str, parameters: int, s: Score) -> "Step":
-        """With what the judges say."""
+        """The step with the scores of the validation."""
         return cls(
             effect, parameters, s.in_plane, s.coupling, s.chi2_per_dof, s.dispersion, s.position,
             s.roll,
         )  # fmt: skip
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {name: value for name, value in vars(self).items() if name != "kept"}
 
 
 def fit_chi2(state: State) -> tuple[Chi2, Chi2, Chi2]:
-    """Of the fitted readings, by their noise alone: in-plane, across, of the RF."""
+    """Misfits of the fitted readings, by their noise alone: in-plane, coupling, RF."""
     data = state.data
     out = []
     use = ~state.split.held
@@ -129,9 +127,9 @@ class HierarchicalFit:
     Attributes:
         design, state: before and after.
         steps: the design, the fit, and single faults.
-        rejected_steps: families that were closed, with the figures of the fit with them.
-        heldout: what held-out correctors say of the design and of the result.
-        messages: what is to be reported.
+        rejected_steps: rejected families, with the residuals of the fit with them.
+        heldout: scores of held-out correctors for the design and for the result.
+        messages: messages of the fit.
     """
 
     design: State
@@ -148,10 +146,10 @@ def fit_families(
     families: Sequence[Family] = FAMILIES,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> HierarchicalFit:
-    """All families together, fitted to all correctors but the held-out ones.
+    """Fit all families together to all correctors except the held-out ones.
 
     Args:
-        data, split: what was measured, and who validates.
+        data, split: the data, and the validation split.
         families: that may be open; those without places or readings are left out.
         progress: called with the name of each stage.
     """
@@ -186,7 +184,7 @@ def fit_families(
     if enough and -rise > max(SPOILT, SURELY * unsure):
         return nothing
     progress("all correctors")
-    # the inner ones begin at what they say: a column far off would weigh nothing, and stay there
+    # the inner ones start at their own estimates: an outlier column would stay without weight
     state = settle(bend(jump(replace(state, exploring=False), beyond=1.0)))
     fewer = _undoubted(state, messages, rejected_steps)
     state = state if fewer is state else settle(fewer)
@@ -194,7 +192,7 @@ def fit_families(
     then = replace(design, good=state.good, exploring=False)
     if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
         astray = (
-            "the fit left more of the readings that it was fitted to than the design leaves: the "
+            "the residual of the fitted readings is larger than the design's: the "
             "lattice may be too far from the ring, and no effect is reported"
         )
         return replace(nothing, messages=(*messages, astray))
@@ -208,7 +206,7 @@ def fit_families(
 
 
 def _rejected(state: State, family: Family) -> Step:
-    """The figures of the fit with a family that is closed."""
+    """A step with a rejected family."""
     figures = score(state, state.split.held)
     return replace(Step.scored(family.title, family.count(state.data), figures), kept=False)
 
@@ -236,8 +234,7 @@ def _validated(state: State, rejected_steps: list[Step], progress: Callable[[str
 
 
 def _closed(state: State, family: Family) -> State:
-    """The state without a family, linear where the fit stands; as it is where no beam is stored
-    without it."""
+    """The state without a family, linearised; unchanged where no beam is stored without it."""
     there = linear(state, family.block)
     gone = {group.name for group in family.groups(state.data)}
     groups = [group for group in there.groups if group.name not in gone]
@@ -249,8 +246,7 @@ def _closed(state: State, family: Family) -> State:
 
 
 def _undoubted(state: State, messages: list[str], rejected_steps: list[Step]) -> State:
-    """The state without families whose numbers cannot be what they stand for; why goes to the
-    messages."""
+    """The state without implausible families; the reasons are added to the messages."""
     doubts = {
         family: doubt
         for family in state.families

@@ -1,7 +1,7 @@
-"""What may be missing of a fitted orbit response: each hypothesis as patterns of readings.
+"""Effects that may be missing from a fitted orbit response: each hypothesis as patterns of
+readings.
 
-To add one, write a function that gives its patterns where the fit stands, and put it into
-`HYPOTHESES`.
+To add one, write a function that returns its patterns at the fit, and put it into `HYPOTHESES`.
 """
 
 from collections.abc import Callable
@@ -22,12 +22,12 @@ from tmlattice.observe.orbit_response import DELTA
 Array = NDArray[np.float64]
 
 BEND_GRADIENT = 1e-4
-"""1/m2, of the differences."""
+"""Step of the differences, 1/m2."""
 MILLIMETRE = 1e-3
 ORDERS = 3
-"""Of a drift over all columns, as a polynomial."""
+"""Order of the polynomial of a drift over all columns."""
 WAVES = 4
-"""Of the leading closed orbits of random kicks in a plane."""
+"""Number of leading closed orbits of random kicks in a plane."""
 
 
 @dataclass(frozen=True)
@@ -121,13 +121,13 @@ def _position(
 
 def _position_beside(state: State) -> Hypothesis | None:
     if state.allows("corrector_position"):
-        return None  # it is in the fit
+        return None  # the fit has it
 
     def beside(own: State) -> list[str]:
         measured = own.data.measured
         return between(own.data.ring, measured.correctors, measured.planes)
 
-    return _position(state, "by the magnets beside it", beside)
+    return _position(state, "by the magnets next to it", beside)
 
 
 def _energy_drift(state: State) -> Hypothesis:
@@ -140,7 +140,7 @@ def _energy_drift(state: State) -> Hypothesis:
 
 
 def _orbit_drift(state: State) -> Hypothesis:
-    """The orbit moves between the readings of a step: whatever kicks it, in each column anew."""
+    """The orbit drifts between the readings of a step, with other kicks in each column."""
     orbits = _readings(state, state.at.orbits(state.at.model))
     waves = np.zeros((WAVES, *orbits.shape))
     for p in (0, 1):
@@ -167,12 +167,12 @@ def _tune_drift(state: State) -> Hypothesis:
 
 
 def _in_time(drift: Hypothesis, effect: str, constant: bool) -> Hypothesis:
-    """A drift that goes on from column to column, smoothly: they are in the order of time.
+    """A smooth drift from column to column, in the order of time.
 
     Args:
-        drift: what it does to each column by itself.
+        drift: its patterns of single columns.
         effect: its name.
-        constant: whether one that is alike in all columns is left to it, and not to the fit.
+        constant: whether it includes a part that is equal in all columns.
     """
     columns = drift.patterns.shape[1] - 1
     orders = legvander(np.linspace(-1, 1, columns), ORDERS).T[0 if constant else 1 :]
@@ -190,13 +190,13 @@ def _orbit_in_time(state: State) -> Hypothesis:
 
 
 def _chromatic_in_time(state: State) -> Hypothesis:
-    """Of the energy at which all columns are read: the tunes and the optics move with it."""
+    """A drift of the energy of all columns, which changes the tunes and the optics."""
     return _in_time(_chromatic(state), "drift of the beam's energy in order of time", False)
 
 
 def _hysteresis(state: State) -> Hypothesis:
-    """What the iron of a corrector keeps of its step stays in the columns after it: of the last one
-    alone, which still relaxes, or of all before it, where all are held against one orbit."""
+    """Hysteresis: a corrector's iron keeps a share of its step in later columns, of the last step
+    alone or of all earlier ones."""
     last = np.zeros_like(state.at.read)
     last[1:-1] = state.at.read[:-2]
     rows = np.stack([state.data.pick(stays) for stays in (last, np.cumsum(last, axis=0))])
@@ -206,7 +206,7 @@ def _hysteresis(state: State) -> Hypothesis:
 
 def _energy_spread(state: State) -> Hypothesis | None:
     if state.allows("energy_spread"):
-        return None  # it is in the fit
+        return None  # the fit has it
     curved = state.at.curved.copy()
     curved[-1] = 0
     return Hypothesis(
@@ -215,20 +215,20 @@ def _energy_spread(state: State) -> Hypothesis | None:
 
 
 def _energy_offset(state: State) -> Hypothesis | None:
-    return None if state.allows("energy_offset") else _chromatic(state)  # it is in the fit
+    return None if state.allows("energy_offset") else _chromatic(state)  # the fit has it
 
 
 def _chromatic(state: State) -> Hypothesis:
-    """The beam's energy is not the magnets': quadrupoles and sextupoles act otherwise."""
+    """An energy offset of the beam, which changes the effect of quadrupoles and sextupoles."""
     scale = (1 + state.at.errors.calibration)[:, None, None] * DELTA
     slope = _readings(state, state.at.chromatic * scale)
     return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
 
 
 def _dispersion(state: State) -> Hypothesis | None:
-    """See `dispersion`; one amount a pattern."""
+    """Dispersion by kicks, see `dispersion`; one amount a pattern."""
     if state.allows("horizontal kicks"):
-        return None  # they are in the fit
+        return None  # the fit has them
     kicks = HorizontalKicks()
     count = kicks.size(state.data)
     if not count:
@@ -238,7 +238,7 @@ def _dispersion(state: State) -> Hypothesis | None:
 
 
 def _nonlinear(state: State) -> Hypothesis:
-    """Two-sided steps: x^3 / 4 of the whole change is left of a cubic reading."""
+    """Cubic BPMs with two-sided steps: x^3 / 4 of the whole change remains."""
     cubes = state.data.pick(state.at.read) ** 3 / 4 / MILLIMETRE**2
     rows = np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
     return Hypothesis("nonlinear monitors (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
@@ -280,7 +280,7 @@ def _monitor_position(state: State) -> Hypothesis:
 
 
 def _bend_gradient(state: State) -> Hypothesis:
-    """By length, for magnets of one length are one type."""
+    """Bends by length: magnets of one length are one type."""
     ring = state.at.model.ring
     bends = [i for i, e in enumerate(ring.elements) if e.kind == "bend"]
     kinds = sorted({round(ring.elements[i].length, 3) for i in bends})

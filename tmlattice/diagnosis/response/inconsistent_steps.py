@@ -1,12 +1,12 @@
-"""Steps of a corrector whose readings belong to no orbit: neighbours contradict one another.
+"""Inconsistent steps: a corrector's readings that belong to no orbit, because neighbours contradict
+one another.
 
-Of three monitors next to one another the reading of one follows from the other two, wherever else
-the beam is kicked: n1 x1 + n2 x2 + n3 x3 = 0, n normal to what they read of the two coordinates of
-a launch. A corrector that stands elsewhere, or kicks twice, breaks that at one triple. Where half
-of a column's triples are broken by many times what is usual, the monitors did not read one orbit:
-some of them, say, had averaged over the time before the step. No error of the ring or of the
-corrector can be learnt from that, and nobody is judged by it: found beside a fit, which knows the
-gains, such a step is left out, and named.
+Of three neighbouring BPMs the reading of one follows from the other two, wherever else the beam is
+kicked: n1 x1 + n2 x2 + n3 x3 = 0, with n normal to their sensitivities to the two coordinates of a
+launch. A misplaced corrector, or a second kick, violates that at one triple. Where half of a
+column's triples violate it by many times the usual, the BPMs did not read one orbit; some had
+averaged over the time before the step, for example. Such a step determines no error and validates
+nothing. It is detected with the gains of a fit, rejected, and reported.
 """
 
 import numpy as np
@@ -18,20 +18,20 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 INCONSISTENT = 5.0
-"""Times what the typical column's typical triple breaks."""
+"""Least ratio to the violation of the typical column's typical triple."""
 NOISE = 2.0
-"""Times the readings' noise, at least."""
+"""Least ratio to the readings' noise."""
 ENOUGH, COLUMNS = 8, 5
-"""Triples of a column, and columns of a plane, that it takes to say so."""
+"""Least numbers of triples of a column, and of columns of a plane."""
 MOST = 0.25
-"""Of a plane's columns, at most: more of them are what the model lacks."""
+"""Largest share of inconsistent columns of a plane: more of them are model discrepancy."""
 BLIND = 0.2
-"""A gain below which a monitor says nothing of the beam."""
+"""Gain below which a BPM does not read the beam."""
 _MAD = 1.4826  # of a Gaussian
 
 
 def inconsistent(state: State) -> Flags:
-    """Columns whose readings belong to no orbit, [column].
+    """Return the columns whose readings belong to no orbit, [column].
 
     Args:
         state: with gains and gradients.
@@ -46,7 +46,7 @@ def inconsistent(state: State) -> Flags:
             continue
         noise = float(np.median(data.noise[:, plane]))
         limit = max(INCONSISTENT * float(np.median(broken[stray])), NOISE * noise)
-        share = broken / orbits_of(state, rows)  # a larger step breaks more
+        share = broken / orbits_of(state, rows)  # a larger step violates more
         bad = stray & (np.where(stray, broken, 0.0) > limit)
         bad &= np.where(stray, share, 0.0) > INCONSISTENT * float(np.median(share[stray]))
         if bad.sum() <= MOST * stray.sum():
@@ -55,7 +55,7 @@ def inconsistent(state: State) -> Flags:
 
 
 def orbits_of(state: State, columns: NDArray[np.int64]) -> Array:
-    """rms of what was measured of columns in their own plane, m, at least the noise, [column]."""
+    """rms of the measured columns in their own plane, m, at least the noise, [column]."""
     read = state.data.pick(state.data.orbits)[columns][:, state.good]
     noise = float(np.median(state.data.noise))
     there = np.isfinite(read)
@@ -64,7 +64,7 @@ def orbits_of(state: State, columns: NDArray[np.int64]) -> Array:
 
 
 def _broken(state: State, column: int, plane: int) -> float:
-    """What a column's typical triple breaks, m, as one reading; NaN of too few."""
+    """The violation of a column's typical triple, m, as one reading; NaN of too few."""
     data, at = state.data, state.at
     gain = at.errors.monitors[:, plane, plane]
     read, orbit = at.read[column, :, plane], data.orbits[column, :, plane]

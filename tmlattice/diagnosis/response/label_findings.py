@@ -1,10 +1,9 @@
-"""Findings of a response that are no effect of the catalogue's: exchanged correctors or monitors,
-and correctors that stand elsewhere than in the lattice.
+"""Findings of a response that are no effect of the catalogue: swapped correctors or BPMs, and
+misplaced correctors.
 
->>> found = unnamed(ring, put_right, displaced(fit.state))
+>>> found = label_findings(ring, swapped, misplaced(fit.state))
 
-That exchanged ones are put right is told by whoever does it. They are located, and
-say in words what they are.
+They are localised and described in words. The correction of swaps is reported elsewhere.
 """
 
 from collections.abc import Sequence
@@ -19,33 +18,33 @@ from tmlattice.inference.alternatives import Detection
 from tmlattice.lattice import Ring
 
 NEAR = 0.25
-"""Of the ring: two that stand nearer have one place."""
+"""Distance, m, below which two elements have one place."""
 
 
 def label_findings(
     ring: Ring, swaps: Swaps, misplaced: Sequence[Misplaced] = (), other: str = "should"
 ) -> list[Finding]:
-    """All of them.
+    """Return the findings.
 
     Args:
         ring: the design.
-        exchanged: pairs that were put right.
-        displaced: correctors that stand elsewhere.
-        other: what the other one of a pair does as each of them: it "should", by the model, or it
-            "did" in a measurement before.
+        exchanged: pairs that were corrected.
+        displaced: misplaced correctors.
+        other: what each one of a pair does like the other: it "should", by the model, or it
+            "did" in the reference.
     """
     found = []
     for what, pairs in (("correctors", swaps.correctors), ("monitors", swaps.monitors)):
         for (a, b), gain in pairs.items():
-            words = f"{what} {a} and {b} answer each as the other one {other}"
-            check = "Follow the cables of both, and look at the table of their names."
+            words = f"{what} {a} and {b} respond each as the other one {other}"
+            check = "Check the cables of both, and the table of their names."
             found.append(_finding(ring, (a, b), Detection.among(gain, len(ring.elements)), words,
                                   check))  # fmt: skip
     for own in misplaced:
-        words = f"corrector {own.name} answers as if it stood {moved_text(own)}"
+        words = f"corrector {own.name} responds like one {moved_text(own)}"
         check = (
-            "Check its place in the lattice, which magnet the name is, and that no other one is "
-            "driven with it."
+            "Check its position in the lattice, its cable, and that its supply drives no other "
+            "magnet."
         )
         found.append(_finding(ring, (own.name,), Detection.among(own.gain, len(ring.elements)),
                               words, check))  # fmt: skip
@@ -55,8 +54,8 @@ def label_findings(
 def _finding(
     ring: Ring, elements: tuple[str, ...], seen: Detection, words: str, to_check: str
 ) -> Finding:
-    """Of one element, at its place in the lattice; of two, from one to the other where they stand
-    near, else at the first."""
+    """The finding of one element at its place in the lattice; of two, from one to the other where
+    they are near, else at the first."""
     found = located(ring, ring[elements[0]], seen)
     found = replace(found, words=words, to_check=to_check, elements=elements)
     if len(elements) == 1:

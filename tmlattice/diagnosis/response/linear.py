@@ -1,4 +1,4 @@
-"""The readings of a dense fit where it stands: slopes, normal equations, priors.
+"""The linearised readings of a hierarchical fit: derivatives, normal equations, priors.
 
 >>> there = linear(state, 0)
 >>> information, score = marginal(there, ["gradient"])
@@ -22,17 +22,18 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STILL = 0.05
-"""Share of what is trusted by which the ring moves, in the mean, before rows are taken anew."""
+"""Mean move of the ring, as a share of the step bounds, from which on derivatives are computed
+again."""
 
 
 def _ring(state: State) -> dict[str, Array]:
-    """The ring's numbers, in units of what a round may move them by."""
+    """The ring's numbers, in units of their step bounds."""
     return {f.variable: state.values[f.variable] / f.trust
             for f in state.families if f.per == "ring"}  # fmt: skip
 
 
 def _rows(state: State, family: Family) -> Kept:
-    """Of a variable of the ring: those that stand, or new ones."""
+    """The derivatives of a variable of the ring: the present ones, or new ones."""
     ring, gain = _ring(state), state.at.gain(family.block)
     scale = 1 + state.at.errors.calibration
     kept = state.kept.get(family.variable)
@@ -44,7 +45,7 @@ def _rows(state: State, family: Family) -> Kept:
 
 
 def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) -> Array:
-    """Of one variable's numbers, of which either may have more: what is not there is zero."""
+    """Values of one variable padded with zeros to the length of the longer one."""
     old, new = (one.get(name, np.zeros(0)) for one in (before, now))
     change = np.zeros(max(len(old), len(new)))
     change[: len(new)] += new
@@ -53,7 +54,7 @@ def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) ->
 
 
 def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
-    """By what rows that stand are to be multiplied: monitors and correctors have moved."""
+    """Factors on the present derivatives: gains and calibrations have changed."""
     if (gain == kept.gain).all() and (scale == kept.scale).all():
         return None
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -62,10 +63,10 @@ def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
 
 
 class Linear(NamedTuple):
-    """The readings of one block where the fit stands.
+    """The linearised readings of one block.
 
-    Parameters are those of the monitors, x and y of each; of the columns; and of the ring. One that
-    is as low as it can be, and that the readings would have lower, stays: no prior moves it.
+    Parameters are those of the monitors, x and y of each; of the columns; and of the ring. One
+    at its lower bound that the readings would decrease stays there.
     """
 
     normal: Normal
@@ -81,11 +82,11 @@ class Linear(NamedTuple):
 
     @property
     def by_ring(self) -> Array:
-        """The ring's rows in one array, [error, column, monitor]: a copy of them."""
+        """The ring's derivatives in one array, [error, column, monitor]: a copy of them."""
         return whole(self.ring, self.by_monitor.shape)
 
     def of_column(self, column: int, read: Indices, plane: int) -> Array:
-        """Slopes of some readings of a column that is read in a plane, [reading, parameter]."""
+        """Derivatives of some readings of a column in a plane, [reading, parameter]."""
         columns, monitors = self.by_monitor.shape
         out = np.zeros((len(read), len(self.start)))
         out[np.arange(len(read)), 2 * read + plane] = self.by_monitor[column, read]
@@ -97,7 +98,7 @@ class Linear(NamedTuple):
 
 
 def linear(state: State, block: int) -> Linear:
-    """Normal equations where the fit stands, the parameters there, priors, trusted changes."""
+    """Normal equations of a state with its parameters, priors and step bounds."""
     data, at = state.data, state.at
     columns, monitors = data.shape
     families = state.of_block(block)
@@ -154,13 +155,13 @@ def linear(state: State, block: int) -> Linear:
 
 
 def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array) -> Linear:
-    """With more numbers of the ring, each of size 1 by its prior.
+    """The linearisation with more numbers of the ring, each of prior rms 1.
 
     Args:
         there: `linear` of a block of the state.
         state, block: as there.
         name: of their variable.
-        rows: what they do for the readings, m, [number, column, monitor].
+        rows: their derivatives, m, [number, column, monitor].
     """
     if not len(rows):
         return there
@@ -192,7 +193,8 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
 
 
 def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
-    """What the readings say of some variables of the ring, all others with their priors taken out.
+    """Return information and score of some variables, with all others and their priors integrated
+    out.
 
     Args:
         there: where the fit stands.
@@ -215,8 +217,8 @@ def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
 
 
 def gathered(there: Linear, plane: Indices, weighted: Array) -> Array:
-    """J^T of weighted readings [column, monitor] with the slopes of the start, [parameter], each
-    column read in a plane."""
+    """J^T of weighted readings [column, monitor] with the derivatives of the start, [parameter],
+    each column read in a plane."""
     by_monitor = there.by_monitor * weighted
     alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
     by_column = (there.by_column * weighted).sum(axis=1)

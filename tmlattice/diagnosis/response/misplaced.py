@@ -1,10 +1,10 @@
-"""Single correctors that answer as if they stood elsewhere than in the lattice.
+"""Single correctors that respond as if they were elsewhere than in the lattice.
 
-A kick at a place d further along is, seen from where the lattice has it, the same kick and a
-position jump of -d times the kick. All correctors have some of that (their fields are no points);
-one that is far beyond the others, and agrees once it is moved, has a wrong place, or name.
+From its place in the lattice, a kick at a distance d downstream looks like the same kick and a
+position jump of -d times the kick. All correctors have some of that, because their fields have a
+length. An outlier among them that agrees at another place has a wrong place, or name.
 
->>> found = displaced(state)
+>>> found = misplaced(state)
 >>> [(own.name, own.by) for own in found]
 """
 
@@ -19,28 +19,29 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FAR = 5.0
-"""So many times the usual of a plane's correctors one is left with, and displaced by."""
+"""Least ratio of residual and displacement to those usual of the plane's correctors."""
 AGREES = 0.3
-"""Share of what it was left with, at most, that is left once it is moved."""
+"""Largest ratio of the residual at the new place to the one before."""
 SPARED = 0.1
-"""Share of the readings that may lie between the two places, and do not count."""
+"""Largest share of the readings between the two places, which do not count."""
 MARGIN = 1.5
-"""So far beyond where it is said to be, as a share of the way, a monitor lies between."""
+"""Margin beyond the estimated place, as a share of the distance, within which a BPM counts as
+between."""
 SAME = 1e-6
-"""m: nearer elements stand in one place."""
+"""Distance, m, below which elements have one place."""
 LEAST = 0.05
-"""m: what is nearer is in any field's shape."""
+"""Displacement, m, that any field's shape explains."""
 FEWEST = 8
-"""Readings, and correctors of a plane, that it takes."""
+"""Least numbers of readings, and of correctors of a plane."""
 _MAD = 1.4826  # of a Gaussian
 
 
 class Misplaced(NamedTuple):
-    """A corrector that answers as if it stood elsewhere.
+    """A misplaced corrector.
 
     Attributes:
         name, column: of the corrector, and of the response.
-        left, moved: what its readings are left with where it stands, and elsewhere, rms, m.
+        left, moved: residual at its place in the lattice, and at the other place, rms, m.
         by: how far downstream, m.
         gain: by which chi-square falls there.
     """
@@ -54,10 +55,10 @@ class Misplaced(NamedTuple):
 
 
 def misplaced(state: State) -> list[Misplaced]:
-    """Those that are.
+    """Return the misplaced correctors.
 
     Args:
-        state: a fit's; held-out correctors are looked at too.
+        state: a fit's; held-out correctors are included.
     """
     data, at = state.data, state.at
     beam, jumps = (data.pick(at.seen(own)) for own in (at.beam, at.jumps))
@@ -94,9 +95,8 @@ def misplaced(state: State) -> list[Misplaced]:
 def clear(
     state: State, column: int, patterns: Array, orbit: Array, seen: Flags, kick: float = 0.0
 ) -> Flags:
-    """Readings but for those of monitors between the place of a corrector and where it seems to
-    stand: they have the kick on their other side. Anything else that is missed counts, for outside
-    of the way between them a kick at any place is one here and a jump.
+    """Readings except those of BPMs between the corrector's place and its estimated place, which
+    have the kick on their other side. Outside, a kick at any place is a kick here and a jump.
 
     Args:
         state: of the fit.
@@ -123,8 +123,8 @@ def clear(
 
 
 def moved_text(own: Misplaced) -> str:
-    """How far off it is, and what that mends."""
+    """The displacement, and the residuals with and without it, in words."""
     return (
-        f"{abs(own.by):.2g} m {'down' if own.by > 0 else 'up'}stream ({1e6 * own.left:.2g} µm are "
-        f"left where it stands, {1e6 * own.moved:.2g} there)"
+        f"{abs(own.by):.2g} m {'down' if own.by > 0 else 'up'}stream ({1e6 * own.left:.2g} µm rms "
+        f"residual in the lattice's place, {1e6 * own.moved:.2g} there)"
     )

@@ -1,5 +1,5 @@
-"""Causes in the ring that no family holds (a sextupole beside its place, a device), as numbers of a
-dense fit; and priors of numbers that are wrong alone.
+"""Causes in the ring without a family (a misaligned sextupole, a device), as numbers of a
+hierarchical fit; and priors of single faults.
 
 >>> state = with_number(state, ("sextupole_offset_x", "sf::3"), block=0)
 """
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Others(Family):
-    """One number each; their priors are those of what is wrong alone.
+    """Causes of one number each; their priors are those of single faults.
 
     Attributes:
         causes: effect and place.
@@ -35,19 +35,19 @@ class _Others(Family):
 
     @property
     def units(self) -> Array:
-        """Numbers are in units of the effect's largest fault, [number]."""
+        """Amounts in units of the effect's largest fault, [number]."""
         return np.array([find(effect).largest for effect, _ in self.causes])
 
     def size(self, data: ResponseData) -> int:
-        """Of the causes."""
+        """Number of causes."""
         return len(self.causes)
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """None."""
+        """No priors."""
         return []
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """As the response has them."""
+        """Derivatives of the response."""
         out = np.empty((len(self.causes), *at.data.shape))
         gain, slopes = at.gain(self.block), at.slopes_of(self.block, self.causes)
         for row, slope, unit in zip(out, slopes, self.units, strict=True):
@@ -55,31 +55,31 @@ class _Others(Family):
         return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """As causes in the ring."""
+        """The errors with these causes in the ring."""
         own = zip(self.causes, (values * self.units).tolist(), strict=True)
         return replace(errors, ring=(*errors.ring, *(Cause(*h, a) for h, a in own if a)))
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """As they stand."""
+        """The causes with their amounts."""
         amounts, sigmas = (values * self.units).tolist(), (sigma * self.units).tolist()
         rows = zip(self.causes, amounts, sigmas, strict=True)
         return [(Cause(*h, a), s) for h, a, s in rows]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Each its own."""
+        """Zero: each has its own prior."""
         return [{h: u} for h, u in zip(self.causes, self.units.tolist(), strict=True)]
 
 
 class OthersInPlane(_Others):
-    """Whose amount the plane of the kick tells."""
+    """Causes whose amount the plane of the kick determines."""
 
     name, block, variable = "others in-plane", 0, "others in-plane"
 
 
 class OthersAcross(_Others):
-    """Whose amount the other plane tells."""
+    """Causes whose amount the other plane determines."""
 
     name, block, variable = "others across", 1, "others across"
 
@@ -88,7 +88,7 @@ KINDS: tuple[Any, ...] = (OthersInPlane, OthersAcross)
 
 
 def with_number(state: State, cause: Hypothesis, block: int) -> State:
-    """With one more number, at zero."""
+    """The state with one more number, at zero."""
     kind = KINDS[block]
     have = next((f.causes for f in state.families if isinstance(f, kind)), ())
     if cause in have:

@@ -1,4 +1,4 @@
-"""Outliers of an orbit response: single readings, steps and BPMs that contradict everything else.
+"""Outliers of an orbit response: single readings, steps and BPMs.
 
 Readings that went wrong have a small weight in the fit, for its noise model learns who they belong
 to. But nobody may be validated by them: what is held out has such readings, too. Here they are
@@ -27,41 +27,41 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 GROSS = 20.0
-"""So many times what is usual both of its corrector and of its BPM, no error of a ring makes of one
-reading alone: it went wrong."""
+"""Ratio to the usual residual of its corrector and of its BPM above which a single reading is an
+outlier."""
 MANY = 0.1
-"""Share of a step's readings from which they are not single ones: the step went wrong."""
+"""Share of a step's outliers from which on the step is the outlier."""
 STEP = 6.0
-"""A step is an outlier that leaves so many times what the typical one does, and so many times as
-large a share of its orbit. Two correctors with swapped labels leave some hundred times."""
+"""Ratio to the residual of the typical step, absolute and relative to its orbit, above which a step
+is an outlier. Swapped correctors have some hundred."""
 NOISE = 2.0
-"""Times the noise that it leaves at least."""
+"""Least ratio of its residual to the noise."""
 BAD = 5.0
-"""A BPM with so many times the rms misfit of the typical reading is bad."""
+"""Ratio of a BPM's rms misfit to the typical reading's above which it is bad."""
 SPARED = 0.1
-"""Share of its readings that do not count: a few outliers make no BPM bad."""
+"""Share of its readings that do not count: single outliers make no BPM bad."""
 ROUNDED = 1e-6
-"""Of the readings: two equal responses differ by less."""
+"""Relative difference below which two responses are equal."""
 COUPLING = "skew_gradient"
-"""The family that makes the readings in the other plane."""
+"""The family of the readings in the other plane."""
 BLIND = 0.2
-"""A gain below which a BPM tells nothing of the beam."""
+"""Gain below which a BPM does not read the beam."""
 MOST = 0.25
-"""Share of the steps of a plane that may be outliers: more of them are a model discrepancy."""
+"""Largest share of outlier steps of a plane: more of them are a model discrepancy."""
 COLUMNS, READINGS = 5, 6
-"""Steps of a plane, and readings of a step, that it takes to say so."""
+"""Least numbers of steps of a plane, and of readings of a step."""
 OUT = 5.0
-"""Standard deviations from which a reading is reported as an outlier of the fit."""
+"""Standard deviations from which on a reading is reported as an outlier of the fit."""
 NAMED, OFTEN = 3, 2
-"""BPMs and correctors that are named, and outliers of one from which it is."""
+"""BPMs and correctors that are named, and the least number of outliers of each."""
 STEPS = 10
-"""Reweighted least squares of a step's own amounts."""
+"""Iterations of reweighted least squares for a step's own amounts."""
 _MAD = 1.4826  # of a Gaussian
 
 
 @dataclass(frozen=True)
 class Outliers:
-    """What went wrong.
+    """Outliers of a response.
 
     Attributes:
         unread: readings that are not used, [column, monitor, plane that is read].
@@ -73,7 +73,7 @@ class Outliers:
 
 
 def outliers(state: State, explained: Collection[str] = ()) -> Outliers:
-    """Single readings and steps that went wrong.
+    """Return the outlier readings and steps.
 
     Args:
         state: a fit, with gains.
@@ -99,18 +99,18 @@ def outliers(state: State, explained: Collection[str] = ()) -> Outliers:
     single[steps] = False
     messages = gross_message(data, single, "the fit")
     if steps:
-        told = ", ".join(f"{names[c]} ({ratio[c]:.2g} times)" for c in steps)
+        named = ", ".join(f"{names[c]} ({ratio[c]:.2g} times)" for c in steps)
         messages.append(
-            "steps whose readings contradict one another or the fit to all others, with so many "
-            f"times what a typical step leaves, left out: {told}; measure them again: wait until "
-            "the beam has settled, and look for another kick or a supply that jumps"
+            "steps whose readings contradict one another or the fit to all others, with their "
+            f"residual over that of a typical step, rejected: {named}; measure them again: wait "
+            "until the beam has settled, and check for a spurious kick or a supply that jumps"
         )
     return Outliers(unread, tuple(messages))
 
 
 def given_own(state: State) -> Array:
-    """What is left of each step beside its own amounts, which held-out ones have not been fitted
-    for: its kick, its place, its roll; least absolute deviations, m, [column, monitor, 2]."""
+    """Residuals of each step after its own amounts (kick, place, roll) by least absolute
+    deviations, m, [column, monitor, 2]."""
     data, at = state.data, state.at
     beam, jumps, across = at.seen(at.kicked), at.seen(at.jumps), at.seen(at.across)
     left = at.left.copy()
@@ -145,9 +145,8 @@ def _robust(patterns: Array, read: Array) -> Array:
 
 
 def misfits(state: State, left: Array) -> Array:
-    """By how many times what a step leaves is more than what the typical one of its plane does,
-    in metres, as a share of its orbit and of what is read, in the plane read where that is more,
-    [column].
+    """Ratio of each step's residual to the typical one of its plane, in metres, relative to its
+    orbit and to its readings, in the plane with the larger ratio, [column].
 
     Args:
         state: of the fit.
@@ -167,34 +166,36 @@ def misfits(state: State, left: Array) -> Array:
         rows = np.flatnonzero(straight == kicked)
         for read in (0, 1):
             size, orbit = sizes[rows, read], orbits[rows, kicked]
-            told = np.isfinite(size) & np.isfinite(orbit)
-            if told.sum() < COLUMNS:
+            named = np.isfinite(size) & np.isfinite(orbit)
+            if named.sum() < COLUMNS:
                 continue
             share = size / np.maximum(orbit, float(np.median(data.noise)))
-            # what is not fitted is left larger
-            least = np.maximum(_medians(size, told, state.fitted[rows]), NOISE * noise[read] / STEP)
-            typical = np.maximum(_medians(share, told, state.fitted[rows]), 1e-300)
+            # residuals of unfitted readings are larger
+            least = np.maximum(
+                _medians(size, named, state.fitted[rows]), NOISE * noise[read] / STEP
+            )
+            typical = np.maximum(_medians(share, named, state.fitted[rows]), 1e-300)
             ratio = np.minimum(size / least, share / typical)
             # a corrector that is rolled makes an orbit in the other plane, which the fit leaves as
             # large a share of as of others
             across = usual * np.fmax(orbits[rows, read], noise[read])
-            ratio = np.where(told, np.fmin(ratio, size / np.maximum(across, 1e-300)), 0.0)
-            if (ratio > STEP).sum() <= MOST * told.sum():
+            ratio = np.where(named, np.fmin(ratio, size / np.maximum(across, 1e-300)), 0.0)
+            if (ratio > STEP).sum() <= MOST * named.sum():
                 out[rows] = np.maximum(out[rows], ratio)
     return out
 
 
-def _medians(own: Array, told: Flags, fitted: Flags) -> Array:
-    """Of each row, the median of all or of those that are fitted, or not, as it is; the larger."""
-    out = np.full(len(own), np.median(own[told]))
+def _medians(own: Array, named: Flags, fitted: Flags) -> Array:
+    """The median of all, of the fitted, or of the unfitted entries of each row; the larger one."""
+    out = np.full(len(own), np.median(own[named]))
     for alike in (fitted, ~fitted):
-        if (told & alike).any():
-            out[alike] = np.maximum(out[alike], np.median(own[told & alike]))
+        if (named & alike).any():
+            out[alike] = np.maximum(out[alike], np.median(own[named & alike]))
     return out
 
 
 def _typical(read: Array) -> Array:
-    """Of each row, by the median, NaN of too few, m."""
+    """The rms of each row, by the median, m; NaN of too few."""
     out = np.full(len(read), np.nan)
     for i, own in enumerate(read):
         seen = own[np.isfinite(own)]
@@ -204,9 +205,9 @@ def _typical(read: Array) -> Array:
 
 
 def good_monitors(state: State) -> Flags:
-    """BPMs whose misfit is usual, with a gain of their own, [monitor].
+    """Return the BPMs with a usual misfit after their own gains, [monitor].
 
-    In the plane across they are judged once skew gradients are fitted, which make it.
+    In the other plane they are checked after skew gradients are fitted.
 
     Args:
         state: a fit, with gains.
@@ -216,8 +217,8 @@ def good_monitors(state: State) -> Flags:
 
 
 def _usual(state: State, block: int) -> Flags:
-    """BPMs whose rms misfit in a block is not far beyond the median one's, also without the worst
-    tenth of their readings: a few outliers make no BPM bad."""
+    """BPMs whose rms misfit in a block is below the limit, also without the worst tenth of their
+    readings."""
     data = state.data
     read, orbits = data.pick(state.at.read, block), data.pick(data.orbits, block)
     good = np.ones(data.shape[1], dtype=bool)
@@ -229,8 +230,8 @@ def _usual(state: State, block: int) -> Flags:
         rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
         for spared in (0.0, SPARED):
             rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
-            told = (count > 0) & state.good
-            usual = max(float(np.median(rms[told])), rounded) if told.any() else np.inf
+            named = (count > 0) & state.good
+            usual = max(float(np.median(rms[named])), rounded) if named.any() else np.inf
             blind = (gain < BLIND) & (block == 0)
             bad &= (count > 0) & ((rms > BAD * usual) | blind)
         good &= ~bad
@@ -238,8 +239,8 @@ def _usual(state: State, block: int) -> Flags:
 
 
 def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
-    """What each monitor leaves with a gain of its own, rms, m; the gain, over those that it has;
-    and of how many readings, [monitor].
+    """Residual of each BPM with its own gain, rms, m; the gain, relative to its present one; and
+    the number of readings, [monitor].
 
     Args:
         read, orbits: by the model and measured, m, [column, monitor].
@@ -262,8 +263,8 @@ def _gain(read: Array, orbits: Array, seen: Flags) -> Array:
 
 
 def without(state: State, flags: Flags) -> State:
-    """A state as if nobody had taken these readings, [column, monitor, 2]: columns that have none
-    are fitted nowhere, validate nothing, and have no numbers of their own."""
+    """The state without these readings, [column, monitor, 2]: empty columns are not fitted,
+    validate nothing, and have no numbers."""
     if not flags.any():
         return state
     data = state.data
@@ -281,10 +282,9 @@ def without(state: State, flags: Flags) -> State:
 
 # --- single readings ------------------------------------------------------------------------------
 def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitResponse, list[str]]:
-    """The measurement without single readings that went wrong, and a message of them.
+    """The measurement without single outliers, and a message about them.
 
-    Held-out correctors have such readings, too, and a few of them make up most of a validation
-    score.
+    Held-out correctors have outliers, too, and they would dominate a validation score.
 
     Args:
         measured: the response.
@@ -299,8 +299,7 @@ def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitRes
 
 
 def gross(data: ResponseData, left: Array) -> Flags:
-    """Readings of the correctors that went wrong, by what something leaves of them, [column,
-    monitor, 2].
+    """Outliers of the correctors' readings, [column, monitor, 2].
 
     Args:
         data: the response.
@@ -320,7 +319,7 @@ def gross(data: ResponseData, left: Array) -> Flags:
 
 
 def gross_message(data: ResponseData, wrong: Flags, what: str) -> list[str]:
-    """A message of readings that went wrong, where there are any.
+    """A message about outliers, if there are any.
 
     Args:
         data: the response.
@@ -334,13 +333,13 @@ def gross_message(data: ResponseData, wrong: Flags, what: str) -> list[str]:
     most = _most(Counter(names.monitors[i] for i in monitors.tolist()),
                  Counter(names.correctors[i] for i in columns.tolist()))  # fmt: skip
     return [
-        f"single readings that differ from {what} by {GROSS:g} times what is usual of their "
-        f"corrector and of their monitor, left out: {len(columns)}{most}"
+        f"single readings that differ from {what} by {GROSS:g} times the usual residual of their "
+        f"corrector and of their BPM, rejected: {len(columns)}{most}"
     ]
 
 
 def _most(*tables: Counter[str]) -> str:
-    """Who has most of them."""
+    """The elements with most outliers."""
     most = [
         f"{name} ({own})"
         for table in tables
@@ -351,7 +350,7 @@ def _most(*tables: Counter[str]) -> str:
 
 
 def messages(state: State) -> list[str]:
-    """Outliers that a fit leaves in its readings, and what all steps have in common."""
+    """Messages about outliers of a fit, and about common-mode noise of the steps."""
     measured = state.data.measured
     limit = (FREEDOM + 1) / (FREEDOM + OUT**2)
     monitors, correctors = Counter[str](), Counter[str]()
@@ -364,22 +363,24 @@ def messages(state: State) -> list[str]:
         if len(rf):
             names = ", ".join(measured.monitors[i] for i in rf)
             out.append(
-                f"readings of the RF's orbit in {'xy'[block]} that are more than {OUT:g} standard "
-                f"deviations off, and count little: {names}"
+                f"readings of the RF's orbit in {'xy'[block]} that deviate by more than {OUT:g} "
+                "standard "
+                f"deviations, and have a low weight: {names}"
             )
         count, total = count + int(found_outliers[:-1].sum()), total + int(use[:-1].sum())
         monitors.update(measured.monitors[i] for i in np.nonzero(found_outliers[:-1])[1])
         correctors.update(measured.correctors[i] for i in np.nonzero(found_outliers[:-1])[0])
     if count:
         out.append(
-            f"{count} of {total} readings are more than {OUT:g} standard deviations off, and count "
-            f"little{_most(monitors, correctors)}"
+            f"{count} of {total} readings deviate by more than {OUT:g} standard deviations, and "
+            "have a "
+            f"low weight{_most(monitors, correctors)}"
         )
     return out + common_modes(state)
 
 
 def common_modes(state: State) -> list[str]:
-    """What all readings of a step have in common, where that is more than their noise."""
+    """A message about the common mode of all readings of a step, if it exceeds their noise."""
     noise, data = state.noise, state.data
     moved = []
     for plane in (0, 1) if "waves" in noise.kinds else ():
@@ -389,6 +390,6 @@ def common_modes(state: State) -> list[str]:
     if not moved:
         return []
     return [
-        "the beam moved between the readings of a step, all BPMs together, by another amount in "
-        f"each: {' and '.join(moved)}; the amounts are taken for unknown"
+        "beam jitter between the readings of a step, common to all BPMs: "
+        f"{' and '.join(moved)}; its amounts are fitted in each step"
     ]

@@ -1,17 +1,16 @@
-"""Which errors close how much of a measured orbit response's gap, on held-out data.
+"""The diagnosis of an orbit response, with validation on held-out data.
 
-A fifth of the correctors is never fitted. Of each of them only the kick is taken, from a random
-half of the monitors, and the other half judges; the RF's orbit is fitted on half of the monitors
-and judged on the other half. What is closed is decided on other correctors, held out from the rest,
-so that these figures choose nothing.
+One fifth of the correctors is held out. For each held-out corrector the kick is estimated from a
+random half of the BPMs, and the prediction is scored on the other half. The RF's orbit is fitted on
+half of the BPMs and scored on the other half. An inner validation set of other correctors selects
+families, so that the outer scores select nothing.
 
 >>> result = diagnose_response(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
 
-Gain and calibration are degenerate in scale but for the dispersion; neighbouring quadrupoles can
-pull against one another. Priors settle both: a family of correctors or quadrupoles (one kind of
-magnet, or one supply) shares an error, its members scatter about it, and how much is learnt from
-the data.
+Gain and calibration are degenerate in scale without the dispersion, and neighbouring quadrupoles
+are correlated. Priors resolve both: a family of correctors or quadrupoles (one kind of magnet, or
+one supply) shares an error, its members scatter about it, and the scatter is learnt.
 """
 
 import time
@@ -77,13 +76,15 @@ Array = NDArray[np.float64]
 FINDINGS = 14
 """Findings at most."""
 PATTERNS = 8
-"""The strongest patterns of what is left."""
+"""Number of the strongest patterns of the residual."""
 LARGE = 60_000
-"""Readings up to which single faults among small errors are sought: every number is fitted anew
-for each of them."""
-TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
+"""Most readings for the search for single faults among distributed errors, which refits
+everything."""
+TOO_LARGE = (
+    "single faults among the distributed errors were not sought: there are too many readings"
+)
 TYPICAL = 6
-"""Columns of a plane that say what a design leaves of the typical one."""
+"""Columns of a plane required for the typical one."""
 
 
 def diagnose_response(
@@ -99,18 +100,18 @@ def diagnose_response(
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> Diagnosis:
-    """Correctors and families, monitors, single gradients, then what couples the planes.
+    """Diagnose an orbit response: all families of errors, sparse solutions and single faults.
 
     Args:
         ring: the design.
-        measured: with an RF step, if it can be, and the noise of its readings; else that is
+        measured: with an RF step, if possible, and the noise of its readings; else that is
             learnt.
         holdout: share of the correctors that is never fitted.
         effects: only families of these are tried; else all.
         max_effects: findings at most.
-        false_alarm: chance that the readings of a faultless ring are said to have an error.
-        missing: weigh too which effect the result still lacks.
-        assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone
+        false_alarm: probability of a finding in the readings of a faultless ring.
+        missing: also compare effects that may be missing.
+        assume: what is recorded wrongly everywhere, see `measurement.assume`; it is corrected
             first.
         seed: of the split.
         progress: called with the name of each stage.
@@ -132,7 +133,7 @@ def diagnose_response(
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
-    # a few causes explain anything to an overstated noise
+    # with overstated noise any sparse set of causes explains the data
     if sparse is None or overstated(ring, data.measured):
         whole = _families(ring, measured, families, holdout, seed, progress)
         sparse = None if sparse is None or outperforms(whole[0], sparse.fit) else sparse
@@ -184,8 +185,8 @@ def _families(
     seed: int,
     progress: Callable[[str], Any],
 ) -> tuple[HierarchicalFit, OrbitResponse, list[str], Swaps]:
-    """The fit of what resembles the model; what was fitted, and what was done to it; and
-    what is exchanged."""
+    """The fit without rejected channels; the fitted data and the messages about them; and the
+    swaps."""
     said: list[str] = []
     known = Swaps([], {}, {}, [])
     fit: HierarchicalFit | None = None
@@ -218,8 +219,8 @@ def _families(
 
 
 def _far(state: State, unlike: RejectedChannels) -> bool:
-    """Whether the ring is to be fitted before columns are exchanged: in a design that is far off
-    they fit in each other's place by chance."""
+    """Whether the ring is fitted before swaps are sought: in a design far from the ring, swapped
+    columns match by chance."""
     gone = {name for name, _ in unlike.monitors}
     good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
     return strange(replace(state, good=good), TYPICAL) > FAR
@@ -233,7 +234,7 @@ def _faults(
     judgement: Judgement,
     progress: Callable[[str], Any],
 ) -> tuple[HierarchicalFit, tuple[Finding, ...]]:
-    """What is wrong alone among small errors, and the fit beside it."""
+    """Single faults among distributed errors, and the fit given them."""
     state = fit.state
     ring = state.data.ring
     found = [swap_of(state, name, judgement) for name in swaps.planes
@@ -252,7 +253,7 @@ def _faults(
 
 
 def _without(state: State, far: Sequence[Misplaced]) -> State:
-    """As if these had not been stepped: what they leave is explained, and no single fault's."""
+    """The state without steps of explained columns, which are evidence for no single fault."""
     gone = np.zeros(state.data.orbits.shape, dtype=bool)
     gone[[own.column for own in far]] = True
     return without(state, gone)
@@ -265,12 +266,12 @@ def as_diagnosis(
     found: Sequence[StatedCause],
     **fields: Any,
 ) -> Diagnosis:
-    """What a fit of a response says, as a diagnosis.
+    """Return the diagnosis of a fit of a response.
 
     Args:
         ring: the design.
         fit: with its steps.
-        within: what the ring as found has.
+        within: errors of the estimated ring.
         found: causes with their errors.
         fields: further ones of the diagnosis.
     """
@@ -325,7 +326,7 @@ def _view(fit: HierarchicalFit) -> ResponseView:
 
 
 def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
-    """What made a diagnosis."""
+    """The provenance of a diagnosis."""
     from tmlattice.version import __version__
 
     return {
@@ -361,21 +362,21 @@ def families_of(
 
 
 def _verdict(fit: HierarchicalFit, false_alarm: float) -> str:
-    """`nothing` where the design leaves noise alone, in the fit and held out, in both planes and in
-    the RF's response; else `distributed`: many small errors."""
+    """`none` where the design leaves only noise, fitted and held out, in both planes and of the RF;
+    else `distributed`."""
     said = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
     chances = [chi2.sf(own.total, own.readings) for own in said if own.readings]
     return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
 def _warnings(fit: HierarchicalFit) -> tuple[str, ...]:
-    """What a reader should know."""
+    """Warnings of the diagnosis."""
     said = dispersion_by_kicks(fit.state.values, fit.state.data)
     return (*said, *messages(fit.state))
 
 
 def _misfit(fit: HierarchicalFit, read: Array) -> Misfit:
-    """Of the fitted correctors' readings in their own plane."""
+    """The misfit of the fitted correctors' readings in their own plane."""
     data, good = fit.state.data, fit.state.good
     rows = np.flatnonzero(~fit.state.split.held[:-1])
     miss = data.pick(data.orbits - read)[rows][:, good]
@@ -394,7 +395,7 @@ def _gap(fit: HierarchicalFit) -> Gap:
 
 
 def _patterns(fit: HierarchicalFit) -> dict[str, Any]:
-    """What stays of the fitted correctors' readings: chi-square per reading, and the share of the
+    """The remaining residual of the fitted correctors: chi-square per reading, and the share of the
     strongest patterns in each plane."""
     state, data = fit.state, fit.state.data
     shares = []

@@ -35,19 +35,19 @@ log = logging.getLogger(__name__)
 ROUNDS = 40
 """Rounds of a fit at most."""
 GAIN = 1e-4
-"""A fit has converged where a round gains less than this share of the cost: half a unit in 5000
-readings. Prior scales and weak directions follow last, and are worth some ten units."""
+"""Relative gain of a round below which a fit has converged: half a unit in 5000 readings. Prior
+scales and weak directions converge last, and contribute some ten units."""
 EACH = 4
 """Fisher steps of the prior scales in a round of the fit."""
 RETRIES, SHORTER, LONGER, LONGEST = 6, 4.0, 2.0, 8.0
-"""How often a step that raised the cost is repeated; by what the step bounds fall then and grow
-else, and to how much at most."""
+"""Repetitions of a step that raised the cost; factors by which the step bounds fall then and grow
+otherwise, and their largest value."""
 CORRECTED, CORRECTS = 6, 1e-3
-"""How often a round corrects its step by what the readings are where it led, with the slopes of its
-start; and what share of the cost that has to gain to be repeated. Numbers that pull against one
-another go far in a valley that is narrow and bent: a step along its tangent leads up its wall."""
+"""Corrections of a round's step by the residuals at its end, with the derivatives of its start; and
+the least gain for another one. Correlated numbers move along a narrow, bent valley, and a tangent
+step leaves it."""
 HELD = 4
-"""How often numbers beyond their bounds are held, and the rest solved again."""
+"""Repetitions of the solution with numbers held at their bounds."""
 
 Weights = tuple[Array, Array]
 
@@ -62,12 +62,12 @@ class Moved(NamedTuple):
 
 
 def one_round(state: State, blocks: Mapping[int, Linear], bold: float = 1.0) -> Moved:
-    """Solve the readings of both blocks, and move.
+    """Solve the readings of both blocks, and take the step.
 
     Args:
         state: where it stands.
         blocks: `linear` of each block that has families.
-        bold: factor of every step bound: small where the last rounds raised the cost.
+        bold: factor of every step bound: small after rounds that raised the cost.
     """
     found = {block: _within(there, bold) for block, there in blocks.items()}
     groups = {group.name: group for own in found.values() for group in own.groups}
@@ -112,7 +112,7 @@ def one_round(state: State, blocks: Mapping[int, Linear], bold: float = 1.0) -> 
 
 
 def _weights(state: State, block: int) -> Weights:
-    """Weights of the readings, and what common modes take from them."""
+    """Weights of the readings, and their reduction by common modes."""
     own = weight(state, block)
     return own, common(own, patterns(state, block))[0]
 
@@ -120,8 +120,7 @@ def _weights(state: State, block: int) -> Weights:
 def _corrected(
     then: State, block: int, there: Linear, found: Posterior, weights: Weights, bold: float
 ) -> Array:
-    """Values that the readings ask for where a step led, as if the ring were linear with the slopes
-    of its start."""
+    """Values by the residuals at the end of a step, with the derivatives of its start."""
     moved = np.zeros_like(there.start)
     for name, at in there.where.items():
         moved[at] = then.values[name] - there.start[at]
@@ -133,7 +132,7 @@ def _corrected(
 
 
 def _within(there: Linear, bold: float) -> Posterior:
-    """The step, with numbers that it would move beyond their bounds left there."""
+    """The step, with numbers that would exceed their bounds held there."""
     groups, trust = there.groups, bold * there.trust
     for _ in range(HELD):
         found = solve(there.normal, groups, there.start, trust, rounds=EACH)
@@ -146,8 +145,8 @@ def _within(there: Linear, bold: float) -> Posterior:
 
 
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
-    """What the priors of one variable, which add up, ask for its values."""
-    if not groups:  # of numbers that a ring has none of
+    """The prior's gradient for the values of one variable; its priors add up."""
+    if not groups:  # the ring has no such numbers
         return 0.0
     each, shared = np.zeros(len(values)), []
     for group in groups:
@@ -157,11 +156,11 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
             each += np.abs(spread).sum(axis=1)
         else:
             shared.append(spread)
-    free = each > 0  # one that is held is not asked for
+    free = each > 0  # held numbers are skipped
     if not free.any():
         spread = np.concatenate(shared, axis=1)
         return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
-    # a few that are shared, each number's own takes the rest
+    # after shared ones, each number's own prior has the rest
     rest, scale = values[free] / each[free], each[free, None]
     few = np.concatenate([np.zeros((len(rest), 0)), *(own[free] / scale for own in shared)], axis=1)
     asked = np.concatenate([rest, np.zeros(few.shape[1])])
@@ -182,7 +181,7 @@ def settle(
     possible: Callable[[State], bool] = lambda state: True,
     alike: bool = False,
 ) -> State:
-    """Rounds until none gains any more, none of which raises the cost.
+    """Repeat rounds until none gains; none of them raises the cost.
 
     As Levenberg and Marquardt have it, but that the bound of a step is a change of each number by
     itself: a round that raised the cost is taken back and repeated with shorter steps.
@@ -221,7 +220,7 @@ def settle(
 
 
 def _spent(state: State, block: int, there: Linear, found: Posterior) -> Spent:
-    """Degrees of freedom that the parameters take, and those of the RF's orbit."""
+    """Degrees of freedom of the parameters, and those of the RF's orbit."""
     half = inverse_of_lower(found.factor)
     total = len(found.prior) - float(np.sum(half**2))
     column = len(state.data.plane) - 1
@@ -234,7 +233,7 @@ def _spent(state: State, block: int, there: Linear, found: Posterior) -> Spent:
 
 
 def log_evidence(state: State) -> float:
-    """Evidence of what is fitted (Laplace), up to a constant of the data.
+    """The log evidence of the fitted readings (Laplace), up to a constant of the data.
 
     Args:
         state: that has settled; states that are compared use the same monitors.

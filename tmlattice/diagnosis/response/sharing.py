@@ -1,4 +1,4 @@
-"""What magnets may share an error: all, a polarity, a region, a type, a family; or one alone."""
+"""Magnets that may share an error: all, a polarity, a region, a type, a family; or a single one."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from tmlattice.lattice.supplies import supplied_alike
 Array = NDArray[np.float64]
 
 GAP = 2.5
-"""Times the usual way between two bends that makes a straight."""
+"""Ratio to the usual distance of two bends that makes a straight."""
 
 
 class Candidates(NamedTuple):
-    """All that may share an error.
+    """All candidates for a common factor.
 
     Attributes:
-        kinds, names: see `reasons.MAKES`.
+        kinds, names: see `common_factors.MAKES`.
         members: what each moves, [magnet, candidate].
-        families: which are families of several magnets, whatever kind they are told as.
+        families: which are families of several magnets, whatever kind they are reported as.
     """
 
     kinds: tuple[str, ...]
@@ -31,10 +31,10 @@ class Candidates(NamedTuple):
 
 
 def candidates(ring: Ring, own: Sequence[tuple[Element, ...]]) -> Candidates:
-    """The magnets of a ring in all ways in which they may share an error; one way has one name.
+    """Return all groups of a ring's magnets that may share an error; each group has one name.
 
     Args:
-        ring: where the magnets stand.
+        ring: with the magnets.
         own: the magnets, each with its pieces.
     """
     kinds: list[str] = []
@@ -81,7 +81,7 @@ def _length(pieces: Sequence[Element]) -> float:
 
 
 def _regions(ring: Ring, own: Sequence[tuple[Element, ...]]) -> list[tuple[str, Array]]:
-    """Arcs and straights, all of them and one by one."""
+    """Arcs and straights, all of them and single ones."""
     bends = np.array([e.s for e in ring.elements if e.kind == "bend"])
     if len(bends) < 3:
         return []

@@ -1,10 +1,9 @@
-"""One change between two measurements, weighed among all that the first one leaves open.
+"""One change between two measurements, given the undetermined errors of the first fit.
 
-With the small errors x that are not known (`left_open`) a change of amount a makes a (v + B x) of
-the readings: v as in the ring that was fitted, B x by what is not known of it. So the readings have
-the covariance 1 + a^2 B B^T, which is each change's own, and the likeliest amount is the one of
-the whole density: where a family of sextupoles changes, all that is seen of it may be what an orbit
-that nobody knows makes of it.
+With undetermined errors x (`undetermined`) a change of amount a has the effect a (v + B x) on the
+readings, with v in the fitted ring. So the readings have the covariance 1 + a^2 B B^T, which
+differs between changes, and the most probable amount maximises the whole density. For a family of
+sextupoles, the effect may come from an unknown orbit alone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,18 +27,18 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 AMOUNTS = np.geomspace(1e-5, 1.2, 120)
-"""Of the largest fault: where the likeliest amount is looked for first."""
+"""Start of the search for the most probable amount, as a share of the largest fault."""
 STEP = 0.01
-"""Of the largest fault: where a change is taken at first of which nothing is known."""
+"""Start for a change of unknown amount, as a share of the largest fault."""
 LINEARISED = 3
-"""Times that a change is taken at its likeliest amount."""
+"""Iterations of the change at its most probable amount."""
 SAME = 0.02
-"""Of the amount, to which that is enough."""
+"""Relative accuracy of the amount at which they end."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """A change, linear in its strength t = amount^power, and what is not known of it.
+    """A change, linear in its strength t = amount^power, with its uncertainty.
 
     Attributes:
         left: rows without the change, [row].
@@ -53,7 +52,7 @@ class _Line:
 
     @cached_property
     def _parts(self) -> tuple[Array, Array, Array, Array]:
-        """Variances along the directions of B, the rows and the slope there; and their products
+        """Variances along the directions of B, the residual and slope there; and their products
         beyond them."""
         values, along = directions_of(self.spread)
         both = np.stack([self.left, self.slope])
@@ -62,7 +61,7 @@ class _Line:
         return values, inside[0], inside[1], beyond
 
     def log_density(self, strengths: Array) -> Array:
-        """Of the readings, up to a constant, [strength]."""
+        """The log density of the readings, up to a constant, [strength]."""
         variance, left, slope, beyond = self._parts
         t = np.atleast_1d(strengths)[:, None]
         spread = 1 + t**2 * variance
@@ -74,9 +73,8 @@ class _Line:
 
 
 def _peaks(amounts: Array, seen: Array, inner: bool) -> Indices:
-    """Where a density of amounts, by rising amount, is highest on either side of zero; at the
-    smallest amount only if that may be: towards zero an amount that is even in its logarithm is
-    ever denser, whatever is read."""
+    """Local maxima of a density of amounts on either side of zero, by rising amount; at the
+    smallest amount only if allowed, because a log-uniform prior diverges towards zero."""
     found = []
     for side in (amounts < 0, amounts > 0):
         own = np.flatnonzero(side)
@@ -88,7 +86,7 @@ def _peaks(amounts: Array, seen: Array, inner: bool) -> Indices:
 
 
 class SingleChange:
-    """Changes of one machine, one at a time.
+    """Single changes of one machine.
 
     Args:
         blur: what is not known of what they do there.
@@ -99,7 +97,7 @@ class SingleChange:
         self.left = self.plain.at((), self.plain.first).residual
 
     def likeliest(self, hypothesis: Hypothesis, start: float | None = None) -> Alternative | None:
-        """A change with its likeliest amount; None where the readings want none of it.
+        """The change with its most probable amount; None where the readings reject it.
 
         Args:
             hypothesis: what changes.
@@ -116,7 +114,7 @@ class SingleChange:
                 line = _Line(self.left, slope, spread)
                 near = None if found is None else at
                 found = self._amount(line, hypothesis, near)
-                if found is None and near is not None:  # it is far from there
+                if found is None and near is not None:  # far from the start
                     found = self._amount(line, hypothesis, None)
                 if found is None:
                     return None
@@ -129,7 +127,7 @@ class SingleChange:
             return None
 
     def _made(self, causes: Sequence[Cause]) -> Array:
-        """What causes make of the rows."""
+        """The effect of causes on the rows."""
         there = self.plain.at(causes, self.plain.first)
         if there.lost:
             raise UnstableRingError(there.lost)
@@ -138,7 +136,8 @@ class SingleChange:
     def _amount(
         self, line: _Line, hypothesis: Hypothesis, near: float | None
     ) -> tuple[float, float, float] | None:
-        """The likeliest amount, its error, and the log density there with the amount's prior."""
+        """The most probable amount, its error, and the log density there with the amount's
+        prior."""
         effect = find(hypothesis[0])
         if effect.discrete:
             return 1.0, 0.0, float(line.log_density(np.ones(1))[0])
@@ -166,7 +165,7 @@ class SingleChange:
         amount = float(best.x)
         h = 1e-3 * abs(amount)
         ends = density(np.array([amount - h, amount, amount + h]))
-        for _ in range(30):  # until the difference is one that can be seen
+        for _ in range(30):  # until the difference is significant
             bend = float(2 * ends[1] - ends[0] - ends[2])
             if bend > 0.01 or h > abs(amount) / 2:
                 break
@@ -174,7 +173,7 @@ class SingleChange:
             ends = density(np.array([amount - h, amount, amount + h]))
         sigma = float(h / np.sqrt(bend)) if bend > 0 else abs(amount)
         mirror = peaks[amounts[peaks] * amount < 0]
-        if len(mirror):  # where the sign is hardly seen, that is in the error
+        if len(mirror):  # an uncertain sign is included in the error
             other = int(mirror[seen[mirror].argmax()])
             odds = float(np.exp(min(seen[other] - ends[1], 0.0)))
             sigma = float(np.hypot(sigma, np.sqrt(odds / (1 + odds)) * (amount - amounts[other])))
@@ -183,7 +182,7 @@ class SingleChange:
     def _rival(
         self, hypothesis: Hypothesis, unit: Array, amount: float, sigma: float, density: float
     ) -> Alternative:
-        """As a fit; its point is among what is open of this change."""
+        """The change as a fit; its point includes the undetermined errors."""
         problem = self.blur.among(amount ** find(hypothesis[0]).power * unit)
         point = problem.at((Cause(*hypothesis, amount),), problem.first)
         evidence = density + self.plain.prior(hypothesis)
@@ -193,11 +192,11 @@ class SingleChange:
         return Alternative(hypothesis, Fit(point, covariance, float(evidence), Outcome.CONVERGED))
 
     def among(self, one: Alternative) -> MarginalProblem:
-        """The problem among what is open of a change."""
+        """The problem with the undetermined errors of a change."""
         return self.blur.among(self.blur.of((one.cause,)))
 
     def all_of(self, starts: Mapping[Hypothesis, float | None]) -> tuple[Alternative, ...]:
-        """Of some hypotheses, with amounts near theirs, by falling evidence."""
+        """Some hypotheses, with amounts near theirs, by falling evidence."""
         tried = (self.likeliest(hypothesis, start) for hypothesis, start in starts.items())
         found = [rival for rival in tried if rival is not None]
         return tuple(sorted(found, key=lambda rival: -rival.fit.log_evidence))

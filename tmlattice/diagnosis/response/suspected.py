@@ -1,10 +1,10 @@
-"""What each single cause would do to an orbit response beside all usual small errors.
+"""The effect of each single cause on an orbit response, given all usual distributed errors.
 
 >>> seen = look_at(state, suspects_of(state, single_causes(state.data)))
 >>> seen.statistic, seen.amount
 
-A cause that one number of a family is (a quadrupole's gradient, a gain, a roll), or some together
-(a supply), costs nothing: the normal equations hold it. Others are weighed by their signatures.
+A cause that is one number of a family (a quadrupole's gradient, a gain, a roll), or a sum of some
+(a supply), is in the normal equations already. Others are compared by their signatures.
 """
 
 from collections.abc import Sequence
@@ -27,15 +27,15 @@ from tmlattice.observe.orbit_response import Hypothesis
 Array = NDArray[np.float64]
 
 AFFORDABLE = 4e9
-"""Products of signatures with rows of the small errors that are taken: more causes, readings and
-errors than that, and only numbers of families are weighed."""
+"""Most products of signatures with derivatives by distributed errors; above it only numbers of
+families are compared."""
 BLIND = 1e-6
-"""Share of a signature that small errors leave of what can be seen beside them."""
+"""Share of a signature that must remain given the distributed errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """One cause.
+    """One candidate for a fault.
 
     Attributes:
         cause: effect and place.
@@ -51,7 +51,7 @@ class Suspect:
 
 
 def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Suspect]:
-    """How each cause is weighed; those that nothing here can tell are left out."""
+    """Suspects of the causes; without those that the readings cannot determine."""
     numbers = _numbers(state)
     found, signed = [], []
     for cause in causes:
@@ -69,7 +69,7 @@ def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Suspect]:
 
 
 def _numbers(state: State) -> dict[Hypothesis, tuple[int, str, list[int], list[float]]]:
-    """Causes that are numbers of the fit: block, variable, which ones, and how much of each."""
+    """Causes that are numbers of the fit: block, variable, members, and factors."""
     data, ring = state.data, state.data.ring
     out: dict[Hypothesis, tuple[int, str, list[int], list[float]]] = {}
     for family in state.families:
@@ -85,7 +85,7 @@ def _numbers(state: State) -> dict[Hypothesis, tuple[int, str, list[int], list[f
                     out[key] = (1, family.variable, [2 * m, 2 * m + 1], [1.0, across])
         elif family.per == "column":
             for c, name in enumerate(data.measured.correctors):
-                # a roll's number is a share of what the corrector is told, not of what it kicks
+                # a roll's number is a share of the stated kick, not of the actual one
                 kick = 1 + state.at.errors.calibration[c] if family.block else 1.0
                 out[(family.name, ring[name].name)] = (family.block, family.variable, [c], [kick])
         elif isinstance(family, QuadrupoleGradient):
@@ -111,7 +111,7 @@ def _of_gradients(
     state: State,
     out: dict[Hypothesis, tuple[int, str, list[int], list[float]]],
 ) -> None:
-    """Single ones, those of supplies, and the same as absolute ones."""
+    """Causes of single numbers, of supplies, and the same in absolute units."""
     ring = state.data.ring
     places = {name: i for i, own in enumerate(family.shares(state.data)) for name in own}
     for name, i in places.items():
@@ -129,10 +129,10 @@ def _of_gradients(
 # --- products -------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Of one block: the fit, what it leaves, and each suspect's products with both.
+    """Products of one block: the fit, its residual, and each suspect's products with both.
 
     Attributes:
-        there: where the fit stands.
+        there: the fit.
         sizes: the small errors' priors, without those of what is wrong alone.
         across: J^T W S, [number, suspect].
         own, left: S^T W S, and S^T W r, [suspect].
@@ -147,7 +147,7 @@ class _Block:
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """Each suspect beside small errors.
+    """The statistics of each suspect given distributed errors.
 
     Attributes:
         statistic: fall of chi-square, [suspect].
@@ -162,7 +162,7 @@ class Weighed:
 
 
 class Seen:
-    """All suspects where a fit stands.
+    """Return the products of all suspects at a fit.
 
     Args:
         state: with small errors, and with what is wrong alone so far.
@@ -204,10 +204,11 @@ class Seen:
                 it.across[:, h] = gathered(it.there, state.data.plane_of(block), heavy)
 
     def beside(self, without: str | None = None) -> Weighed:
-        """Each suspect beside small errors and what is wrong alone.
+        """The statistics of each suspect, given distributed errors and accepted faults.
 
         Args:
-            without: the prior's name of one of these that is taken back: its rivals take its place.
+            without: the prior's name of one of these that is taken back: its alternatives take its
+                place.
         """
         shape = (2, len(self.suspects))
         information, inner = np.zeros(shape), np.zeros(shape)

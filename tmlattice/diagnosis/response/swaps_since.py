@@ -21,8 +21,7 @@ from tmlattice.observe.split import split_columns
 def all_right(
     made: Callable[[OrbitResponse], ResponseData], measured: OrbitResponse, holdout: float
 ) -> tuple[OrbitResponse, ResponseData, Swaps]:
-    """A measurement with exchanged pairs of correctors and monitors put right, what was made of it,
-    and which these are.
+    """A measurement with swapped pairs of correctors and BPMs corrected, its data, and these pairs.
 
     Args:
         made: readings in a model, of a measurement.
@@ -40,7 +39,8 @@ def all_right(
 
 
 def since(first: Swaps, second: Swaps, messages: list[str]) -> Swaps:
-    """Pairs that were exchanged on one of two days; those of both are added to what is `said`."""
+    """Pairs that were swapped on one of two days; a message about those of both is added to
+    `said`."""
     found = []
     for what, a, b in (
         ("correctors", first.correctors, second.correctors),

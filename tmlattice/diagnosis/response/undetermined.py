@@ -1,10 +1,9 @@
-"""What a dense fit leaves open of a machine, and what a change of it looks like because of that.
+"""Undetermined errors of a machine after a hierarchical fit, and their effect on a change.
 
-A change between two measurements is seen in the machine that was fitted to the first one, whose
-numbers are known with errors. What is not known of them moves no reading by itself, for it was
-there before; but it moves what the change makes of the readings, by as much as the change is large.
-So far the readings are blurred: amounts, rivals and statistics know it, of one change
-(`inference.among.Blurred`) and of many (`linear.with_numbers`).
+A change between two measurements is fitted in the machine of the first one, whose errors are known
+with uncertainty. That uncertainty cancels in the difference, but scales with the effect of the
+change on the readings. Amounts, alternatives and statistics include it, for one change
+(`inference.among.Blurred`) and for many (`linear.with_numbers`).
 """
 
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Undetermined:
-    """Errors of a machine that are not known, Gaussian.
+    """Gaussian errors of a machine that are undetermined.
 
     Attributes:
         hypotheses: what they are errors of.
@@ -40,7 +39,7 @@ class Undetermined:
     root: Array
 
     def size(self, problem: Response) -> int:
-        """Numbers that have to be held."""
+        """Largest dimension of the covariance."""
         return len(self.hypotheses) * problem.used.size
 
 
@@ -48,12 +47,12 @@ ORBITS = (
     "quadrupole_offset_x", "quadrupole_offset_y", "dipole_field", "dipole_roll",
     "sextupole_offset_x", "sextupole_offset_y",
 )  # fmt: skip
-"""What makes orbits, and what sextupoles make of them: a response shows hardly anything of it, and
-a change of sextupoles does."""
+"""Effects that make orbits: a response is hardly sensitive to them, but a change of sextupoles
+is."""
 
 
 def undetermined(state: State) -> Undetermined:
-    """By a fit that has settled, with its priors."""
+    """The undetermined errors of a converged fit, with its priors."""
     blocks: list[dict[Hypothesis, Array]] = []
     for block in (block for block in (0, 1) if state.of_block(block)):
         there = linear(state, block)
@@ -81,7 +80,7 @@ def undetermined(state: State) -> Undetermined:
 
 
 def and_orbits(ring: Ring, open_: Undetermined) -> Undetermined:
-    """With orbits as large as usual errors make them."""
+    """The errors with orbits of the usual size."""
     usual = background_rms(dict.fromkeys(ORBITS))
     unseen = [(name, place) for name in ORBITS for place in find(name).places(ring)]
     alone = np.diag([usual[name] for name, _ in unseen])
@@ -89,13 +88,12 @@ def and_orbits(ring: Ring, open_: Undetermined) -> Undetermined:
 
 
 STRONGEST, HARDLY = 200, 0.1
-"""Errors that are kept where all are too many, and what one has to make of the readings, in units
-of their noise."""
+"""Errors that are kept where there are too many, and the least effect of one on the readings, in
+units of their noise."""
 
 
 def strongest(problem: Response, open_: Undetermined, causes: Sequence[Cause]) -> Undetermined:
-    """Of the errors those, with what is known of them together, that move most what causes make of
-    the readings.
+    """Return the combinations of errors with the largest effect on the changes of causes.
 
     Raises:
         UnstableRingError: no closed orbit with the causes.
@@ -115,11 +113,11 @@ def strongest(problem: Response, open_: Undetermined, causes: Sequence[Cause]) -
 
 
 class Blur:
-    """What is not known of what causes do, in one machine.
+    """Return the problem with undetermined errors of the machine.
 
     Args:
         problem: of the response in that machine.
-        open_: what is not known of it.
+        open_: its undetermined errors.
     """
 
     def __init__(self, problem: Response, open_: Undetermined) -> None:
@@ -127,7 +125,7 @@ class Blur:
 
     @cached_property
     def _without(self) -> Array:
-        """Signatures where nothing changed, [hypothesis, reading]."""
+        """Signatures of unchanged causes, [hypothesis, reading]."""
         return self._signatures(())
 
     def _signatures(self, causes: Sequence[Cause]) -> Array:
@@ -147,7 +145,7 @@ class Blur:
         return np.asarray(spread.reshape(-1, *self.problem.used.shape))
 
     def among(self, spread: Array) -> MarginalProblem:
-        """The problem among errors that make so much of the readings."""
+        """The problem with these undetermined errors."""
         own = self.problem
         return MarginalProblem(
             inner=own, spread=spread, places=own.places, rare=own.rare, amounts=own.amounts,

@@ -1,8 +1,8 @@
-"""Monitors, in one plane or both, and correctors whose readings resemble nothing in the model.
+"""Rejected channels: BPMs, in one plane or both, and correctors that the model cannot describe.
 
-A monitor whose vertical signal is another one's, or noise, spoils what everybody is judged by; its
-horizontal one may be good. Whatever the gain, the model explains next to nothing of it, where it
-explains most of all the others.
+A BPM plane with another one's signal, or noise, biases the validation; its other plane may be good.
+The model explains almost nothing of such a channel, whatever its gain, and most of all the
+others.
 """
 
 from dataclasses import dataclass, replace
@@ -17,21 +17,21 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 STRANGE, TIMES = 0.5, 9.0
-"""Share of the mean square that the model leaves of what resembles nothing; and how many times the
-share that it leaves of the typical one."""
+"""Unexplained share of the mean square of a rejected channel; and its least ratio to the typical
+share."""
 ODD = 0.05
-"""The least such share of what may be another one's."""
+"""Least unexplained share of a channel that may be swapped."""
 ENOUGH = 4
-"""Readings that it takes to say so."""
+"""Readings required for a decision."""
 SILENT = 0.3
-"""Share of the model's answer below which one is weak, not strange."""
+"""Share of the model's response below which a channel is weak."""
 MOST = 0.25
-"""Of all monitors or correctors of a plane, at most: more strangers are another lattice."""
+"""Largest share of rejected BPMs or correctors of a plane: more of them mean another lattice."""
 
 
 @dataclass(frozen=True)
 class RejectedChannels:
-    """What resembles nothing.
+    """Rejected channels.
 
     Attributes:
         monitors: names, with the plane.
@@ -43,21 +43,19 @@ class RejectedChannels:
 
     @property
     def any(self) -> bool:
-        """Whether there are some."""
+        """Whether there are any."""
         return bool(self.monitors or self.correctors)
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """In words."""
+        """The messages about them."""
         found = []
         if self.monitors:
             sentence = ", ".join(f"{name} in {plane}" for name, plane in self.monitors)
-            found.append(f"readings that resemble nothing in the model, left out: {sentence}")
+            found.append(f"BPM channels that the model cannot describe, rejected: {sentence}")
         if self.correctors:
             sentence = ", ".join(self.correctors)
-            found.append(
-                f"correctors whose orbits resemble nothing in the model, left out: {sentence}"
-            )
+            found.append(f"correctors that the model cannot describe, rejected: {sentence}")
         return tuple(found)
 
     def without(self, measured: OrbitResponse) -> OrbitResponse:
@@ -75,7 +73,7 @@ class RejectedChannels:
 
 
 def reversed_ones(state: State) -> list[str]:
-    """A sentence of monitors and correctors that the fit says have the wrong sign."""
+    """A message about BPMs and correctors with the wrong sign by the fit."""
     errors, measured = state.at.errors, state.data.measured
     gains = np.diagonal(errors.monitors, axis1=1, axis2=2)
     messages = []
@@ -94,11 +92,11 @@ def reversed_ones(state: State) -> list[str]:
 
 
 def unlike_model(state: State, least: float = STRANGE) -> RejectedChannels:
-    """Those among the readings in each column's own plane.
+    """Return the rejected channels among the readings in each column's own plane.
 
     Args:
-        state: what the model makes of them.
-        least: share of the mean square that the model leaves of a stranger.
+        state: with the model's readings.
+        least: least unexplained share of the mean square of a rejected channel.
     """
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]
@@ -122,7 +120,7 @@ def _unlike(model: Array, read: Array, there: Flags, least: float) -> Flags:
     size = (d**2).sum(axis=0)
     gain = (u * d).sum(axis=0) / np.maximum((u**2).sum(axis=0), 1e-300)
     share = ((d - gain * u) ** 2).sum(axis=0) / np.maximum(size, 1e-300)
-    # what hardly answers has a calibration or a gain that says so
+    # a weak response is described by a calibration or a gain
     seen = (there.sum(axis=0) >= ENOUGH) & (size > SILENT**2 * (u**2).sum(axis=0))
     if seen.sum() < ENOUGH:
         return np.zeros(len(share), dtype=bool)

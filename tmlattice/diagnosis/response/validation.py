@@ -1,8 +1,8 @@
-"""Who judges a dense fit of an orbit response: correctors that were not fitted.
+"""The validation of a hierarchical fit of an orbit response, on correctors that were not fitted.
 
-Of each of them only the kick is taken, from half of the monitors; the other half judges. Those that
-are held out for good (`score`) choose nothing; those that choose among families (`inner`) say too
-how well they know it, for they may be four.
+For each of them the kick is estimated from half of the BPMs, and the prediction is scored on the
+other half. The outer validation set (`score`) selects nothing. The inner one (`inner`) selects
+families, with standard errors, because it may have only four correctors.
 """
 
 from dataclasses import dataclass, replace
@@ -17,33 +17,33 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
-"""How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: one
-reading a monitor), and by how much their sum may fall without a step that stays all the same:
-evidence takes what the model lacks for noise, and gladly fits it."""
+"""Weights of the log rms of held-out correctors (in-plane, coupling, RF: one reading a BPM), and
+the largest fall of their sum without an accepted step. The marginal likelihood alone would take
+model discrepancy for noise, and fit it."""
 CORRECTORS = np.array([1.0, 1.0, 0.0])
-"""The same, of correctors alone: all monitors share a jitter of the RF's orbit."""
+"""The same, of correctors alone: all BPMs share the jitter of the RF's orbit."""
 FLOOR = np.array([0.1, 0.1, 1.0])
-"""Of the noise, beside what is left in-plane, across and of the RF: what is left of nothing (a
-model's own orbit) is no better for being less."""
+"""Share of the noise that is added to the residuals in-plane, across and of the RF, so that
+residuals below it count alike."""
 SURELY = 1.0
 """Standard errors of a fall from which on it counts."""
 
 
 class Chi2(NamedTuple):
-    """A sum of squares in units of the noise, and of how many readings."""
+    """A sum of squares in units of the noise, with the number of readings."""
 
     total: float
     readings: int
 
     @property
     def per_reading(self) -> float:
-        """1 is noise."""
+        """Chi-square per reading; 1 is noise."""
         return self.total / max(self.readings, 1)
 
 
 @dataclass(frozen=True)
 class Score:
-    """What the judges say: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
+    """Validation scores: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
 
     in_plane: float
     coupling: float
@@ -55,7 +55,7 @@ class Score:
 
 
 class _Missed(NamedTuple):
-    """What the far readings of correctors that were not fitted miss, m, column by column.
+    """Residuals of the far readings of held-out correctors, m, column by column.
 
     Attributes:
         inside: in-plane.
@@ -82,7 +82,7 @@ class _Missed(NamedTuple):
 
 
 def _missed(state: State, validation: Flags, rf: Flags | None = None) -> _Missed:
-    """What correctors that were not fitted say; see `score`."""
+    """Validation scores of held-out correctors; see `score`."""
     data, at, half = state.data, state.at, state.split.half
     read = at.seen(at.beam)
     straight, across = data.pick(read), data.pick(read, 1)
@@ -98,11 +98,11 @@ def _missed(state: State, validation: Flags, rf: Flags | None = None) -> _Missed
         near, far = seen & half[c], seen & ~half[c]
         if not (near.any() and far.any()):
             continue
-        # all alike: what the model lacks is not the readings' noise
+        # all alike: model discrepancy is not the readings' noise
         kick, miss = amplitudes(straight[c][:, None], orbits[c], near, far)
         inside.append(miss)
         squares.append(miss**2 / variance[c, far])
-        # the kick's own error stands beside the reading's
+        # the kick's error adds to the reading's
         spread.append(1 + straight[c, far] ** 2 / np.sum(straight[c, near] ** 2))
         jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
         left = orbits_across[c] - kick[0] * across[c]
@@ -118,12 +118,12 @@ def _missed(state: State, validation: Flags, rf: Flags | None = None) -> _Missed
 
 
 def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
-    """What correctors that were not fitted say; each has its kick from its near monitors.
+    """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
     Args:
-        state: that is judged.
-        judges: the correctors that judge, [column].
-        rf: monitors that judge the RF's response; None: those that did not fit it.
+        state: that is validated.
+        judges: the correctors of the validation set, [column].
+        rf: monitors that validate the RF's response; None: those that did not fit it.
     """
     missed = _missed(state, validation, rf)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
@@ -143,7 +143,7 @@ def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
 
 
 class Validated(NamedTuple):
-    """What those who choose are left with: sums of squares, m^2, and counts of readings.
+    """Residuals of the inner validation set: sums of squares, m^2, and counts of readings.
 
     Attributes:
         columns: of each corrector, in-plane and across, [column, 2, (sum, count)].
@@ -155,7 +155,7 @@ class Validated(NamedTuple):
 
     @property
     def logs(self) -> Array:
-        """Logarithms of rms, in-plane, across and of the RF; NaN of what nobody read."""
+        """Log rms, in-plane, across and of the RF; NaN without readings."""
         return _logs(np.concatenate([self.columns.sum(axis=0), self.rf.sum(axis=0)[None]]))
 
 
@@ -165,8 +165,8 @@ def _logs(sums: Array) -> Array:
 
 
 def inner(state: State) -> Validated:
-    """In-plane, coupling and dispersion readings of correctors held out for it; each half of their
-    monitors gives the kick once."""
+    """In-plane, coupling and dispersion residuals of the inner correctors; each half of their BPMs
+    determines the kick once."""
     other = replace(state, split=replace(state.split, half=~state.split.half))
     said = [_missed(one, state.split.inner, state.split.inner_rf) for one in (state, other)]
     sums = [
@@ -184,11 +184,11 @@ def inner(state: State) -> Validated:
 
 
 def lost(without: Validated, within: Validated, counts: Array = JUDGES) -> tuple[float, float]:
-    """By how much the judges' figures rise, and its standard error: by the jackknife, each
-    corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing.
+    """The rise of the validation score, and its standard error by the jackknife over correctors and
+    BPMs of the RF's orbit. Entries without readings are omitted.
 
     Args:
-        without, within: what is compared.
+        without, within: the two residuals.
         counts: weights of in-plane, across and RF readings.
     """
     whole = float(np.nansum(counts * (without.logs - within.logs)))
@@ -206,5 +206,5 @@ def lost(without: Validated, within: Validated, counts: Array = JUDGES) -> tuple
 
 
 def against(said: tuple[float, float]) -> bool:
-    """Whether the validation set is better off without, by what `lost` says."""
+    """Whether the validation score is better without, by the result of `lost`."""
     return said[0] < -max(VETO, SURELY * said[1])

@@ -3,11 +3,11 @@
 >>> state = learnt(state, spent)
 >>> weight(state, 0)                               # 1 / variance, [column, monitor]
 
-Readings have Student's distribution about the model, with a variance of their noise, a misfit of
-their column and a misfit of their monitor. Beside these each column has amounts of common modes:
+Readings have Student's distribution about the model. Their variance is that of their noise, of the
+misfit of their column and of the misfit of their BPM. Each column also has amounts of common modes:
 waves of the closed orbit (beam jitter), a drift of the energy (the RF's orbit) and the place of its
-corrector's field. They are integrated out, see `inference.common`. All scales are learnt from what
-the fit leaves.
+corrector's field. They are integrated out, see `inference.common`. All scales are learnt from the
+residuals.
 """
 
 from dataclasses import replace
@@ -26,12 +26,12 @@ Flags = NDArray[np.bool_]
 FREEDOM = 6.0
 """Degrees of freedom of the readings' Student distribution."""
 TAILS = 4.0
-"""Of the amounts of common modes."""
+"""Degrees of freedom of the amounts of common modes."""
 COUNT = 10.0
-"""The typical column's misfit counts as so many readings of each one's own; so does no misfit at
-all of each monitor."""
+"""Number of a column's own readings that the typical column's misfit counts as; a misfit of zero
+counts as much for each BPM."""
 LEAST = 0.05
-"""Of the noise: the misfit of a column at least."""
+"""Least misfit of a column, as a share of the noise."""
 DAMPING = 0.7
 """Share of a step of the misfits that is taken: columns and monitors would else take turns."""
 MEDIAN_SQUARE = 0.455
@@ -39,14 +39,14 @@ MEDIAN_SQUARE = 0.455
 
 
 class Spent(NamedTuple):
-    """Degrees of freedom that a block's parameters take from its readings, and from the RF's."""
+    """Degrees of freedom of a block's parameters in its readings, and in the RF's."""
 
     all: float
     rf: float
 
 
 def used(state: State, block: int) -> Flags:
-    """Readings that are fitted, [column, monitor]."""
+    """Fitted readings, [column, monitor]."""
     data, split = state.data, state.split
     use = np.isfinite(data.pick(data.orbits, block)) & state.good
     use[:-1] &= state.fitted[:-1, None]
@@ -57,7 +57,8 @@ def used(state: State, block: int) -> Flags:
 
 
 def variance(state: State, block: int) -> Array:
-    """Of each reading, without common modes and Student weights, m^2, [column, monitor]."""
+    """Variance of each reading, without common modes and Student weights, m^2, [column,
+    monitor]."""
     noise, plane = state.noise, state.data.plane_of(block)
     return np.asarray(
         state.data.noise_of(block) ** 2 + noise.column[block][:, None] + noise.monitor[block][plane]
@@ -65,12 +66,12 @@ def variance(state: State, block: int) -> Array:
 
 
 def weight(state: State, block: int) -> Array:
-    """1 / variance of the readings that are fitted, 0 of the others, [column, monitor]."""
+    """1 / variance of the fitted readings, 0 of the others, [column, monitor]."""
     return np.where(used(state, block), state.noise.share[block] / variance(state, block), 0.0)
 
 
 def patterns(state: State, block: int) -> Array:
-    """Common modes of each column, as large as they usually are, m, [column, pattern, monitor]."""
+    """Common modes of each column, with their usual size, m, [column, pattern, monitor]."""
     data, at, noise = state.data, state.at, state.noise
     plane = data.plane_of(block)
     out = np.zeros((data.shape[0], noise.size.shape[2], data.shape[1]))
@@ -87,19 +88,18 @@ def patterns(state: State, block: int) -> Array:
 
 
 def taken(state: State, block: int) -> Array:
-    """What common modes take from the weights, see `inference.common`, [column, monitor,
+    """Reduction of the weights by common modes, see `inference.common`, [column, monitor,
     pattern]."""
     return common(weight(state, block), patterns(state, block))[0]
 
 
 def weighed(state: State, block: int, left: Array) -> Array:
-    """Inverse covariance of the readings that are fitted times what is left, 1/m, [column,
-    monitor]."""
+    """Inverse covariance of the fitted readings times the residual, 1/m, [column, monitor]."""
     return times_precision(weight(state, block), taken(state, block), left)
 
 
 def log_likelihood(state: State, block: int) -> float:
-    """Of what the fit leaves, common modes integrated out (Laplace), up to a constant of the
+    """Log density of the residuals, common modes integrated out (Laplace), up to a constant of the
     data."""
     use = used(state, block)
     if not use.any():
@@ -114,7 +114,7 @@ def log_likelihood(state: State, block: int) -> float:
 
 
 def learnt(state: State, spent: dict[int, Spent], alike: bool = False) -> State:
-    """With the variance components that what the fit leaves makes likely.
+    """The state with variance components from the residuals.
 
     Args:
         state: after a round.
@@ -177,14 +177,14 @@ def with_waves(state: State) -> State:
 
 
 def _floor(state: State) -> float:
-    """The misfit of a column at least, m^2."""
+    """Least misfit of a column, m^2."""
     return (LEAST * float(np.median(state.data.noise))) ** 2
 
 
 def _learn_modes(
     state: State, block: int, use: Flags, likely: Array, kept: Array, alike: bool
 ) -> None:
-    """Sizes of the common modes, in place.
+    """Update the scales of the common modes, in place.
 
     Args:
         state, block, use, alike: as in `learnt`.
@@ -213,7 +213,7 @@ def _learn_modes(
 def _learn_misfits(
     state: State, block: int, use: Flags, left: Array, spent: Spent, alike: bool
 ) -> None:
-    """Student weights, and misfits of columns and monitors by moments, in place.
+    """Update Student weights, and misfits of columns and BPMs by moments, in place.
 
     Args:
         state, block, use, alike: as in `learnt`.
@@ -227,8 +227,8 @@ def _learn_misfits(
     free[-1] = max(count[-1] - spent.rf, 0.01 * count[-1])
     grown = (count / np.maximum(free, 1e-9))[:, None]
     v = variance(state, block)
-    # a reading is an outlier beside the others of its column and of its monitor, and not because
-    # these are
+    # a reading is an outlier relative to its column and its BPM, not because
+    # these are outliers
     usual = v if alike else np.maximum(v, _typical(left, use)[:, None])
     for read in (0, 1) if not alike else ():
         rows = plane == read
@@ -246,7 +246,7 @@ def _learn_misfits(
         typical = max(float(np.median(rest[fitted])), 0.0)
         own = (COUNT * typical + free * rest) / (COUNT + free)
         noise.column[block] = np.maximum(typical if alike else own, floor)
-        noise.column[block, -1] = max(typical, floor)  # one orbit does not show a misfit
+        noise.column[block, -1] = max(typical, floor)  # a single orbit shows no misfit
         if alike:
             return
         for read in (0, 1):
@@ -261,7 +261,7 @@ def _learn_misfits(
 
 
 def _typical(left: Array, use: Flags) -> Array:
-    """Of each row, by the median of its squares, m^2, [row]."""
+    """Mean square of each row, by the median, m^2, [row]."""
     out = np.zeros(len(left))
     for row in np.flatnonzero(use.any(axis=1)):
         out[row] = np.median(left[row, use[row]] ** 2) / MEDIAN_SQUARE
