@@ -149,8 +149,8 @@ def slip(ring: Ring) -> float:
 def _off_energy(matrix: Array, length: float) -> tuple[Array, float]:
     """Of a turn's matrix the dispersion [4], and how much later more energy comes round, over the
     turn's length."""
-    dispersion = np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 5])
-    return np.asarray(dispersion), float(matrix[4, :4] @ dispersion + matrix[4, 5]) / length
+    dispersion = np.asarray(np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 5]), dtype=float)
+    return dispersion, float(matrix[4, :4] @ dispersion + matrix[4, 5]) / length
 
 
 def curvatures(ring: Ring, stated: Stated) -> list[float]:
