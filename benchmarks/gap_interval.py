@@ -41,12 +41,12 @@ def main() -> None:
         if told is None or true is None or told.interval is None:
             continue
         before, after = true.misfits[told.since].rms, true.misfits[-1].rms
-        closed, (low, high) = 1 - (after / before) ** 2, told.interval
-        holds.append(bool(low <= closed <= high))
-        sides.append(closed - told.closed)
+        explained, (low, high) = 1 - (after / before) ** 2, told.interval
+        holds.append(bool(low <= explained <= high))
+        sides.append(explained - told.explained)
         widths.append((high - low) / 2)
         if not holds[-1]:
-            print(f"{name}: stated {low:.4f} to {high:.4f}, true {closed:.4f}", flush=True)
+            print(f"{name}: stated {low:.4f} to {high:.4f}, true {explained:.4f}", flush=True)
     low, high = rate(holds)["interval"]
     print(f"{given.folder}: {sum(holds)} of {len(holds)} hold; a share of {low:.2f} to {high:.2f}")
     print(f"half width {np.median(widths):.4f} in the median, "

@@ -55,7 +55,7 @@ def main(seed=1):
         print(f"{effect}: {len(own)}, rms error over the stated one {size:.2f}")
     sick = apply(ring, [c for c in drawn if c.effect == "quadrupole_gradient"])
     beta, expected, design = (
-        twiss(TaylorNetwork.from_ring(one)).beta for one in (found.repaired, sick, ring)
+        twiss(TaylorNetwork.from_ring(one)).beta for one in (found.corrected, sick, ring)
     )
     for plane, name in enumerate("xy"):
         beat, left = (

@@ -158,10 +158,10 @@ def _as_it_comes(found):
     if "error" in found:
         return f"{name}, seed {seed}: {found['error']}"
     last = found["steps"][-1]
-    refused = ", ".join(step["effect"] for step in found["refused"])
+    rejected_steps = ", ".join(step["effect"] for step in found["refused"])
     return (f"{name}, seed {seed}: {_figures(last)}, chi² {last['chi2']:.1f}, {found['verdict']}, "
             f"{found['seconds']:.0f} s; kept: {', '.join(_kept(found))}; "
-            f"refused: {refused or 'nothing'}")  # fmt: skip
+            f"refused: {rejected_steps or 'none'}")  # fmt: skip
 
 
 def _figures(step):
@@ -186,7 +186,7 @@ def _diagnosed(lattice, folder, told, seed, missing, pictures, name):
         "seconds": seconds,
         "fit": MICRO * found.fit_after.rms,
         "steps": [_step(step.as_json()) for step in found.steps],
-        "refused": [_step(step.as_json()) for step in found.refused],
+        "refused": [_step(step.as_json()) for step in found.rejected_steps],
         "findings": [own.words or f"{own.effect} {own.element}" for own in found.findings],
         "hypotheses": [row.as_json() for row in found.hypotheses or ()],
         "warnings": list(found.warnings),

@@ -86,7 +86,7 @@ def counted(rows: list[dict], faulty: bool) -> dict:
         return own | {"chi2_per_dof": float(np.mean(ratio)), "largest_z": float(np.max(off))}
     if faulty:
         return own | {"right": sum(row.get("right", False) for row in rows)}
-    return own | {"false_alarms": sum(v not in ("nothing", "refused") for v in verdicts)}
+    return own | {"false_alarms": sum(v not in ("none", "refused") for v in verdicts)}
 
 
 def main() -> None:

@@ -469,12 +469,12 @@ def tried(make: Callable[[], Case], seed: int, assumed: tuple[str, ...] = ()) ->
         "seconds": time.process_time() - begun,
         "assumed": assumed,
         "verdict": found.verdict,
-        "named": [f"{f.effect} {f.element} {f.amount:.3g}" for f in found.findings],
+        "identified": [f"{f.effect} {f.element} {f.amount:.3g}" for f in found.findings],
         "heldout": [MICRO * own for own in (
             last.heldout_rms_in_plane, last.heldout_rms_coupling, last.dispersion_rms
         )],
         "steps": [step.effect for step in found.steps[1:]],
-        "refused": [step.effect for step in found.refused],
+        "refused": [step.effect for step in found.rejected_steps],
         "bad": list(found.bad_monitors),
         "warnings": list(found.warnings),
     }  # fmt: skip
@@ -493,7 +493,7 @@ def lines(ring: str, name: str, said: dict[str, Any], base: dict[str, Any]) -> l
     out = [head + f"{said['verdict']} | {' / '.join(figures)}"]
     if "stopped" in said:
         out.append(f"    stopped: {said['stopped']}")
-    out += [f"    named: {one}" for one in said["named"]]
+    out += [f"    named: {one}" for one in said["identified"]]
     out += [f"    bad: {', '.join(said['bad'])}"] if said["bad"] != base.get("bad", []) else []
     gone = [one for one in base.get("steps", []) if one not in said["steps"]]
     out += [f"    refused now: {'; '.join(gone)}"] if gone else []

@@ -35,8 +35,8 @@ LATTICE = Path(__file__).parent / "lattices" / "small_ring.py"
 USUAL = {"all": None}
 ERRORS = 4.0
 """Stated errors that an amount may be from the truth."""
-ANY = frozenset({"named", "equivalent", "located", "distributed"})
-ONE = frozenset({"named", "equivalent"})
+ANY = frozenset({"identified", "ambiguous", "localised", "distributed"})
+ONE = frozenset({"identified", "ambiguous"})
 """Verdicts on something that the catalogue has."""
 MAKE: dict[str, Callable[..., Any]] = {
     "first turns": lambda ring, causes, **o: simulate(ring, causes, **o).measurement(),
@@ -371,11 +371,11 @@ def millimetres(read: np.ndarray, data: Any, rng: np.random.Generator) -> None:
 
 WEAK = Cause("quadrupole_gradient", "QF::2", -0.02)
 GRADIENTS = {"quadrupole_gradient": 3e-3}
-NOTHING = frozenset({"nothing"})
+NOTHING = frozenset({"none"})
 MANY = frozenset({"distributed"})
 SOUND = NOTHING | MANY
 """Verdicts on a machine without a single fault among its small errors."""
-LOCATED = frozenset({"located"})
+LOCATED = frozenset({"localised"})
 BENDS = [f"bend::{k}" for k in range(32)]
 
 
@@ -591,7 +591,7 @@ def since(name: str, *causes: Cause, **more: Any) -> Scenario:
 
 
 CHANGES = (
-    since("nothing", verdicts=NOTHING),
+    since("none", verdicts=NOTHING),
     since("a magnet", Cause("quadrupole_gradient", "QD::5", -0.008)),
     since("a supply", Cause("family_gradient", "QF", 0.003)),
     since(

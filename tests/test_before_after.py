@@ -205,7 +205,7 @@ def test_a_fit_of_everything_is_held_against_few_causes_in_the_planes_that_were_
 
 
 def test_the_changed_supply_and_the_changed_magnet_are_found_and_no_other(change):
-    assert change.verdict == "named"
+    assert change.verdict == "identified"
     found = {(own.effect, own.element): own for own in change.findings}
     supply = found.pop(("family_gradient", "qf"))
     magnet = found.pop(("quadrupole_gradient", "QD::5"))
@@ -218,13 +218,13 @@ def test_the_changed_supply_and_the_changed_magnet_are_found_and_no_other(change
 
 def test_a_machine_that_only_drifts_has_not_changed(small_ring, before):
     same = diagnose(small_ring, machine(small_ring, seed=5, drift=0.01), reference=before)
-    assert (same.verdict, same.findings) == ("nothing", ())
+    assert (same.verdict, same.findings) == ("none", ())
     assert "Nothing changed since the reference" in report_text(same)
 
 
 def test_a_measurement_against_itself_is_nothing(small_ring, before):
     same = diagnose(small_ring, before, reference=before)
-    assert (same.verdict, same.findings) == ("nothing", ())
+    assert (same.verdict, same.findings) == ("none", ())
 
 
 def test_a_corrector_that_was_reversed_since_is_named(small_ring, before):
@@ -255,11 +255,11 @@ def test_what_was_exchanged_on_one_day_is_located(small_ring, before, axis, a, b
     result = diagnose(small_ring, days["after"], reference=days["before"])
     names = (before.correctors, before.monitors)[axis]
     (found,) = result.findings
-    assert (result.verdict, found.effect) == ("located", None)
+    assert (result.verdict, found.effect) == ("localised", None)
     assert set(found.elements) == {names[a], names[b]}
     text = " ".join(report_text(result).split())
     assert "answer each as the other one did. 1." in text  # and no word of small errors, or of
-    assert "--repaired-out" not in text  # gradients to be set
+    assert "--corrected-out" not in text  # gradients to be set
 
 
 def test_what_went_wrong_in_the_reference_is_no_change(small_ring, before, after):
@@ -274,7 +274,7 @@ def test_what_went_wrong_in_the_reference_is_no_change(small_ring, before, after
 
 def test_what_changed_is_found_beside_two_exchanged_correctors(small_ring, before, after):
     result = diagnose(small_ring, exchanged(after, 0, 4, 5), reference=before)
-    assert result.verdict == "located"
+    assert result.verdict == "localised"
     assert {own.element for own in result.findings if own.effect} == {"qf", "QD::5"}
     (pair,) = (own for own in result.findings if own.effect is None)
     assert set(pair.elements) == {before.correctors[4], before.correctors[5]}
@@ -285,7 +285,7 @@ def test_what_was_exchanged_on_both_days_is_no_change(small_ring, before, axis, 
     days = before, machine(small_ring, seed=5, drift=0.01)
     first, second = (exchanged(one, axis, a, b) for one in days)
     same = diagnose(small_ring, second, reference=first)
-    assert (same.verdict, same.findings) == ("nothing", ())
+    assert (same.verdict, same.findings) == ("none", ())
     (said,) = (own for own in same.warnings if own.startswith("on both days"))
     names = (before.correctors, before.monitors)[axis]
     assert {names[a], names[b]} <= set(said.replace(";", " ").split())
@@ -409,7 +409,7 @@ def test_measured_pairs(tmp_path, null):
     first, second = (read_measurement(folder) for folder in folders)
     result = diagnose(ring, second, reference=first)
     if null:
-        assert (result.verdict, result.findings) == ("nothing", ())
+        assert (result.verdict, result.findings) == ("none", ())
         return
     settings = [json.loads((REAL / f"lnls_2014-{name}.setpoints.json").read_text())
                 for name in names]  # fmt: skip

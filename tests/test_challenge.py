@@ -18,7 +18,7 @@ from tmlattice.challenge.baselines import baselines
 from tmlattice.challenge.case import Truth, ring_of
 from tmlattice.challenge.figures import calibration, confusion, pulls, summary
 from tmlattice.challenge.oracle import Oracle, judge
-from tmlattice.challenge.record import Places, baseline_answer, exact, one_remedy
+from tmlattice.challenge.record import Places, baseline_answer, exact, one_action
 from tmlattice.challenge.score import row_of
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
@@ -172,7 +172,7 @@ def test_baselines_of_several_causes_give_a_finding_each():
     assert len(baseline_answer(guesses)["findings"][0]["credible_set"]) == 3
     apart = baseline_answer(guesses, apart=2)
     assert [f["element"] for f in apart["findings"]] == ["0", "1"]
-    assert baseline_answer([], apart=2) == {"verdict": "nothing", "findings": []}
+    assert baseline_answer([], apart=2) == {"verdict": "none", "findings": []}
 
 
 def test_unknowns_and_a_reduced_catalogue_share_tier_d(tmp_path):
@@ -204,8 +204,8 @@ def finding(*members, amount=0.1, sigma=0.01, s=None):
     }
 
 
-def result_of(*findings, verdict="named"):
-    gap = {"closed": None, "heldout": None}
+def result_of(*findings, verdict="identified"):
+    gap = {"explained": None, "heldout": None}
     return {
         "verdict": verdict,
         "findings": list(findings),
@@ -229,13 +229,13 @@ def rows_by_hand(small_ring, quads):
         result_of(finding(("quadrupole_gradient", name, 1.0))),
         result_of(
             finding(("quadrupole_roll", name, 0.6), ("quadrupole_gradient", name, 0.4)),
-            verdict="equivalent",
+            verdict="ambiguous",
         ),
         result_of(
             {**finding((None, None, 1.0), s=quads[-1].s), "credible_set": [], "mass": 0.0},
-            verdict="located",
+            verdict="localised",
         ),
-        result_of(verdict="nothing"),
+        result_of(verdict="none"),
         result_of(finding(("quadrupole_gradient", other, 0.9))),
     ]
     rows = [row_of(result, truth, None, None, places) for result in results]
@@ -260,7 +260,7 @@ def test_rates_by_hand(small_ring, quads):
     assert found["coverage"]["holds_truth"]["cases"] == 3
     assert found["coverage"]["mean_stated_mass"] == pytest.approx((1 + 1 + 0.9) / 3)
     assert found["clean_gap_closed"]["within_5_percent"]["share"] == 4 / 5
-    assert found["verdicts"] == {"named": 2, "equivalent": 1, "located": 1, "nothing": 1}
+    assert found["verdicts"] == {"identified": 2, "ambiguous": 1, "localised": 1, "none": 1}
 
 
 def test_confusion_calibration_and_pulls_by_hand(small_ring, quads):
@@ -268,9 +268,9 @@ def test_confusion_calibration_and_pulls_by_hand(small_ring, quads):
     assert confusion(rows) == {
         "quadrupole_gradient": {
             "quadrupole_gradient": 2,
-            "equivalent": 1,
+            "ambiguous": 1,
             "unknown": 1,
-            "nothing": 1,
+            "none": 1,
         }
     }
     bins = {b["from"]: b for b in calibration(rows)}
@@ -293,25 +293,25 @@ def test_within_one_monitor_gap_counts_monitors_between(small_ring):
     assert places.between(m[2] + 0.001, m[0] - 0.001) == 3
 
 
-def test_one_remedy_by_hand(small_ring):
-    """A thin gradient in the quadrupole has the true remedy; its roll, a neighbour, a second
+def test_one_action_by_hand(small_ring):
+    """A thin gradient in the quadrupole has the true action; its roll, a neighbour, a second
     finding and an open verdict have not."""
     true = Cause("quadrupole_gradient", "QD::5", 0.08)
 
-    def told(effect, element, verdict="named", more=0):
-        remedy = {"effect": effect, "element": element}
-        one = {**finding((effect, element, 1.0)), "remedy": remedy}
-        return one_remedy(result_of(*[one] * (1 + more), verdict=verdict), true, small_ring)
+    def told(effect, element, verdict="identified", more=0):
+        recommended_action = {"effect": effect, "element": element}
+        one = {**finding((effect, element, 1.0)), "recommended_action": recommended_action}
+        return one_action(result_of(*[one] * (1 + more), verdict=verdict), true, small_ring)
 
     assert told("quadrupole_gradient", "QD::5")
     assert not told("quadrupole_roll", "QD::5")
     assert not told("quadrupole_gradient", "QD::6")
     assert not told("quadrupole_gradient", "QD::5", more=1)
-    assert not told("quadrupole_gradient", "QD::5", verdict="equivalent")
+    assert not told("quadrupole_gradient", "QD::5", verdict="ambiguous")
     thin = Cause("gradient_absolute", "QD::5", 0.01)
     one = {**finding(("x", "QD::5", 1.0)),
-           "remedy": {"effect": "quadrupole_gradient", "element": "QD::5"}}  # fmt: skip
-    assert one_remedy(result_of(one), thin, small_ring)
+           "recommended_action": {"effect": "quadrupole_gradient", "element": "QD::5"}}  # fmt: skip
+    assert one_action(result_of(one), thin, small_ring)
 
 
 def test_several_causes_need_a_finding_each():

@@ -157,13 +157,13 @@ def test_the_supply_of_a_family_of_sextupoles_is_one_change(small_ring, tmp_path
         "credible_set": [{"effect": one.effect, "element": one.element, "probability": 1.0}],
     }  # fmt: skip
     result = {
-        "verdict": "named", "findings": [finding], "gap": {"closed": None, "heldout": None},
+        "verdict": "identified", "findings": [finding], "gap": {"explained": None, "heldout": None},
         "next_measurement": None,
     }  # fmt: skip
     row = row_of(result, truth, None, None, Places(small_ring))
     assert row["answers"]["tool"]["first"]
     assert row["answers"]["tool"]["place"]
-    result |= {"verdict": "nothing", "findings": []}
+    result |= {"verdict": "none", "findings": []}
     row = row_of(result, truth, None, None, Places(small_ring))
     assert not row["answers"]["tool"]["place"]
 
@@ -182,11 +182,11 @@ def test_what_many_find_where_one_does_not_by_hand(small_ring):
     rows = []
     for together, alone in ((True, True), (False, True), (True, False), (True, False)):
         said = {
-            "verdict": "named" if together else "nothing", "findings": [right] * together,
-            "gap": {"closed": None, "heldout": None}, "next_measurement": None, "seconds": 1.0,
+            "verdict": "identified" if together else "none", "findings": [right] * together,
+            "gap": {"explained": None, "heldout": None}, "next_measurement": None, "seconds": 1.0,
             "alone": {
-                "a": {"verdict": "nothing", "findings": []},
-                "b": {"verdict": "named", "findings": [right] * alone},
+                "a": {"verdict": "none", "findings": []},
+                "b": {"verdict": "identified", "findings": [right] * alone},
             },
         }  # fmt: skip
         rows.append(row_of(said, truth, None, None, Places(small_ring)))
@@ -199,7 +199,7 @@ def test_what_many_find_where_one_does_not_by_hand(small_ring):
 def test_small_errors_are_no_false_alarm_where_there_are_some(small_ring):
     truth = Truth("x", "E", (), None, (), 0.0, {"quadrupole_gradient": 1e-3}, 0.0, 1.0, 0, {}, {})
     said = {
-        "verdict": "distributed", "findings": [], "gap": {"closed": None, "heldout": None},
+        "verdict": "distributed", "findings": [], "gap": {"explained": None, "heldout": None},
         "next_measurement": None, "priors": {"quadrupole_gradient": 1e-3},
     }  # fmt: skip
     row = row_of(said, truth, None, None, Places(small_ring))

@@ -36,7 +36,7 @@ def test_without_gaps_there_is_none(small_ring):
 
 def test_chromaticity_of_a_healthy_ring_is_no_fault(thomx):
     read = simulate_tunes(thomx, seed=1).measured
-    assert diagnose(thomx, read).verdict == "nothing"
+    assert diagnose(thomx, read).verdict == "none"
 
 
 def test_a_reversed_sextupole_is_still_seen(thomx):
@@ -60,4 +60,4 @@ def test_chromaticity_of_slow_particles_is_per_momentum(tmp_path):
     ring = load_ring(sequence)
     assert ring.beta < 0.4
     read = simulate_tunes(ring, noise=(2e-5, 0.01), seed=1).measured
-    assert diagnose(ring, read).verdict == "nothing"
+    assert diagnose(ring, read).verdict == "none"

@@ -45,7 +45,7 @@ def test_text_page_and_json_show_them(small_ring, measured):
     jsonschema.validate(document, SCHEMA)
     assert document["devices"] == DEVICES
     assert document["findings"][0]["device"] == DEVICES["end_3"]
-    assert document["findings"][0]["remedy"]["device"] == DEVICES["end_3"]
+    assert document["findings"][0]["recommended_action"]["device"] == DEVICES["end_3"]
     (row,) = [row for row in document["errors"] if row["element"] == "end_3"]
     assert row["device"] == DEVICES["end_3"]
     for said in (found.report(), page(found, [])):

@@ -31,10 +31,10 @@ SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
 FAINT = Cause("quadrupole_gradient", "QD::5", -0.0025)  # a neighbour explains it nearly as well
 CASES = {
-    "named": ([WEAK], {}, {}),
-    "equivalent": ([FAINT], {}, {}),
-    "located": ([WEAK], {}, {"effects": ["monitor_gain_x", "dipole_field"]}),
-    "nothing": ([], {}, {}),
+    "identified": ([WEAK], {}, {}),
+    "ambiguous": ([FAINT], {}, {}),
+    "localised": ([WEAK], {}, {"effects": ["monitor_gain_x", "dipole_field"]}),
+    "none": ([], {}, {}),
     "distributed": (
         [],
         {"quadrupole_gradient": 0.02, "quadrupole_offset_x": None},
@@ -139,8 +139,8 @@ def test_page_holds_its_figures_and_leads_nowhere(outcome):
     inside = [source for source in parser.found if source not in pictures]
     assert all(source.startswith(("#", "data:,")) for source in inside)
     assert not {"iframe", "object"} & set(parser.tags)
-    for words in ("QD::5", "named", "Set or repair the gradient of QD::5", "as designed",
-                  "the remedy is the same", "The gap", "Provenance", "false_alarm"):  # fmt: skip
+    for words in ("QD::5", "identified", "Set or repair the gradient of QD::5", "as designed",
+                  "the action is the same", "The gap", "Provenance", "false_alarm"):  # fmt: skip
         assert words in html
 
 
@@ -224,26 +224,27 @@ def test_json_of_every_verdict_is_valid(diagnoses, schema, tmp_path, verdict):
 
 
 def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, schema):
-    document = json.loads(json.dumps(diagnoses["named"].as_json()))
+    document = json.loads(json.dumps(diagnoses["identified"].as_json()))
     jsonschema.validate(document, schema)
     for key in document:
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate({k: v for k, v in document.items() if k != key}, schema)
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate({**document, "verdict": "nothing"}, schema)
+        jsonschema.validate({**document, "verdict": "none"}, schema)
 
 
 @pytest.mark.parametrize(
     ("verdict", "words"),
     [
-        ("named", ["NAMED: quadrupole QD::5, integrated gradient -1.9", "(k1 -0.9 -> -0.88",
+        ("identified", ["IDENTIFIED: quadrupole QD::5, integrated gradient -1.9",
+                   "(k1 -0.9 -> -0.88",
                    "set or repair the gradient of QD::5", "Read back the current", "> 99.9 %",
                    "between bpm::5 and end_5", "beta beat", "after the repair: as designed",
-                   "the remedy is the same"]),
-        ("equivalent", ["alternatives: sextupole sd::5", "or else"]),
-        ("located", ["no effect of the catalogue explains it", "Next: Inspect this section",
+                   "the action is the same"]),
+        ("ambiguous", ["alternatives: sextupole sd::5", "or else"]),
+        ("localised", ["no effect of the catalogue explains it", "Next: Inspect this section",
                      "(bpm::5, QD::5, end_5)", "the gap of held-out readings stays"]),
-        ("nothing", ["No error is detected", "Would have been seen",
+        ("none", ["No error is detected", "Would have been seen",
                      "wrong strength of a quadrupole"]),
         ("distributed", ["all along the ring", "faults that small errors hide", "--reference"]),
     ],
@@ -257,23 +258,23 @@ def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):
     assert "held out (shots" in flat
     assert "noise of a reading" in flat
     assert "nan" not in flat
-    assert "Would have been seen" not in flat or verdict == "nothing"
+    assert "Would have been seen" not in flat or verdict == "none"
     assert max(map(len, text.splitlines())) <= 100
 
 
 def test_report_says_how_much_is_closed_and_how_surely(diagnoses):
-    text = " ".join(report_text(diagnoses["named"]).split())
+    text = " ".join(report_text(diagnoses["identified"]).split())
     found = re.search(r"([\d.]+) % of the gap .* \(95 % interval ([\d.]+) to ([\d.]+) %\)", text)
     closed, low, high = map(float, found.groups())
     assert 90 < low < closed <= high <= 100  # a gap of three times the noise
-    assert closed == pytest.approx(100 * diagnoses["named"].gap["closed"], abs=0.06)
+    assert closed == pytest.approx(100 * diagnoses["identified"].gap["explained"], abs=0.06)
 
 
 def test_dead_monitor_in_report_and_json(small_ring, schema, tmp_path):
     data = simulate(small_ring, [Cause("monitor_dead", "end_3", 1.0)], **SHOTS).measurement()
     diagnosis = diagnose(small_ring, data)
     text = report_text(diagnosis)
-    assert "NAMED: monitor end_3, no signal." in text
+    assert "IDENTIFIED: monitor end_3, no signal." in text
     assert "the stored beam does not feel it" in text
     write_json(tmp_path / "a.json", diagnosis.as_json())
     document = json.loads((tmp_path / "a.json").read_text())
@@ -319,7 +320,7 @@ def test_every_verdict_has_its_figures(diagnoses, verdict):
         plt.close(figure)
     assert names[:3] == ["plan", "readings", "scan"]
     assert "gap" in names
-    assert ("credible-set-1" in names) == (verdict == "equivalent")
+    assert ("credible-set-1" in names) == (verdict == "ambiguous")
     assert ("scan-near" in names) == bool(diagnoses[verdict].findings)
 
 
@@ -328,7 +329,7 @@ def test_scan_figure_shows_the_scan_that_saw_the_fault(diagnoses):
 
     from tmlattice.plots.diagnosis import plot_scan
 
-    diagnosis = diagnoses["named"]
+    diagnosis = diagnoses["identified"]
     figure = plot_scan(diagnosis)
     ax = figure.axes[0]
     lines = {line.get_label(): line for line in ax.lines}
@@ -348,7 +349,7 @@ def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
 
     from tmlattice.plots.diagnosis import plot_gap
 
-    diagnosis = diagnoses["named"]
+    diagnosis = diagnoses["identified"]
     ax = plot_gap(diagnosis)
     lengths = [bar.get_width() for bar in ax.patches]
     assert lengths == pytest.approx([1e6 * m.rms for m in diagnosis.heldout.misfits])
@@ -363,7 +364,7 @@ def test_a_gap_of_a_model_that_loses_the_beam_is_drawn(diagnoses):
     from tmlattice.plots.diagnosis import plot_gap
     from tmlattice.report import interactive
 
-    diagnosis = diagnoses["named"]
+    diagnosis = diagnoses["identified"]
     first, *others = diagnosis.heldout.misfits
     lost = dataclasses.replace(first, rms=np.nan, chi2_per_dof=np.nan)
     heldout = dataclasses.replace(diagnosis.heldout, misfits=(lost, *others))
@@ -383,7 +384,7 @@ def test_names_under_the_bars_of_the_gap_do_not_overlap(diagnoses, count):
 
     from tmlattice.plots.diagnosis import gap_axes, plot_gap
 
-    diagnosis = diagnoses["named"]
+    diagnosis = diagnoses["identified"]
     (cause,), (error,) = diagnosis.causes, diagnosis.errors
     long = Cause("corrector_kick_x", "steerer_of_the_long_straight_section_north_supply_17", 1e-5)
     steps = diagnosis.heldout.misfits

@@ -40,7 +40,7 @@ FAULTS = [
 
 @pytest.mark.parametrize("cause", FAULTS, ids=str)
 def test_a_fault_of_the_at_machine_is_found(petra3, cause):
-    """Place and effect in the credible set, the amount within four of its errors, the gap closed:
+    """Place and effect in the credible set, the amount within four of its errors, the gap gone:
     a wrong sign, a swapped plane or a neighbour taken for the magnet fails."""
     result = diagnose(petra3, measured(petra3, [cause]))
     assert len(result.findings) == 1
@@ -58,15 +58,15 @@ def test_a_fault_of_the_at_machine_is_found(petra3, cause):
     if cause.element is not None:
         low, high = finding.where
         assert low <= petra3[cause.element].s <= high
-    closed = result.gap["closed"]
+    closed = result.gap["explained"]
     assert closed is None or closed > 0.9
     assert result.unexplained["p_value"] > 1e-4
 
 
 def test_no_fault_is_nothing_and_says_what_would_have_been_seen(petra3):
     result = diagnose(petra3, measured(petra3, []))
-    assert (result.verdict, result.findings) == ("nothing", ())
-    assert result.gap["closed"] is None
+    assert (result.verdict, result.findings) == ("none", ())
+    assert result.gap["explained"] is None
     assert result.tunes["before"] == result.tunes["after"]
     least = result.sensitivity["quadrupole_gradient"]
     seen = Cause("quadrupole_gradient", "qd::12", 10 * least)
@@ -89,7 +89,7 @@ def test_dead_and_frozen_monitors_are_findings(petra3):
         ("bpm_a3_3", 1.0),
         ("bpm_a4_3", 2.0),
     }
-    assert result.verdict == "named"
+    assert result.verdict == "identified"
 
 
 def test_an_effect_without_a_name_is_located(petra3):
@@ -99,18 +99,18 @@ def test_an_effect_without_a_name_is_located(petra3):
     data = measured(petra3, [], settings=settings)
     hidden = data.__class__(**{**vars(data), "settings": ()})
     result = diagnose(petra3, hidden, effects=[n for n in CATALOGUE if "corrector" not in n])
-    assert result.verdict == "located"
+    assert result.verdict == "localised"
     finding = first(result)
     assert (finding.effect, finding.element, finding.credible_set) == (None, None, ())
     assert finding.where[0] - 15 <= petra3["hcor_a1_5"].s <= finding.where[1] + 15
-    assert result.gap["closed"] is None
+    assert result.gap["explained"] is None
 
 
 def test_an_effect_out_of_the_catalogue_is_not_given_another_name(petra3):
     fault = Cause("monitor_coupling", "bpm_a4_3", 0.2)
     others = [n for n in CATALOGUE if not n.startswith("monitor_")]
     result = diagnose(petra3, measured(petra3, [fault]), effects=others)
-    assert result.verdict == "located"
+    assert result.verdict == "localised"
     assert "bpm_a4_3" in first(result).near
 
 
@@ -142,8 +142,8 @@ def test_a_single_wild_reading_is_left_out_and_is_no_finding(petra3):
     readings = data.readings.copy()
     readings[0, 0, 100, 0] += 1e-3
     result = diagnose(petra3, data.__class__(**{**vars(data), "readings": readings}), holdout=0)
-    assert result.verdict == "nothing"
-    (told,) = result.as_json()["left_out"]
+    assert result.verdict == "none"
+    (told,) = result.as_json()["outliers"]
     name = data.monitors[100]
     assert told == {"shot": data.shots[0], "turn": 0, "monitor": name, "plane": "x"}
     assert any(name in warning for warning in result.warnings)
@@ -160,7 +160,7 @@ def test_data_of_another_ring_are_recognised(petra3):
 def test_energy_offset_is_no_hypothesis_where_every_shot_has_its_own_energy(petra3):
     data = measured(petra3, [], launch_sigma=(1e-4, 2e-5, 1e-4, 2e-5, 1e-4))
     result = diagnose(petra3, data)
-    assert result.verdict == "nothing"
+    assert result.verdict == "none"
     assert ("energy_offset", None) not in result.explanation.scan.hypotheses
 
 
@@ -254,7 +254,7 @@ def test_what_is_in_the_reference_too_is_no_change(small_ring, cause, shots):
     )
     for reference in (after, before):  # the folder itself, and the same machine once more
         found = diagnose(small_ring, after, reference=reference)
-        assert (found.verdict, found.findings) == ("nothing", ())
+        assert (found.verdict, found.findings) == ("none", ())
 
 
 def test_more_shots_than_find_room_are_used_in_part(small_ring, monkeypatch):
@@ -279,7 +279,7 @@ def test_small_errors_alone_are_no_change(small_ring):
     before, after = (
         simulate(small_ring, [], shots=6, seed=seed, **machine).measurement() for seed in (50, 0)
     )
-    assert diagnose(small_ring, after, reference=before).verdict == "nothing"
+    assert diagnose(small_ring, after, reference=before).verdict == "none"
 
 
 def test_a_fault_among_small_errors_that_lose_the_beam(small_ring):

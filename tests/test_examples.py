@@ -41,9 +41,13 @@ def run(page, place):
     return said
 
 
-def right(remedy):
-    assert remedy.element.lower() == MAGNET
-    assert abs(remedy.amount - FAULT.amount) < 4 * remedy.amount_sigma < 0.2 * abs(FAULT.amount)
+def right(recommended_action):
+    assert recommended_action.element.lower() == MAGNET
+    assert (
+        abs(recommended_action.amount - FAULT.amount)
+        < 4 * recommended_action.amount_sigma
+        < 0.2 * abs(FAULT.amount)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +86,7 @@ def test_a_physicist_finds_the_magnet(place):
     }
     assert away == {MAGNET: pytest.approx(FAULT.amount, abs=3e-3)}
     assert f"{100 * away[MAGNET]:.2f}" in found
-    assert "nothing" in response.lower()
+    assert "none" in response.lower()
 
 
 def test_an_operator_is_told_the_magnet_and_the_settings(place):
@@ -91,7 +95,7 @@ def test_an_operator_is_told_the_magnet_and_the_settings(place):
     assert (check.returncode, found.returncode) == (0, 0)
     result = json.loads((place / "report" / "diagnosis.json").read_text())
     (finding,) = result["findings"]
-    right(types.SimpleNamespace(**finding["remedy"]))
+    right(types.SimpleNamespace(**finding["recommended_action"]))
 
 
 def test_in_python_too(place, monkeypatch):
@@ -101,7 +105,7 @@ def test_in_python_too(place, monkeypatch):
     exec(code, names)
     diagnosis = names["diagnosis"]
     (finding,) = diagnosis.findings
-    right(finding.remedy)
+    right(finding.recommended_action)
 
 
 def test_what_several_measurements_say_together(place, monkeypatch):
@@ -110,7 +114,7 @@ def test_what_several_measurements_say_together(place, monkeypatch):
     names = {}
     exec(code, names)
     (finding,) = names["diagnosis"].findings
-    right(finding.remedy)
+    right(finding.recommended_action)
     (printed,) = re.findall(r"seen_by  # (.*)", code)
     assert finding.seen_by == pytest.approx(json.loads(printed), abs=0.05)
 

@@ -47,7 +47,7 @@ def test_a_plain_install_simulates_diagnoses_and_reports(tmp_path):
         SMALL,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    assert "NAMED: quadrupole QD::5" in done.stdout
+    assert "IDENTIFIED: quadrupole QD::5" in done.stdout
     assert (tmp_path / "out" / "report.html").exists()
 
 

@@ -207,7 +207,7 @@ def measured(tmp_path_factory):
         ("diagnose", "ring.py", "M", "--json", "M/measurement.json"),
         ("diagnose", "ring.py", "M", "--json", "linked.csv"),
         ("diagnose", "ring.py", "M", "--lattice-out", "ring.py"),
-        ("diagnose", "ring.py", "M", "--json", "x.json", "--repaired-out", "x.json"),
+        ("diagnose", "ring.py", "M", "--json", "x.json", "--corrected-out", "x.json"),
         ("check", "ring.py", "M", "--json", "ring.py"),
         ("info", "ring.py", "--json", "ring.py"),
         ("simulate", "ring.py", "--out", "N", "--truth", "ring.py"),

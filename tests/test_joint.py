@@ -67,7 +67,9 @@ def _turns(ring, causes, seed=4, turns=300):
 
 
 def _found(diagnosis):
-    return {(f.remedy.effect, f.element) for f in diagnosis.findings if f.remedy}
+    return {
+        (f.recommended_action.effect, f.element) for f in diagnosis.findings if f.recommended_action
+    }
 
 
 def test_each_sees_its_part_and_both_are_named(small_ring):
@@ -80,12 +82,12 @@ def test_each_sees_its_part_and_both_are_named(small_ring):
         "injection": simulate(small_ring, truth, shots=4, seed=1).measurement(),
     }
     diagnosis = diagnose(small_ring, whole)
-    assert diagnosis.verdict in ("named", "equivalent")
+    assert diagnosis.verdict in ("identified", "ambiguous")
     assert _found(diagnosis) == {(KICK.effect, KICK.element), (WEAK.effect, WEAK.element)}
     amount, sigma = diagnosis.error(WEAK.effect, WEAK.element)
     assert abs(amount - WEAK.amount) < 4 * sigma
     assert sigma < 2e-4
-    shares = {f.remedy.effect: f.seen_by for f in diagnosis.findings}
+    shares = {f.recommended_action.effect: f.seen_by for f in diagnosis.findings}
     for share in shares.values():
         assert sum(share.values()) == pytest.approx(1.0)
     assert shares[KICK.effect]["orbit"] > 0.9
@@ -146,7 +148,7 @@ def test_a_beam_that_is_lost_early_is_told(small_ring):
 @pytest.mark.parametrize("make", [_orbit, _dispersion, _tunes, _turns])
 def test_a_sound_ring_is_nothing(small_ring, make):
     diagnosis = diagnose(small_ring, make(small_ring, []))
-    assert diagnosis.verdict == "nothing"
+    assert diagnosis.verdict == "none"
     if make is not _tunes:  # two readings
         assert diagnosis.fit_after.chi2_per_dof == pytest.approx(1.0, abs=0.3)
 
@@ -210,7 +212,7 @@ def test_what_was_there_before_is_nothing_now(small_ring, make):
     before, after = (make(small_ring, [fault], seed=seed) for seed in (70, 71))
     for reference in (after, before) if make is not _turns else (after,):  # seconds each
         found = diagnose(small_ring, after, reference=reference)
-        assert (found.verdict, found.findings) == ("nothing", ())
+        assert (found.verdict, found.findings) == ("none", ())
 
 
 def test_a_corrector_that_is_held_out_is_named_too(small_ring):
@@ -266,7 +268,7 @@ def test_readings_that_are_given_twice_are_refused(small_ring):
     with pytest.raises(MeasurementError, match="'monday' and 'again' hold the same readings"):
         diagnose(small_ring, data)
     data["again"] = _orbit(small_ring, [KICK], seed=5)
-    assert diagnose(small_ring, data).verdict in {"named", "equivalent"}
+    assert diagnose(small_ring, data).verdict in {"identified", "ambiguous"}
 
 
 def test_small_errors_that_leave_no_stored_beam_are_told(small_ring):
@@ -319,7 +321,7 @@ def test_tuesday_is_sharper_for_monday(small_ring, monday):
     assert abs(found.amount - fault.amount) < 4 * found.amount_sigma
     assert all(f.detection.statistic < found.detection.statistic for f in alone.findings)
     sound = simulate(small_ring, small, shots=4, seed=53).measurement()
-    assert diagnose(diagnosis.as_found, sound, known=known_of(diagnosis)).verdict == "nothing"
+    assert diagnose(diagnosis.as_found, sound, known=known_of(diagnosis)).verdict == "none"
 
 
 def test_what_was_known_of_another_ring_goes_with_it(small_ring, tmp_path):
@@ -346,7 +348,7 @@ def test_what_is_known_is_written_beside_the_lattice(small_ring, monday, tmp_pat
     )
     assert (tmp_path / "twin.json.known.json").is_file()
     told = tmlattice("diagnose", "twin.json", "tuesday", cwd=tmp_path, check=0)
-    assert told.stdout.startswith("NOTHING")
+    assert told.stdout.startswith("NONE")
     assert "is not there" not in told.stderr
     (tmp_path / "twin.json").rename(tmp_path / "moved.json")
     moved = tmlattice("diagnose", "moved.json", "tuesday", cwd=tmp_path, check=0)

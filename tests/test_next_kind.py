@@ -37,7 +37,7 @@ def how(**more):
 
 def test_what_is_proposed_parts_them(small_ring, tunes):
     reading, diagnosis = tunes
-    assert diagnosis.verdict == "equivalent"
+    assert diagnosis.verdict == "ambiguous"
     proposed = diagnosis.next
     assert proposed.kind in KINDS
     assert proposed.kind != "tunes"
@@ -45,8 +45,11 @@ def test_what_is_proposed_parts_them(small_ring, tunes):
     further = measured(small_ring, proposed.kind, seed=2)
     both = diagnose(small_ring, {"tunes": reading, "further": further})
     (found,) = both.findings
-    assert both.verdict == "named"
-    assert (found.remedy.effect, found.remedy.element) == (WEAK.effect, WEAK.element)
+    assert both.verdict == "identified"
+    assert (found.recommended_action.effect, found.recommended_action.element) == (
+        WEAK.effect,
+        WEAK.element,
+    )
 
 
 def test_it_is_told_in_text_and_json(tunes):

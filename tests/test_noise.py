@@ -30,7 +30,7 @@ def test_one_signal_under_two_names_has_the_noise_of_one(small_ring, copied):
     found = diagnose(small_ring, copied, holdout=0)
     assert found.noise_estimated
     assert found.noise == pytest.approx((NOISE, NOISE), rel=0.25)
-    assert found.verdict == "nothing"
+    assert found.verdict == "none"
 
 
 def test_a_fit_of_weights_takes_that_noise_too(small_ring, copied):

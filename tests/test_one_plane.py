@@ -38,7 +38,7 @@ def test_a_healthy_ring_is_healthy_in_one_plane(small_ring, plane, launches_know
     """At 3 mm sextupoles move the orbit by 100 µm with the plane that is not read: five sigma."""
     data = measured(small_ring, [], plane, launches_known, amplitude=amplitude)
     result = diagnose(small_ring, data)
-    assert (result.verdict, result.findings) == ("nothing", ())
+    assert (result.verdict, result.findings) == ("none", ())
     assert result.fit_after.chi2_per_dof < 1.2
     assert not any("settled" in warning for warning in result.warnings)
 
@@ -65,7 +65,7 @@ def test_a_weak_quadrupole_is_found_in_one_plane(small_ring, plane, launches_kno
 )
 def test_what_acts_in_the_other_plane_alone_is_not_named(small_ring, plane, cause):
     result = diagnose(small_ring, measured(small_ring, [cause], plane))
-    assert result.verdict in ("nothing", "distributed")
+    assert result.verdict in ("none", "distributed")
     assert result.findings == ()
     unread = PLANES[1 - PLANES.index(plane)]
     assert any(f"no BPM reads {unread}" in warning for warning in result.warnings)
@@ -84,7 +84,7 @@ def test_a_strong_kick_in_the_other_plane_has_a_place_and_no_amount(small_ring, 
     result = diagnose(small_ring, measured(small_ring, [cause], plane, seed=2))
     (finding,) = result.findings
     low, high = finding.where
-    assert (finding.verdict, finding.amount) == ("located", None)
+    assert (finding.verdict, finding.amount) == ("localised", None)
     assert low <= small_ring["QD::5"].s <= high
     assert any(f"upstream in {unread}" in warning for warning in result.warnings)
 
@@ -138,7 +138,7 @@ def test_a_stored_beam_of_a_healthy_ring_is_healthy_in_one_plane(small_ring, kin
     data = stored(kind, small_ring, [], plane)
     assert check_data(small_ring, data).status == "note"
     result = diagnose(small_ring, data)
-    assert (result.verdict, result.findings) == ("nothing", ())
+    assert (result.verdict, result.findings) == ("none", ())
     assert not any("settled" in warning for warning in result.warnings)
 
 

@@ -305,7 +305,7 @@ def test_from_templates_to_a_name(tmp_path):
         document = json.loads((tmp_path / "a.json").read_text())
         assert "readings are in mm" in done.stdout
         assert document["provenance"]["assumed_of_files"]
-        assert document["verdict"] == "named"
+        assert document["verdict"] == "identified"
         named.add(tuple(finding["element"] for finding in document["findings"]))
     assert len(named) == 1
     words = ["import", "ex/response.csv", "--lattice", SMALL, "--out", "r"]

@@ -54,7 +54,7 @@ def tried(reader):
 def test_commands_run_as_written_and_write_what_they_name(reader, tried, number):
     for line in tried(number):
         words = shlex.split(line)
-        for option in ("--out", "--lattice-out", "--repaired-out"):
+        for option in ("--out", "--lattice-out", "--corrected-out"):
             if option in words:
                 assert (reader / words[words.index(option) + 1]).exists(), line
 

@@ -132,7 +132,7 @@ def test_first_turns_have_every_section_and_hover_tells_names(opened, first_turn
     tab = opened(first_turns)
     assert headings(tab) == ["findings", "notes", "gap", "scan", "sensitivity", "provenance"]
     answer = tab.inner_text("#answer")
-    for words in ("NAMED", "Culprit", "QD::5", "Place", "Gap", "Do next"):
+    for words in ("IDENTIFIED", "Culprit", "QD::5", "Place", "Gap", "Do next"):
         assert words in answer
     assert tab.locator("nav a").count() == 6
     assert tab.locator(".figure .main-svg").first.is_visible()

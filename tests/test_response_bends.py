@@ -95,7 +95,7 @@ def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):
     ).measured
     data = response_data(small_ring, measured)
     fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
-    assert not any(step.effect == "bend_gradient" for step in (*fit.steps, *fit.refused))
+    assert not any(step.effect == "bend_gradient" for step in (*fit.steps, *fit.rejected_steps))
 
 
 def test_the_scale_of_edges_is_that_of_a_rectangular_magnet(small_ring):

@@ -134,7 +134,7 @@ def test_one_wrong_corrector_is_not_nothing(small_ring, effect, amount):
     """Held-out correctors, each with its kick fitted, see nothing of it: the column itself does."""
     found = diagnose(small_ring, wrong_corrector(small_ring, effect, amount), seed=1)
     assert not found.response.held[found.response.measured.correctors.index("v5")]
-    assert found.verdict != "nothing"
+    assert found.verdict != "none"
     assert found.fit_after.chi2_per_dof < 1.2  # 490 readings: 1 +- 0.06
     value, sigma = found.error(effect, "v5")
     assert sigma < 5e-3
@@ -145,7 +145,7 @@ def test_one_wrong_corrector_is_not_nothing(small_ring, effect, amount):
 def test_a_faultless_ring_is_nothing(small_ring):
     measured = simulate_response(small_ring, [], engine="ocelot", progress=False).measured
     found = diagnose(small_ring, measured)
-    assert found.verdict == "nothing"
+    assert found.verdict == "none"
     assert not found.warnings
 
 
@@ -383,7 +383,7 @@ def test_what_no_fitted_reading_sees_is_not_weighed(small_ring, measured, monkey
     state = fitted(small_ring, measured)
     pattern = np.zeros((1, *state.data.shape))
     pattern[0, state.split.held] = 1.0
-    unseen = Hypothesis("unseen", "m", "nothing", pattern)
+    unseen = Hypothesis("unseen", "m", "none", pattern)
     monkeypatch.setitem(HYPOTHESES, "unseen", lambda _: unseen)
     assert [row.effect for row in weigh(state, ["unseen"])] == ["none"]
 
@@ -559,7 +559,7 @@ def test_the_errors_of_a_known_machine_are_those_stated(small_ring):
     assert size["quadrupole_gradient"] > 0.5  # of gains the common scale is the largest error
     sick = apply(small_ring, [c for c in drawn if c.effect == "quadrupole_gradient"])
     beta, expected, design = (
-        twiss(TaylorNetwork.from_ring(ring)).beta for ring in (found.repaired, sick, small_ring)
+        twiss(TaylorNetwork.from_ring(ring)).beta for ring in (found.corrected, sick, small_ring)
     )
     assert np.std(design / expected - 1) > 1e-2
     assert np.std(beta / expected - 1) < 3e-3
@@ -571,7 +571,7 @@ def test_report_and_json(small_ring, result):
     jsonschema.validate(json.loads(json.dumps(document)), schema)
     assert [s["effect"] for s in document["steps"]] == [s.effect for s in result.steps]
     text = report_text(result)
-    assert "NAMED: 5 faults" in text  # and no small errors beside them
+    assert "IDENTIFIED: 5 faults" in text  # and no small errors beside them
     assert "QD::5" in text
     (line,) = (line for line in text.splitlines() if line.startswith("beta beating, rms [%]"))
     told = [float(word) for word in line.split()[-3::2]]
@@ -614,7 +614,7 @@ def test_more_energy_spread_than_a_beam_has_is_refused(small_ring):
     ).measured
     found = diagnose(small_ring, measured, seed=1, effects=["energy_spread"])
     assert [step.effect for step in found.steps] == ["design"]
-    assert [step.effect for step in found.refused] == ["energy_spread"]
+    assert [step.effect for step in found.rejected_steps] == ["energy_spread"]
     assert any("where radiation makes 0.11 %" in said for said in found.warnings)
 
 
@@ -629,7 +629,7 @@ def test_a_family_that_is_doubted_draws_no_other_one_along(small_ring):
     trials = [own for own in STEPS if own.families[0].name in asked]
     found, without = (fit_steps(data, split, some) for some in (trials, trials[:1] + trials[2:]))
     assert [own.families[0].name for own in trials] == [asked[0], asked[2], asked[1]]
-    assert "energy_spread" in [step.effect for step in found.refused]
+    assert "energy_spread" in [step.effect for step in found.rejected_steps]
     assert any("an energy spread of" in said for said in found.said)
     assert found.state.values.keys() == without.state.values.keys()
     for name, values in found.state.values.items():

@@ -35,7 +35,7 @@ def test_a_reversed_corrector_is_named_also_where_it_is_held_out(small_ring, see
     result = diagnose(small_ring, response, seed=seed)
     held = dict(zip(result.response.measured.correctors, result.response.held, strict=False))
     assert held["v3"] == (seed == 0)
-    assert result.verdict == "named"
+    assert result.verdict == "identified"
     (found,) = result.findings
     assert (found.effect, found.element) == ("corrector_calibration", "v3")
     assert abs(found.amount + 2.0) < 4 * found.amount_sigma < 0.02
@@ -54,7 +54,7 @@ def test_a_reversed_corrector_is_named_also_where_it_is_held_out(small_ring, see
 )
 def test_one_cause_is_named_as_one(small_ring, effect, element, amount):
     result = diagnose(small_ring, measured(small_ring, [Cause(effect, element, amount)]))
-    assert result.verdict in ("named", "equivalent")
+    assert result.verdict in ("identified", "ambiguous")
     (found,) = result.findings
     assert (effect, element) in in_sets(result)[0]
     if (found.effect, found.element) == (effect, element) and found.amount_sigma:

@@ -375,7 +375,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     wrong = (put_right if what == "correctors" else monitors_back)(measured, [tuple(pair)])
     effects = ["quadrupole_gradient"] if case == "neighbours" else None
     found = diagnose(small_ring, wrong, effects=effects)
-    assert found.verdict == "located"
+    assert found.verdict == "localised"
     (one,) = found.findings
     assert set(one.elements) == set(pair)
     assert one.words == f"{what} {' and '.join(one.elements)} answer each as the other one should"
@@ -391,7 +391,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     else:
         assert any(one.where[0] <= s <= one.where[1] for s in places)
         assert one.where[1] - one.where[0] < 0.4 * small_ring.length
-    assert f"LOCATED: {what.capitalize()} {one.elements[0]} and" in found.report()
+    assert f"LOCALISED: {what.capitalize()} {one.elements[0]} and" in found.report()
     assert one.to_check in " ".join(found.report().split())
     assert repr(one).startswith(f"<Finding {one.words}")
 

@@ -45,7 +45,7 @@ def parted(ring, measured, seed=0):
 def named(ring, measured, cause):
     """The diagnosis, of which the cause is the one finding."""
     result = diagnose(ring, measured)
-    assert result.verdict == "named"
+    assert result.verdict == "identified"
     (found,) = result.findings
     assert (found.effect, found.element) == (cause.effect, cause.element)
     assert abs(found.amount - cause.amount) < 4 * found.amount_sigma
@@ -131,7 +131,7 @@ def test_exchanged_planes_of_a_monitor_are_put_back_and_told(small_ring, measure
     assert swapped(begin(right, split)) == []
     result = diagnose(small_ring, measured)
     (found,) = result.findings
-    assert (found.effect, found.element, found.verdict) == ("monitor_swap", "end_6", "named")
+    assert (found.effect, found.element, found.verdict) == ("monitor_swap", "end_6", "identified")
     assert found.detection.statistic > 1000
     assert not result.bad_monitors
 

@@ -205,7 +205,7 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
     path.write_text(json.dumps(document | {"provenance": moved}))
     with pytest.raises(MeasurementError, match=r"needs its lattice 'away.py'.*give the lattice"):
         Diagnosis.load(tmp_path)
-    assert Diagnosis.load(tmp_path, SMALL_RING()).verdict == "named"
+    assert Diagnosis.load(tmp_path, SMALL_RING()).verdict == "identified"
     with pytest.raises(MeasurementError, match="has no element 'QD::5'"):
         Diagnosis.load(tmp_path, tmlattice.load_ring("petra3"))
     del document["gap"]["readings_noise"]

@@ -78,7 +78,7 @@ def test_what_an_object_shows_is_a_line(small_ring, measured, diagnosis):
     every = [
         (small_ring, ("107.700 m", "monitors 35", "3 GeV")),
         (measured, ("shots 3", "1 µm", "stated")),
-        (diagnosis, ("named", "QD::5", "quadrupole_gradient")),
+        (diagnosis, ("identified", "QD::5", "quadrupole_gradient")),
         (diagnosis.findings[0], ("QD::5", "relative")),
         (tmlattice.CATALOGUE, ("quadrupole_gradient",)),
         *((own, ()) for own in of_every_kind(measured.monitors).values()),

@@ -95,7 +95,7 @@ def test_it_is_named(small_ring, late):
     weak = Cause("quadrupole_gradient", "QD::3", -0.02)
     measured = simulate_turns(small_ring, [offset(late), weak], shots=3, turns=400, seed=3).measured
     diagnosis = diagnose(small_ring, measured)
-    named = {(f.remedy.effect, f.element) for f in diagnosis.findings}
+    named = {(f.recommended_action.effect, f.element) for f in diagnosis.findings}
     assert named == {("monitor_turn_offset", MONITOR), ("quadrupole_gradient", "QD::3")}
     amount, sigma = diagnosis.error("monitor_turn_offset", MONITOR)
     assert abs(amount - late) < 4 * sigma < 0.02

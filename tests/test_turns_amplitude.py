@@ -104,7 +104,7 @@ def test_chi_square_of_a_healthy_ring_is_right_at_every_amplitude(small_ring, am
 
 
 def test_nothing_is_found_in_a_healthy_ring_at_the_default_amplitude(petra3):
-    assert diagnose(petra3, simulate_turns(petra3, seed=0).measured).verdict == "nothing"
+    assert diagnose(petra3, simulate_turns(petra3, seed=0).measured).verdict == "none"
 
 
 def test_a_quadrupole_is_found_at_a_large_amplitude(small_ring):

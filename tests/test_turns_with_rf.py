@@ -80,7 +80,7 @@ def test_a_faultless_ring_is_faultless_over_several_turns(small_ring, radiation,
         settings=[settings] * 4, seed=1,
     ).measurement()  # fmt: skip
     result = diagnose(small_ring, measured, radiation=radiation)
-    assert result.verdict == "nothing"
+    assert result.verdict == "none"
     # 560 readings of three shots: chi-square per reading is 1 within 0.06, and four of that
     assert abs(result.fit_after.chi2_per_dof - 1) < 0.2
     assert not result.causes

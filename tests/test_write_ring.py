@@ -172,7 +172,7 @@ def test_diagnose_writes_the_ring_as_found_and_repaired(small_ring, tmp_path):
     ).measurement()
     write_measurement(tmp_path / "m", data)
     done = tmlattice(
-        "diagnose", SMALL, tmp_path / "m", "--lattice-out", "found.at.json", "--repaired-out",
+        "diagnose", SMALL, tmp_path / "m", "--lattice-out", "found.at.json", "--corrected-out",
         "set.py", "--json", "a.json", cwd=tmp_path, check=0,
     )  # fmt: skip
     assert "turn QF::11 upright" in done.stdout.split("written:")[1]
@@ -189,6 +189,6 @@ def test_diagnose_writes_the_ring_as_found_and_repaired(small_ring, tmp_path):
 
 def test_suffix_without_a_format_is_refused_before_the_work(tmp_path):
     done = tmlattice(
-        "diagnose", SMALL, tmp_path, "--repaired-out", "ring.lte", cwd=tmp_path, check=2
+        "diagnose", SMALL, tmp_path, "--corrected-out", "ring.lte", cwd=tmp_path, check=2
     )
     assert done.stderr

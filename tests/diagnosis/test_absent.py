@@ -61,7 +61,7 @@ def test_what_the_lattice_lacks_is_left_out_and_told(small_ring, response):
 def test_of_a_reference_too(small_ring, response):
     again = with_more(response)
     found = diagnose(small_ring, again, reference=again)
-    assert found.verdict == "nothing"
+    assert found.verdict == "none"
     assert sum("not in the lattice" in said for said in found.warnings) == 2
 
 

@@ -100,9 +100,9 @@ CONTRADICTIONS = (
     ("residual is noise", "is larger than the noise"),
     ("explains the readings within their noise", "lacks an effect"),
     ("Small errors all along the ring explain the readings", "lacks an effect"),
-    ("show no gap beyond the noise", "of the gap is closed"),
-    ("No reading was held out", "of the gap is closed"),
-    ("Nothing was put into the model", "of the gap is closed"),
+    ("show no gap beyond the noise", "of the gap is explained"),
+    ("No reading was held out", "of the gap is explained"),
+    ("Nothing was put into the model", "of the gap is explained"),
     ("Nothing was put into the model", "within their noise"),
 )
 
@@ -128,8 +128,8 @@ def test_a_gap_that_falls_by_orders_of_magnitude_is_closed(results):
     assert len(found.heldout_shots) == 2
     before, after = found.heldout.misfits[0].rms, found.heldout.misfits[-1].rms
     assert before > 10 * after
-    assert found.assessment.gap == "closed"
-    assert found.heldout.closed > 0.99
+    assert found.assessment.gap == "explained"
+    assert found.heldout.explained > 0.99
 
 
 @pytest.mark.parametrize("name", [name for name in SCENARIOS if "reference" in name])
@@ -162,9 +162,9 @@ FITTED = {
 }
 
 
-def gap_of(before, after, closed, readings=100):
+def gap_of(before, after, explained, readings=100):
     misfits = (Misfit(before * 1e-5, before**2), Misfit(after * 1e-5, after**2))
-    return Gap(misfits, np.zeros((0, 0, 0)), closed, None, 0, readings)
+    return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, readings)
 
 
 GAPS = (None, gap_of(5, 1, 0.99), gap_of(5, 2, 0.9), gap_of(1, 1, None), gap_of(2, 1, None),
@@ -174,7 +174,7 @@ FLAGS = ("amounts", "findings", "noise_estimated", "families", "small_errors", "
 
 def every_assessment():
     """All combinations that a diagnosis can have."""
-    for verdict in ("named", "located", "distributed", "nothing"):
+    for verdict in ("identified", "localised", "distributed", "none"):
         for fitted, gap in itertools.product(FITTED.values(), GAPS):
             for flags in itertools.product((False, True), repeat=len(FLAGS)):
                 told = dict(zip(FLAGS, flags, strict=True))
@@ -184,9 +184,9 @@ def every_assessment():
                 if verdict == "distributed" and alone and told["amounts"]:
                     continue  # it puts nothing into the model
                 yield assess(verdict, compared_of(fitted, gap), gap, **told)
-    yield assess("nothing", (), None, amounts=False, findings=False, noise_estimated=False)
+    yield assess("none", (), None, amounts=False, findings=False, noise_estimated=False)
     for fitted in FITTED.values():
-        yield assess("nothing", (fitted,), None, amounts=False, findings=False,
+        yield assess("none", (fitted,), None, amounts=False, findings=False,
                      noise_estimated=False, reference=True, change=True)  # fmt: skip
 
 

@@ -80,5 +80,5 @@ def test_small_errors_that_explain_all_leave_suspects(small_ring):
 def test_named_verdict_has_no_suspects(small_ring):
     data = simulate(small_ring, [Cause("quadrupole_gradient", "QD::5", -0.05)], **SHOTS)
     result = diagnose(small_ring, data.measurement())
-    assert result.verdict == "named"
+    assert result.verdict == "identified"
     assert result.suspects == ()

@@ -30,7 +30,7 @@ COMMANDS = {
     "simulate, response": (["simulate", "ring.json", "--kind", "orbit-response", "--engine",
                             "ocelot", "--out", "out", "--force", "-q"], ("out",)),
     "diagnose": (["diagnose", "ring.json", "turns", "--json", "found.json", "--lattice-out",
-                  "found.at.json", "--repaired-out", "repaired.json", "-q"],
+                  "found.at.json", "--corrected-out", "repaired.json", "-q"],
                  ("found.json", "found.at.json", "repaired.json")),
     "import": (["import", "turns/readings.csv", "--lattice", "ring.json", "--out", "out",
                 "--force"], ("out",)),

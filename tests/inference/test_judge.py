@@ -78,7 +78,7 @@ def test_the_interval_of_what_is_closed_holds_in_95_per_cent(halves, rng):
 
 def test_no_share_is_told_of_a_gap_within_the_noise(halves, rng):
     both = [of(judged(halves, 0.0, rng, False)) for _ in range(2)]
-    assert held_out_gap(both).closed is None
+    assert held_out_gap(both).explained is None
 
 
 def test_a_gap_of_which_a_model_loses_the_beam_is_judged_by_nobody(halves, rng):
@@ -87,6 +87,6 @@ def test_a_gap_of_which_a_model_loses_the_beam_is_judged_by_nobody(halves, rng):
     seen[0] = np.nan
     fewer = Left(whole.residual[1:], whole.noise[1:, 1:])
     found = held_out_gap([of(whole), Judged(seen.reshape(1, -1, 1), (fewer,))])
-    assert found.closed is None
+    assert found.explained is None
     assert found.lost
     assert not held_out_gap([of(whole)] * 2).lost

@@ -79,7 +79,7 @@ def test_the_false_alarm_rate_acts_on_what_would_have_been_seen(small_ring):
     usual, strict = (
         diagnose(small_ring, quiet, holdout=0, false_alarm=rate) for rate in (5e-3, 1e-9)
     )
-    assert usual.verdict == strict.verdict == "nothing"
+    assert usual.verdict == strict.verdict == "none"
     for effect, least in usual.sensitivity.items():
         assert strict.sensitivity[effect] > 1.2 * least
     assert strict.provenance["options"]["false_alarm"] == 1e-9

@@ -46,7 +46,7 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
         # errors everywhere are no alarm where there are some
         out["false_alarms"] = rate(
             [
-                row["answers"]["tool"]["detected"] if row["small"] else row["verdict"] != "nothing"
+                row["answers"]["tool"]["detected"] if row["small"] else row["verdict"] != "none"
                 for row in rows
             ]
         )
@@ -82,7 +82,7 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["clean_gap_closed"] = _closed(clear)
     strong = [row for row in rows if (row["signal_to_noise"] or 0) >= 20]
     out["clean_gap_closed_above_20"] = _closed(strong)
-    for name in ("one_remedy", "oracle_one_remedy"):
+    for name in ("one_action", "oracle_one_action"):
         out[name] = _told(clear, name)
         out[f"{name}_above_20"] = _told(strong, name)
     out["false_refusals"] = rate([row["refused"] for row in clear])

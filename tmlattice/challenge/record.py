@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.diagnosis.remedies import leading, pieces_of, remedies_of
+from tmlattice.diagnosis.recommended_actions import leading, pieces_of, recommended_actions
 from tmlattice.effects import Cause, find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
@@ -20,7 +20,7 @@ Pair = tuple[str | None, str | None]
 ALIASED = 10.0
 """An unknown whose residual after the best catalogue member is below this is aliased, in sigma."""
 
-REFUSED = ("located", "distributed")
+REFUSED = ("localised", "distributed")
 
 
 class Places:
@@ -107,25 +107,25 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
     }
 
 
-def one_remedy(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | None:
-    """Whether the answer is one finding, named, with the remedy that takes the true cause away;
-    None of a result from before there were remedies."""
-    if any("remedy" not in finding for finding in result["findings"]):
+def one_action(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | None:
+    """Whether the answer is one finding, named, with the action that takes the true cause away;
+    None of a result from before there were recommended actions."""
+    if any("recommended_action" not in finding for finding in result["findings"]):
         return None
-    if result["verdict"] != "named" or len(result["findings"]) != 1:
+    if result["verdict"] != "identified" or len(result["findings"]) != 1:
         return False
-    told, true = result["findings"][0]["remedy"], leading(ring, cause)
+    told, true = result["findings"][0]["recommended_action"], leading(ring, cause)
     places = (pieces_of(ring, name) for name in (told["element"], true.element))
     return told["effect"] == true.effect and next(places) == next(places)
 
 
-def oracle_one_remedy(judged: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
-    """The same of the exact posterior: whether one remedy, the true one, holds the mass."""
+def oracle_one_action(judged: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
+    """The same of the exact posterior: whether one action, the true one, holds the mass."""
     (oracle,) = judged["oracles"]
     members = [m for m in oracle["posterior"] if m["probability"]]
     causes = [Cause(m["effect"], m["element"], m["amount"]) for m in members]
-    told = remedies_of(ring, causes, [m["probability"] for m in members])
-    first = max(told, key=lambda remedy: remedy.probability, default=None)
+    told = recommended_actions(ring, causes, [m["probability"] for m in members])
+    first = max(told, key=lambda recommended_action: recommended_action.probability, default=None)
     if not oracle["detected"] or first is None or first.probability < DEFAULT.mass:
         return False
     true = leading(ring, cause)
@@ -136,14 +136,14 @@ def column(result: Mapping[str, Any], cause: Cause) -> str:
     """The column of the confusion table."""
     if not result["findings"]:
         refused = result["verdict"] == "distributed" and not result.get("priors")
-        return "unknown" if refused else "nothing"
+        return "unknown" if refused else "none"
     finding = result["findings"][0]
     if finding["effect"] is None:
         return "unknown"
     if finding["effect"] == cause.effect:
         return cause.effect
     if cause.effect in {effect for effect, _ in pairs(finding)}:
-        return "equivalent"
+        return "ambiguous"
     return str(finding["effect"])
 
 
@@ -179,9 +179,9 @@ def oracle_answer(judged: Mapping[str, Any], ranking: str) -> dict[str, Any]:
     """
     findings = [_oracle_finding(o, ranking) for o in judged["oracles"] if o["detected"]]
     if not findings:
-        return {"verdict": "nothing", "findings": []}
+        return {"verdict": "none", "findings": []}
     several = any(len(finding["credible_set"]) > 1 for finding in findings)
-    return {"verdict": "equivalent" if several else "named", "findings": findings}
+    return {"verdict": "ambiguous" if several else "identified", "findings": findings}
 
 
 def _oracle_finding(oracle: Mapping[str, Any], ranking: str) -> dict[str, Any]:
@@ -214,4 +214,4 @@ def baseline_answer(
         members = [{**g, "probability": 1 / len(part)} for g in part]
         if part:
             findings.append({**part[0], "s": None, "amount": None, "credible_set": members})
-    return {"verdict": "named" if findings else "nothing", "findings": findings}
+    return {"verdict": "identified" if findings else "none", "findings": findings}

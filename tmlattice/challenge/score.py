@@ -36,9 +36,9 @@ from tmlattice.challenge.record import (
     column,
     exact,
     finding_row,
-    one_remedy,
+    one_action,
     oracle_answer,
-    oracle_one_remedy,
+    oracle_one_action,
     stated,
 )
 from tmlattice.effects import Cause, find
@@ -173,7 +173,7 @@ def row_of(
         "verdict": result["verdict"],
         "findings": len(result["findings"]),
         "seconds": result.get("seconds"),
-        "closed": result["gap"]["closed"],
+        "explained": result["gap"]["explained"],
         "heldout_chi2_per_dof": _after(result),
         "heldout_as_noise": _as_noise(result, len(places.monitors) // 2),
         "stated": stated(result, causes),
@@ -200,9 +200,9 @@ def row_of(
     row["answers"] = {name: _answer(answer, truth, places) for name, answer in answers.items()}
     if len(causes) == 1:
         row["column"] = column(result, causes[0])
-        row["one_remedy"] = one_remedy(result, causes[0], places.ring)
+        row["one_action"] = one_action(result, causes[0], places.ring)
         if judged is not None and "error" not in judged:
-            row["oracle_one_remedy"] = oracle_one_remedy(judged, causes[0], places.ring)
+            row["oracle_one_action"] = oracle_one_action(judged, causes[0], places.ring)
     if len(causes) > 1 and truth.tier == "C":
         visible = [cause for cause in causes if find(cause.effect).modelled]
         row["exact"] = {

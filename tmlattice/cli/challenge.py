@@ -322,11 +322,11 @@ def _print_sets(screen: "Console", result: dict[str, Any]) -> None:
         f"the oracle's class in {_share(coverage['no_larger_than_oracle'])}"
     )
     screen.print(
-        "one named finding with the element and the remedy: "
-        f"{_share(result['one_remedy'])} (the exact posterior "
-        f"{_plain(result['oracle_one_remedy'])}), at signal to noise >= 20 "
-        f"{_share(result['one_remedy_above_20'])} "
-        f"({_plain(result['oracle_one_remedy_above_20'])})"
+        "one named finding with the element and the recommended action: "
+        f"{_share(result['one_action'])} (the exact posterior "
+        f"{_plain(result['oracle_one_action'])}), at signal to noise >= 20 "
+        f"{_share(result['one_action_above_20'])} "
+        f"({_plain(result['oracle_one_action_above_20'])})"
     )
     screen.print(
         f"pulls of {pulls['cases']} amounts: mean {_number(pulls['mean'], '{:+.2f}')}, width "

@@ -110,7 +110,7 @@ log = logging.getLogger(__name__)
     "correctors do (`tmlattice predict`).",
 )
 @click.option(
-    "--repaired-out",
+    "--corrected-out",
     type=FILE,
     metavar="FILE",
     help="The ring repaired, in the same formats: the design with the settings that, loaded into "
@@ -137,7 +137,7 @@ def diagnose(
     effects: tuple[str, ...] | None,
     network: Path | None,
     lattice_out: Path | None,
-    repaired_out: Path | None,
+    corrected_out: Path | None,
     missing: bool,
     assumed: tuple[str, ...],
     json_file: Path | None,
@@ -195,7 +195,7 @@ def diagnose(
             if before:
                 _refuse(
                     "a change since a reference", missing=missing, lattice_out=lattice_out,
-                    repaired_out=repaired_out,
+                    corrected_out=corrected_out,
                 )  # fmt: skip
         else:
             _refuse("anything but an orbit response alone", missing=missing)
@@ -205,9 +205,9 @@ def diagnose(
         if options["max_effects"] is None:
             del options["max_effects"]
         options["holdout"] = (0.2 if response else 0.33) if holdout is None else holdout
-        if lattice_out and lattice_out == repaired_out:
-            raise click.UsageError(f"--lattice-out and --repaired-out are both '{lattice_out}'")
-        for option, path in (("lattice", lattice_out), ("repaired", repaired_out)):
+        if lattice_out and lattice_out == corrected_out:
+            raise click.UsageError(f"--lattice-out and --corrected-out are both '{lattice_out}'")
+        for option, path in (("lattice", lattice_out), ("corrected", corrected_out)):
             if path:
                 _check_out(ring, f"--{option}-out", path)
         where = " or ".join(str(path) for path in (*measurements, *references))
@@ -235,7 +235,7 @@ def diagnose(
         if calibrations:
             source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]
         _write(result, source, folder, extra, correction)
-        written = _write_rings(result, known, lattice_out, repaired_out)
+        written = _write_rings(result, known, lattice_out, corrected_out)
         if folder and reading:
             _write_weights(reading, folder)
     if not quiet:
@@ -338,14 +338,14 @@ def _write_rings(
     result: "Diagnosis",
     known: "Known | None",
     lattice_out: Path | None,
-    repaired_out: Path | None,
+    corrected_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:
     """The ring as found and the ring repaired: the files, with what they do not hold."""
     from tmlattice.diagnosis.twin import ESTIMATED, known_beside, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring
     from tmlattice.observe.calibration import write_calibration
-    from tmlattice.report.remedies import by_hand_text
+    from tmlattice.report.action_texts import by_hand_text
 
     written: dict[str, tuple[str, ...]] = {}
     if lattice_out:
@@ -357,7 +357,7 @@ def _write_rings(
             amounts = zip(result.causes, result.errors, strict=True)
             errors = {(c.effect, c.element): e for c, e in amounts if isfinite(e)}
             write_calibration(
-                beside, result.calibration, result.dispersion, result.rejected, errors
+                beside, result.calibration, result.dispersion, result.rejected_channels, errors
             )
             written[str(beside)] = ()
         else:  # that of the ring which stood there
@@ -368,11 +368,11 @@ def _write_rings(
             with output_file(beside) as temporary:
                 write_json(temporary, known_document(known, lattice_out))
             written[str(beside)] = ()
-    if repaired_out:
+    if corrected_out:
         ring, by_hand = result.repair()
-        told = write_ring(ring, repaired_out)
+        told = write_ring(ring, corrected_out)
         more = by_hand_text(result.ring, by_hand)
-        written[str(repaired_out)] = (*told, more) if more else told
+        written[str(corrected_out)] = (*told, more) if more else told
     return written
 
 

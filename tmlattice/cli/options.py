@@ -112,7 +112,7 @@ INPUTS = (
     "network", "files", "map_file", "estimated", "design", "goal", "knobs",
 )  # fmt: skip
 MARKS = ("monitors", "correctors", "particle")
-OUTPUTS = ("json_file", "truth", "out", "lattice_out", "repaired_out", "example_file")
+OUTPUTS = ("json_file", "truth", "out", "lattice_out", "corrected_out", "example_file")
 OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv", "tunes.csv")
 OF_FOLDERS = ("challenge.json", "options.json")
 OF_BATCHES = ("cases", "truth", "results", "oracle", "baselines")

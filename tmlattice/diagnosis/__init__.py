@@ -2,7 +2,7 @@
 
 >>> diagnosis = diagnose(ring, read_measurement("day_1"))
 >>> diagnosis.verdict
-'named'
+'identified'
 >>> diagnosis.as_json()["findings"][0]["element"]
 """
 

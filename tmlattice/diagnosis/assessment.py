@@ -26,7 +26,7 @@ of 1.2 times the expected one, more than the error of a usual noise estimate."""
 
 Remainder = Literal["noise", "above_noise", "effect_missing", "unknown"]
 GapState = Literal[
-    "not_held_out", "nothing_fitted", "no_amount", "beam_lost", "none", "closed", "share_unknown"
+    "not_held_out", "nothing_fitted", "no_amount", "beam_lost", "none", "explained", "share_unknown"
 ]
 
 
@@ -115,7 +115,7 @@ class Assessment:
     gap: GapState
     before: float
     after: float
-    closed: float | None
+    explained: float | None
     interval: tuple[float, float] | None
     series: tuple[float, ...]
     families: bool
@@ -207,7 +207,7 @@ def assess(
         gap=_gap(gap, amounts, findings, held if remainder in _UNEXPLAINED else (), false_alarm),
         before=before,
         after=after,
-        closed=None if gap is None else gap.closed,
+        explained=None if gap is None else gap.explained,
         interval=None if gap is None else gap.interval,
         series=series,
         families=families,
@@ -235,8 +235,8 @@ def _gap(
         return "beam_lost"
     if not amounts:
         return ("no_amount" if findings else "nothing_fitted") if left else "none"
-    if gap.closed is not None:
-        return "closed"
+    if gap.explained is not None:
+        return "explained"
     return "share_unknown" if gap.significant(false_alarm) else "none"
 
 
@@ -301,7 +301,7 @@ def _missing(own: Assessment) -> str:
 
 
 def _closed(own: Assessment) -> str:
-    text = f"On {_held(own)} {100 * (own.closed or 0.0):.1f} % of the gap is closed"
+    text = f"On {_held(own)} {100 * (own.explained or 0.0):.1f} % of the gap is explained"
     if own.interval is not None:
         low, high = own.interval
         text += f" (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"
@@ -336,7 +336,7 @@ STATEMENTS = (
         "verdict", "no_change",
         "verdict nothing; the findings are changes since a reference; the remainder is noise or "
         "cannot be tested",
-        lambda own: own.verdict == "nothing" and own.change
+        lambda own: own.verdict == "none" and own.change
         and own.remainder not in _UNEXPLAINED,
         lambda own: "Nothing changed since the reference beyond the usual drifts of monitors, "
         "correctors and magnets.",
@@ -346,7 +346,7 @@ STATEMENTS = (
         "verdict", "change_not_located",
         "verdict nothing; the findings are changes since a reference; the remainder is larger than "
         "the noise",
-        lambda own: own.verdict == "nothing" and own.change and own.remainder in _UNEXPLAINED,
+        lambda own: own.verdict == "none" and own.change and own.remainder in _UNEXPLAINED,
         lambda own: "No change since the reference is located, but drifts do not explain all "
         "readings within their noise.",
         ("remainder_noise",),
@@ -354,7 +354,7 @@ STATEMENTS = (
     Statement(
         "verdict", "no_error",
         "verdict nothing, no reference; the remainder is noise or cannot be tested",
-        lambda own: own.verdict == "nothing" and not own.change
+        lambda own: own.verdict == "none" and not own.change
         and own.remainder not in _UNEXPLAINED,
         lambda own: f"No error is detected: the {own.model} explains the readings within "
         "their noise.",
@@ -363,7 +363,7 @@ STATEMENTS = (
     Statement(
         "verdict", "not_located",
         "verdict nothing, no reference; the remainder is larger than the noise",
-        lambda own: own.verdict == "nothing" and not own.change and own.remainder in _UNEXPLAINED,
+        lambda own: own.verdict == "none" and not own.change and own.remainder in _UNEXPLAINED,
         lambda own: f"No error is located, but the {own.model} does not explain all readings "
         "within their noise.",
         ("remainder_noise",),
@@ -392,7 +392,7 @@ STATEMENTS = (
         lambda own: own.verdict == "distributed" and not own.small_errors and not own.families,
         lambda own: "The readings differ from the model all along the ring; no sparse set of "
         "errors explains them.",
-        ("gap_closed",),
+        ("gap_explained",),
     ),
     Statement(
         "remainder", "remainder_noise", "p-value over all blocks of readings at the false-alarm "
@@ -432,9 +432,9 @@ STATEMENTS = (
         lambda own: f"{_held(own).capitalize()} show no gap beyond the noise.",
     ),
     Statement(
-        "gap", "gap_closed", "a gap on held-out readings, five standard errors or more; the share "
-        "that is closed is determined",
-        lambda own: own.gap == "closed", _closed,
+        "gap", "gap_explained", "a gap on held-out readings, five standard errors or more; the "
+        "share that is explained is determined",
+        lambda own: own.gap == "explained", _closed,
     ),
     Statement(
         "gap", "gap_share_unknown", "a gap on held-out readings that is significant in chi²; its "

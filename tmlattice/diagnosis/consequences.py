@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
-from tmlattice.diagnosis.remedies import undone
+from tmlattice.diagnosis.recommended_actions import undone
 from tmlattice.effects import Cause, RingEffect, changed_elements, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Element, Ring
@@ -59,14 +59,14 @@ class Consequences:
 
     design: Pair | None
     found: Beam | None
-    repaired: Beam | None
+    corrected: Beam | None
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
         return {
             "design_tunes": None if self.design is None else list(self.design),
             "found": _json(self.found),
-            "repaired": _json(self.repaired),
+            "corrected": _json(self.corrected),
         }
 
 

@@ -40,7 +40,7 @@ def with_devices(found: Diagnosis, devices: Mapping[str, str]) -> Diagnosis:
     findings = tuple(
         replace(
             named(finding),
-            remedies=tuple(map(named, finding.remedies)),
+            recommended_actions=tuple(map(named, finding.recommended_actions)),
             credible_set=tuple(map(named, finding.credible_set)),
             devices={
                 name: devices[name]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.places import between
-from tmlattice.diagnosis.remedies import credible as credible_remedies
-from tmlattice.diagnosis.remedies import remedies_of, remedy_of
+from tmlattice.diagnosis.recommended_actions import credible as credible_actions
+from tmlattice.diagnosis.recommended_actions import recommended_action, recommended_actions
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
@@ -108,7 +108,7 @@ def finding_of(
         mass: that a credible set is to hold.
     """
     cause = causes[0]
-    remedies = remedies_of(ring, causes, probability, sigma)
+    actions = recommended_actions(ring, causes, probability, sigma)
     positions = [s for m in shown for s in _positions(ring, (m.effect, m.element))]
     where, near = between(ring, positions) if positions else (None, ())
     return Finding(
@@ -118,7 +118,7 @@ def finding_of(
         amount=cause.amount,
         amount_sigma=sigma,
         unit=find(cause.effect).unit,
-        probability=min(remedies[0].probability, 1.0),
+        probability=min(actions[0].probability, 1.0),
         detection=detection,
         where=where,
         near=near,
@@ -126,7 +126,7 @@ def finding_of(
             _member(ring, m, float(p)) for m, p in zip(shown, probability, strict=False)
         ),
         mass=float(probability[: len(shown)].sum()),
-        remedies=credible_remedies(remedies, mass),
+        recommended_actions=credible_actions(actions, mass),
     )
 
 
@@ -166,7 +166,7 @@ def _dead(ring: Ring, monitor: Element, amount: float) -> Finding:
         near=near,
         credible_set=(_member(ring, cause, 1.0),),
         mass=1.0,
-        remedies=remedies_of(ring, [cause], [1.0], 0.0),
+        recommended_actions=recommended_actions(ring, [cause], [1.0], 0.0),
     )
 
 
@@ -184,7 +184,12 @@ def with_consequences(
         return ()
     told = consequences(ring, faults_of(findings, causes))
     return tuple(
-        replace(f, consequences=told.get((f.remedy.effect, f.remedy.element)) if f.remedy else None)
+        replace(
+            f,
+            consequences=told.get((f.recommended_action.effect, f.recommended_action.element))
+            if f.recommended_action
+            else None,
+        )
         for f in findings
     )
 
@@ -192,7 +197,12 @@ def with_consequences(
 def _member(ring: Ring, cause: Cause, probability: float) -> Member:
     place = _middle(ring, cause.element)
     return Member(
-        cause.effect, cause.element, place, probability, cause.amount, remedy_of(ring, cause)
+        cause.effect,
+        cause.element,
+        place,
+        probability,
+        cause.amount,
+        recommended_action(ring, cause),
     )
 
 
@@ -225,7 +235,7 @@ def verdict_of(
     if explanation.full and explanation.scan.chance < judgement.false_alarm:
         many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"
         return "distributed", (), (f"{many} not explain the data",)
-    clean = "nothing" if p_value >= far_more or estimated else "distributed"
+    clean = "none" if p_value >= far_more or estimated else "distributed"
     return least_certain(findings, clean), findings, ()
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.doctor import consulted, mended
 from tmlattice.diagnosis.prepare import batch, prepare
-from tmlattice.diagnosis.stored_doctor import refused
+from tmlattice.diagnosis.stored_doctor import raise_if_wrong
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
@@ -215,7 +215,7 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
             )
         problem = make(how.ring, measured, how.places)
         if isinstance(problem, Stored):
-            refused(how.ring, measured, problem)
+            raise_if_wrong(how.ring, measured, problem)
         said = problem.said if isinstance(problem, ManyTurns) else ()
         return Part(label, kind, problem, held and make(how.ring, held, how.places), said=said)
 
@@ -229,7 +229,7 @@ def _alone(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]
         _check_assumed(label, kind, how)
         problem = make(how.ring, measured, how.places)
         if isinstance(problem, Stored):
-            refused(how.ring, measured, problem)
+            raise_if_wrong(how.ring, measured, problem)
         return Part(label, kind, problem)
 
     return made

@@ -18,10 +18,10 @@ from tmlattice.diagnosis.assessment import Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.remedies import element_kind
+from tmlattice.diagnosis.recommended_actions import element_kind
 from tmlattice.diagnosis.response.dense import Step
+from tmlattice.diagnosis.response.inconsistencies import Inconsistency
 from tmlattice.diagnosis.response.missing import Weighed
-from tmlattice.diagnosis.response.pulled_apart import PulledApart
 from tmlattice.diagnosis.response.reasons import Instead, Reasons
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.support import Support
@@ -33,7 +33,7 @@ from tmlattice.inference.judge import Gap, Misfit
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.measurement.documents import read_document
 
-FORMAT = "tmlattice-diagnosis"
+FORMAT, VERSION = "tmlattice-diagnosis", 2
 DOCUMENT, LATTICE = "diagnosis.json", "diagnosis.lattice.json"
 """Of a folder of `save`: the result, and the lattice that it is about."""
 
@@ -66,7 +66,7 @@ def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diag
     """
     place = Path(path)
     file = place / DOCUMENT if place.is_dir() else place
-    document = read_document(file, "diagnosis", FORMAT)
+    document = read_document(file, "diagnosis", FORMAT, VERSION)
     ring = _ring(file, document) if ring is None else ring
     places = {name for e in ring.elements for name in (e.name, e.family)}
     for row in document["errors"]:
@@ -112,7 +112,7 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
         noise_estimated=noise["estimated"],
         provenance=d["provenance"],
         ring=ring,
-        repaired=apply(ring, [cause for cause in causes if _in_ring(cause)]),
+        corrected=apply(ring, [cause for cause in causes if _in_ring(cause)]),
         causes=causes,
         errors=tuple(decoded(float, row["amount_sigma"]) for row in d["errors"]),
         view=StoredView(
@@ -121,18 +121,18 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
             tuple(d["assessment"]["measured"]),
             (gap["heldout"] or {}).get("correctors"),
         ),
-        left_out=tuple(d["left_out"]),
+        outliers=tuple(d["outliers"]),
         steps=decoded(tuple[Step, ...], d["steps"]),
-        refused=decoded(tuple[Step, ...], d["refused"]),
+        rejected_steps=decoded(tuple[Step, ...], d["rejected_steps"]),
         bad_monitors=tuple(d["bad_monitors"]),
         priors=d["priors"],
         prior_errors={name: decoded(float, value) for name, value in d["prior_errors"].items()},
         degenerate=tuple(d["degenerate"]),
         reasons=decoded(Reasons | None, d["reasons"]),
-        pulled_apart=decoded(PulledApart | None, d["pulled_apart"]),
+        inconsistencies=decoded(Inconsistency | None, d["inconsistencies"]),
         hypotheses=decoded(tuple[Weighed, ...] | None, d["hypotheses"]),
         suspects=decoded(tuple[Suspect, ...], d["suspects"]),
-        rejected=tuple((row["element"], row["plane"]) for row in d["rejected"]),
+        rejected_channels=tuple((r["element"], r["plane"]) for r in d["rejected_channels"]),
         compared=decoded(tuple[Block, ...], d["assessment"]["blocks"]),
         correlations=decoded(tuple[Correlation, ...], d["correlations"]),
         devices=d.get("devices", {}),
@@ -147,9 +147,10 @@ def _in_ring(cause: Cause) -> bool:
 
 
 def _finding(row: Mapping[str, Any], ring: Ring) -> Finding:
-    stated = [row["remedy"], *row["or_remedies"]] if row["remedy"] is not None else []
-    remedies = [{**own, "kind": element_kind(ring, own["element"])} for own in stated]
-    found: Finding = decoded(Finding, {**row, "remedies": remedies})
+    first = row["recommended_action"]
+    stated = [] if first is None else [first, *row["alternative_actions"]]
+    actions = [{**own, "kind": element_kind(ring, own["element"])} for own in stated]
+    found: Finding = decoded(Finding, {**row, "recommended_actions": actions})
     return found
 
 
@@ -165,8 +166,8 @@ def _gap(gap: Mapping[str, Any]) -> Gap | None:
     return Gap(
         decoded(tuple[Misfit, ...], held["steps"]),
         np.zeros((0, 0, 0)),
-        gap["closed"],
-        decoded(tuple[float, float] | None, gap["closed_interval"]),
+        gap["explained"],
+        decoded(tuple[float, float] | None, gap["explained_interval"]),
         held["since"],
         held["readings"],
         held["lost"],

@@ -19,7 +19,7 @@ from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis.findings import credible
 from tmlattice.diagnosis.kinds import How
 from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement
-from tmlattice.diagnosis.remedies import remedy_of
+from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.effects import Cause, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.among import Among, small_errors_of
@@ -63,12 +63,14 @@ ROOM = 2**26
 
 
 def leading(ring: Ring, explanation: Explanation, mass: float) -> tuple[Rival, Rival] | None:
-    """The first finding's likeliest explanation, and the likeliest one that another remedy takes
-    away: which of two mechanisms with one remedy it is changes nothing."""
+    """The first finding's likeliest explanation, and the likeliest one that another action takes
+    away: which of two mechanisms with one recommended action it is changes nothing."""
     for named in explanation.named:
         first, *others = credible(named.rivals, mass)[0]
-        done = remedy_of(ring, first.cause)
-        other = next((rival for rival in others if remedy_of(ring, rival.cause) != done), None)
+        done = recommended_action(ring, first.cause)
+        other = next(
+            (rival for rival in others if recommended_action(ring, rival.cause) != done), None
+        )
         if other is not None:
             return first, other
     return None

@@ -296,6 +296,6 @@ def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
     lost = dropped[data.active].all(axis=0)
     never = np.asarray(lost | ~data.valid[data.active].any(axis=0))
     readings = min(len(never), other.valid.shape[1])
-    left_out = np.zeros(other.valid.shape, dtype=bool)
-    left_out[:, :readings] = never[None, :readings]
-    return other.without(left_out)
+    outliers = np.zeros(other.valid.shape, dtype=bool)
+    outliers[:, :readings] = never[None, :readings]
+    return other.without(outliers)

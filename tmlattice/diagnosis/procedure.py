@@ -26,7 +26,9 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
-from tmlattice.diagnosis.left_out import (
+from tmlattice.diagnosis.next_kind import leading, next_kind
+from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
+from tmlattice.diagnosis.outliers import (
     about_launches,
     about_rejected,
     noise_text,
@@ -34,8 +36,6 @@ from tmlattice.diagnosis.left_out import (
     spikes,
     with_silent,
 )
-from tmlattice.diagnosis.next_kind import leading, next_kind
-from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.stages import (
@@ -243,7 +243,7 @@ def _told(
     findings = findings_of(ring, found, dead, judgement)
     fitted = Block("fitted readings", result.chi2, freedom(found.problem, result))
     verdict, findings, said = verdict_of(found, findings, fitted.p_value, estimated, judgement)
-    if verdict == "nothing" and small is not None and small.errors and problem.alone:
+    if verdict == "none" and small is not None and small.errors and problem.alone:
         verdict = "distributed"  # the gap has a cause: many small ones; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
         said = (*said, f"the amounts are not settled: {result.outcome.value}")
@@ -257,24 +257,24 @@ def _told(
     aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
     turns = parts[0] if parts[0].hypotheses is not None and len(parts) == 1 else None
-    left_out: tuple[dict[str, Any], ...] = ()
+    rejected: tuple[dict[str, Any], ...] = ()
     if turns is None:
         heldout = held_out(parts, problem.fixed, stages, aside, since)
         # what small errors leave undetermined is not in the errors of held-out readings
         compared = compared_of(fitted, heldout if small is None else None)
         told = (f"{part.label}: {one}" for part in parts for one in part.said)
-        outliers = list(spikes(parts, problem, found))
+        notes = list(spikes(parts, problem, found))
     else:
         heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
         told = (one for one in turns.said)
-        left_out = rejected_readings(turns, found)
-        outliers = about_rejected(left_out)
+        rejected = rejected_readings(turns, found)
+        notes = about_rejected(rejected)
         if turns.estimated:
-            outliers.append(noise_text(_noise(parts)))
-        outliers += about_launches(turns, findings)
-    warnings = [*told, *outliers, *said, *too_large(stages)]
-    repaired = apply(ring, causes)
+            notes.append(noise_text(_noise(parts)))
+        notes += about_launches(turns, findings)
+    warnings = [*told, *notes, *said, *too_large(stages)]
+    corrected = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     return Diagnosis(
         verdict=verdict,
@@ -300,17 +300,17 @@ def _told(
             combined_p_value(compared),
             judgement,
         ),
-        tunes={"before": ring_tunes(ring), "after": ring_tunes(repaired)},
+        tunes={"before": ring_tunes(ring), "after": ring_tunes(corrected)},
         next=_next(ring, found, parts, how, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),
         warnings=tuple(dict.fromkeys(warnings)),
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
-        left_out=left_out,
+        outliers=rejected,
         noise=_noise(parts),
         noise_estimated=estimated,
         provenance={"package": __version__, "lattice": ring.name, "measurement": None, **made},
         ring=ring,
-        repaired=repaired,
+        corrected=corrected,
         causes=causes,
         errors=tuple(errors.tolist()),
         priors={} if small is None else dict(small.sizes),

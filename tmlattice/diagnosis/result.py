@@ -13,7 +13,7 @@ from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
-from tmlattice.diagnosis.remedies import Remedy, undone
+from tmlattice.diagnosis.recommended_actions import RecommendedAction, undone
 from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
 from tmlattice.diagnosis.support import FREE, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
@@ -35,8 +35,8 @@ from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis.response.dense import Step
+    from tmlattice.diagnosis.response.inconsistencies import Inconsistency
     from tmlattice.diagnosis.response.missing import Weighed
-    from tmlattice.diagnosis.response.pulled_apart import PulledApart
     from tmlattice.diagnosis.response.reasons import Reasons
     from tmlattice.diagnosis.suspects import Suspect
 
@@ -48,7 +48,7 @@ _MEASURES = {
 }
 """Quantities of the stored beam that a kind of measurement holds."""
 
-VERDICTS = ("named", "equivalent", "located", "distributed", "nothing")
+VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
 """From the most certain to the least."""
 
 
@@ -60,7 +60,7 @@ class Member:
         effect, element, amount: see `Cause`.
         s: middle of the element, m.
         probability: of this explanation alone.
-        remedy: what takes it away, in words.
+        recommended_action: what takes it away, in words.
         device: what the control system calls the element; None: unknown.
     """
 
@@ -69,7 +69,7 @@ class Member:
     s: float | None
     probability: float
     amount: float
-    remedy: str
+    recommended_action: str
     device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
@@ -87,14 +87,14 @@ class Finding(ShownFinding):
         s: middle of the element, m from the start of the sequence.
         amount, amount_sigma: in the effect's unit.
         unit: of the amount.
-        probability: of its remedy, given that one of the catalogue is there.
+        probability: of its recommended action, given that one of the catalogue is there.
         detection: how clearly it was seen.
         where: from the last monitor before to the first one behind all members of the set, m.
         near: the names of those monitors.
         credible_set: explanations that the data do not exclude, the first is this finding.
         mass: the sum of their probabilities.
-        remedies: what takes it away, then what else might, until they hold the mass of a credible
-            set; empty without an effect.
+        recommended_actions: what takes it away, then what else might, until they hold the mass of
+            a credible set; empty without an effect.
         consequences: what it does to the stored beam, and what is left of that after the repair.
         seen_by: share of each measurement in what is known of its amount, where there are several.
         words, to_check, elements: what it is, what to look at, and which elements it is of, where
@@ -115,7 +115,7 @@ class Finding(ShownFinding):
     near: tuple[str, ...]
     credible_set: tuple[Member, ...]
     mass: float
-    remedies: tuple[Remedy, ...] = ()
+    recommended_actions: tuple[RecommendedAction, ...] = ()
     consequences: Consequences | None = None
     seen_by: Mapping[str, float] | None = None
     words: str = ""
@@ -133,13 +133,13 @@ class Finding(ShownFinding):
     def verdict(self) -> str:
         """Of this finding alone: `equivalent` where places or actions differ."""
         if self.effect is None:
-            return "located"
-        return "named" if len(self.remedies) == 1 else "equivalent"
+            return "localised"
+        return "identified" if len(self.recommended_actions) == 1 else "ambiguous"
 
     @property
-    def remedy(self) -> Remedy | None:
+    def recommended_action(self) -> RecommendedAction | None:
         """What takes it away."""
-        return self.remedies[0] if self.remedies else None
+        return self.recommended_actions[0] if self.recommended_actions else None
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
@@ -166,8 +166,12 @@ class Finding(ShownFinding):
             "near": list(self.near),
             "credible_set": [member.as_json() for member in self.credible_set],
             "mass": self.mass,
-            "remedy": None if self.remedy is None else self.remedy.as_json(),
-            "or_remedies": [remedy.as_json() for remedy in self.remedies[1:]],
+            "recommended_action": None
+            if self.recommended_action is None
+            else self.recommended_action.as_json(),
+            "alternative_actions": [
+                recommended_action.as_json() for recommended_action in self.recommended_actions[1:]
+            ],
             "consequences": None if self.consequences is None else self.consequences.as_json(),
             **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
             **(told if self.words else {}),
@@ -182,8 +186,12 @@ def _device(name: str | None) -> dict[str, str]:
 
 
 def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
-    """The causes, those of findings as their remedies name them."""
-    named = {(f.effect, f.element): f.remedy.cause for f in findings if f.remedy is not None}
+    """The causes, those of findings as their recommended actions name them."""
+    named = {
+        (f.effect, f.element): f.recommended_action.cause
+        for f in findings
+        if f.recommended_action is not None
+    }
     return tuple(named.get((cause.effect, cause.element), cause) for cause in causes)
 
 
@@ -250,23 +258,23 @@ class Diagnosis(ShownDiagnosis):
     noise_estimated: bool
     provenance: dict[str, Any]
     ring: Ring = field(repr=False)
-    repaired: Ring = field(repr=False)
+    corrected: Ring = field(repr=False)
     causes: tuple[Cause, ...]
     errors: tuple[float, ...]
     view: TrajectoryView | ResponseView | JointView | StoredView = field(repr=False)
-    left_out: tuple[dict[str, Any], ...] = ()
+    outliers: tuple[dict[str, Any], ...] = ()
     steps: "tuple[Step, ...]" = ()
-    refused: "tuple[Step, ...]" = ()
+    rejected_steps: "tuple[Step, ...]" = ()
     bad_monitors: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
     prior_errors: Mapping[str, float] = field(default_factory=dict)
     degenerate: tuple[str, ...] = ()
     reasons: "Reasons | None" = None
-    pulled_apart: "PulledApart | None" = None
+    inconsistencies: "Inconsistency | None" = None
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
     dispersion: Dispersion = field(default_factory=dict, repr=False)
-    rejected: tuple[tuple[str, str | None], ...] = ()
+    rejected_channels: tuple[tuple[str, str | None], ...] = ()
     compared: tuple[Block, ...] = ()
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
@@ -280,7 +288,7 @@ class Diagnosis(ShownDiagnosis):
 
     @cached_property
     def assessment(self) -> Assessment:
-        """Whether the remainder is noise, a gap is closed, an effect is missing: each once."""
+        """Whether the remainder is noise, a gap is explained, an effect is missing: each once."""
         options = self.provenance["options"]
         return assess(
             self.verdict,
@@ -291,7 +299,7 @@ class Diagnosis(ShownDiagnosis):
             places=self.unexplained["places"],
             noise_estimated=self.noise_estimated,
             families=self.by_steps,
-            rejected=[step.effect for step in self.refused],
+            rejected=[step.effect for step in self.rejected_steps],
             small_errors=bool(self.priors) and not self.by_steps,
             reference=bool(options.get("reference")),
             change=self.since_reference,
@@ -428,7 +436,7 @@ class Diagnosis(ShownDiagnosis):
 
     @property
     def faults(self) -> tuple[Cause, ...]:
-        """The causes, those of findings as their remedies name them: a thin gradient that explains
+        """The causes, those of findings as their actions name them: a thin gradient that explains
         a quadrupole's is the quadrupole's own."""
         return faults_of(self.findings, self.causes)
 
@@ -436,13 +444,13 @@ class Diagnosis(ShownDiagnosis):
     def as_found(self) -> Ring:
         """The design with the faults in it: the machine as it is."""
         faults = self.faults
-        return self.repaired if faults == self.causes else apply(self.ring, faults)
+        return self.corrected if faults == self.causes else apply(self.ring, faults)
 
     def repair(self) -> tuple[Ring, tuple[Cause, ...]]:
         """The design with the settings that take the faults away, and what settings do not mend.
 
         Loaded into the machine as it was found, these settings make it the design again: see
-        `remedies.undone`.
+        `recommended_actions.undone`.
         """
         return undone(self.ring, self.faults)
 
@@ -480,8 +488,8 @@ class Diagnosis(ShownDiagnosis):
             },
             "fit": both(self.fit_before, self.fit_after),
             "heldout": heldout,
-            "closed": None if gap is None else gap.closed,  # null where nothing was put in
-            "closed_interval": interval,
+            "explained": None if gap is None else gap.explained,  # null where nothing was put in
+            "explained_interval": interval,
         }
 
     def as_json(self) -> dict[str, Any]:
@@ -491,16 +499,18 @@ class Diagnosis(ShownDiagnosis):
         weighed = self.hypotheses
         return {
             "format": "tmlattice-diagnosis",
-            "version": 1,
+            "version": 2,
             "package": __version__,
             "kind": self.kind,
             "model": self.ring.model,
             "verdict": self.verdict,
             "findings": [finding.as_json() for finding in self.findings],
             "steps": [step.as_json() for step in self.steps],
-            "refused": [step.as_json() for step in self.refused],
+            "rejected_steps": [step.as_json() for step in self.rejected_steps],
             "bad_monitors": list(self.bad_monitors),
-            "rejected": [{"element": name, "plane": plane} for name, plane in self.rejected],
+            "rejected_channels": [
+                {"element": name, "plane": plane} for name, plane in self.rejected_channels
+            ],
             "degenerate": list(self.degenerate),
             "priors": dict(self.priors),
             "prior_errors": dict(self.prior_errors),
@@ -517,7 +527,9 @@ class Diagnosis(ShownDiagnosis):
             ],
             "correlations": [pair.as_json() for pair in self.correlations],
             "reasons": None if self.reasons is None else self.reasons.as_json(),
-            "pulled_apart": None if self.pulled_apart is None else self.pulled_apart.as_json(),
+            "inconsistencies": None
+            if self.inconsistencies is None
+            else self.inconsistencies.as_json(),
             "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
             **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
             "assessment": self.assessment.as_json(),
@@ -528,7 +540,7 @@ class Diagnosis(ShownDiagnosis):
             "next_measurement": None if self.next is None else self.next.as_json(),
             "sensitivity": self.sensitivity,
             "warnings": list(self.warnings),
-            "left_out": [dict(row) for row in self.left_out],
+            "outliers": [dict(row) for row in self.outliers],
             **({"devices": dict(self.devices)} if self.devices else {}),
             "provenance": self.provenance,
         }

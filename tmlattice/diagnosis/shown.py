@@ -59,11 +59,11 @@ class ShownDiagnosis(Speaks):
 
     def _told(self) -> tuple[str, dict[str, str]]:
         own: Any = self  # its attributes are the dataclass's
-        closed = None if own.heldout is None else own.heldout.closed
+        explained = None if own.heldout is None else own.heldout.explained
         rows = {"of": f"{own.kind} of {last_part(own.ring.name)}"}
         for number, finding in enumerate(own.findings[:MOST], 1):
             rows[f"finding {number}"] = finding.in_short
         if len(own.findings) > MOST:
             rows["and"] = f"{len(own.findings) - MOST} more"
-        rows["gap closed"] = "" if closed is None else f"{100 * closed:.1f} %"
+        rows["gap explained"] = "" if explained is None else f"{100 * explained:.1f} %"
         return own.verdict, rows

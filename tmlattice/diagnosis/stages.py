@@ -192,7 +192,7 @@ def held_out(
     gap = Gap(tuple(misfits), np.zeros((0, 0, 0)), None, None, since, readings)
     before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
     if before > GAP and since < len(misfits) - 1 and gap.significant(DEFAULT.false_alarm):
-        return replace(gap, closed=1 - after / before)
+        return replace(gap, explained=1 - after / before)
     return gap
 
 

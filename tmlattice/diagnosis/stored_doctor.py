@@ -100,7 +100,7 @@ WHOLE = [*SIGNS, *UNITS, EXCHANGED]
 """What an orbit's change tells."""
 
 
-def refused(ring: Ring, data: StoredData, problem: Stored) -> None:
+def raise_if_wrong(ring: Ring, data: StoredData, problem: Stored) -> None:
     """Whether something is wrong everywhere that can be undone: no diagnosis means anything then.
 
     Raises:

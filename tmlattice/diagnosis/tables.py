@@ -78,7 +78,9 @@ def _findings(diagnosis: Diagnosis) -> Any:
             "sigma": finding.amount_sigma,
             "statistic": finding.detection.statistic,
             "p_value": finding.detection.p_value,
-            "action": finding.words if finding.remedy is None else finding.remedy.action,
+            "action": finding.words
+            if finding.recommended_action is None
+            else finding.recommended_action.action,
             **dict(zip(("s_from", "s_to"), finding.where or (np.nan, np.nan), strict=True)),
         }
         rows.append({name: row[name] for name in columns})
@@ -111,7 +113,7 @@ def _errors(diagnosis: Diagnosis) -> Any:
 def _of_kind(diagnosis: Diagnosis, which: str) -> Any:
     """All elements of a kind with what was fitted to them."""
     own = [e for e in diagnosis.ring.elements if e.kind in _KINDS[which]]
-    rejected = {name: plane or "xy" for name, plane in diagnosis.rejected}
+    rejected = {name: plane or "xy" for name, plane in diagnosis.rejected_channels}
     rejected |= dict.fromkeys(diagnosis.bad_monitors, "xy")
     rows = {
         e.name: {"element": e.name, "device": diagnosis.devices.get(e.name), "s": e.s,
@@ -158,7 +160,7 @@ def _optics(diagnosis: Diagnosis) -> Any:
 def _steps(diagnosis: Diagnosis) -> Any:
     kept = [(step, True) for step in diagnosis.steps]
     rows = [step.as_json() | {"kept": own} for step, own in
-            [*kept, *((step, False) for step in diagnosis.refused)]]  # fmt: skip
+            [*kept, *((step, False) for step in diagnosis.rejected_steps)]]  # fmt: skip
     columns = [
         "effect", "parameters", "kept", "heldout_rms_in_plane", "heldout_rms_position",
         "heldout_rms_coupling", "heldout_rms_roll", "heldout_chi2_per_dof", "dispersion_rms",

@@ -28,7 +28,7 @@ class EnergyOffset(LaunchEffect):
     unit = "relative"
     sign = "p += amount: of the launch, common to all shots, or of a response's closed orbit"
     quantity = "energy deviation"
-    remedy = "match the energy of the beam to the ring"
+    recommended_action = "match the energy of the beam to the ring"
     to_check = (
         "Compare the injector's energy, or of a stored beam the frequency of the RF, with the "
         "field of the ring's bends, which all may be off by as much the other way."
@@ -55,7 +55,7 @@ class EnergySpread(LaunchEffect):
     unit = "relative"
     sign = "rms of the particles' relative energy deviation"
     quantity = "energy spread"
-    remedy = "reduce the energy spread of the beam, or take it into the model"
+    recommended_action = "reduce the energy spread of the beam, or take it into the model"
     to_check = "Measure the injector's energy spread; look at its RF phases."
     largest = 3e-3
     power = 2

@@ -28,7 +28,7 @@ class DipoleField(_OnBend):
     unit = "relative"
     sign = "px -= angle x amount: a stronger field bends towards the inside"
     quantity = "field"
-    remedy = "set or repair the field of {}"
+    recommended_action = "set or repair the field of {}"
     to_check = (
         "Read back the current of its supply and of its trim winding; look for a shorted turn."
     )
@@ -57,7 +57,7 @@ class DipoleRoll(_OnBend):
     unit = "rad"
     sign = "kick (amount^2 angle / 2, -amount angle)"
     quantity = "roll"
-    remedy = "turn {} upright"
+    recommended_action = "turn {} upright"
     to_check = "Measure its roll with a level or the survey; look at its supports."
     background = 2e-4
     largest = 5e-3
@@ -84,7 +84,7 @@ class BendGradient(_OnBend):
     unit = "1/m2"
     sign = "k1 becomes k1 + amount, over the whole body"
     quantity = "additional gradient"
-    remedy = "correct the gradient of {}"
+    recommended_action = "correct the gradient of {}"
     to_check = (
         "Compare its gradient and its edges in the lattice file with what was measured; look for a "
         "beam that passes beside its axis."

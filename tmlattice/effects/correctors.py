@@ -20,7 +20,7 @@ class _Kick(_OnCorrector):
     headline = True
     unit = "rad"
     largest = 2e-4
-    remedy = "take the kick of {} away"
+    recommended_action = "take the kick of {} away"
     to_check = (
         "Read back its current at setting zero: an offset of the supply, a setting that was not "
         "recorded, a stray field beside it, or a neighbour that bends wrongly."
@@ -72,7 +72,7 @@ class CorrectorCalibration(_OnCorrector, StrengthEffect):
     unit = "relative"
     sign = "kick = (1 + amount) x setting; -2 is a reversed one"
     quantity = "calibration"
-    remedy = "calibrate {}"
+    recommended_action = "calibrate {}"
     to_check = (
         "Step its setting and read back its current; near -200 % its cables are exchanged, near "
         "-100 % it is off, or kicks in the other plane where that was not read."
@@ -94,7 +94,7 @@ class CorrectorRoll(_OnCorrector, ErrorEffect):
     unit = "rad"
     sign = "positive turns the kick from x towards y"
     quantity = "roll"
-    remedy = "turn {} upright"
+    recommended_action = "turn {} upright"
     to_check = "Measure its roll; look whether its two planes' cables are mixed up."
     background = 1e-2
     largest = 0.1
@@ -112,7 +112,7 @@ class CorrectorPosition(_OnCorrector, ErrorEffect):
     unit = "m"
     sign = "positive is further down: the kick comes so much later"
     quantity = "place along the beam"
-    remedy = "enter the place of the field of {} into the lattice"
+    recommended_action = "enter the place of the field of {} into the lattice"
     to_check = "Measure where it stands; iron beside it draws its field away."
     largest = 0.1
     usual = False  # in responses, where a family of it is fitted, or where somebody names it

@@ -63,8 +63,8 @@ class Effect(ABC):
         whole: its amounts on a machine are whole numbers; a fit finds what is near to one.
         responds: a closed orbit's response to a corrector sees it alone, to first order.
         multiplies: two amounts at one place act as (1 + a)(1 + b); else they add up.
-        quantity: what the amount is of, as a remedy says it ("integrated gradient"); else `words`.
-        remedy: what takes it away, of the element's name in {}: "turn {} upright".
+        quantity: what the amount is of, as a action says it ("integrated gradient"); else `words`.
+        recommended_action: what takes it away, of the element's name in {}: "turn {} upright".
         to_check: what to look at on the machine, one sentence.
         natural: no fault: known physics that the model leaves out, and nothing is to be repaired.
         odds: how often it is the fault where it stands for itself (see `stands_for`), beside an
@@ -96,7 +96,7 @@ class Effect(ABC):
     responds: ClassVar[bool] = False
     multiplies: ClassVar[bool] = False
     quantity: ClassVar[str] = ""
-    remedy: ClassVar[str] = "find out what acts at {}"
+    recommended_action: ClassVar[str] = "find out what acts at {}"
     to_check: ClassVar[str] = "Look at what stands there, and at what its record says."
     natural: ClassVar[bool] = False
     odds: ClassVar[float] = 1.0
@@ -111,9 +111,9 @@ class Effect(ABC):
         """The elements, or families, that it can sit on, in beam order; [None] for the beam."""
 
     def stands_for(self, element: Element) -> tuple[str, float]:
-        """The effect whose remedy takes this one away too, and its amount for 1 of this one.
+        """The effect whose action takes this one away too, and its amount for 1 of this one.
 
-        At one element two effects share a remedy where the same adjustment of the element takes
+        At one element two effects share a action where the same adjustment of the element takes
         both away, to first order in the beam's place: a thin gradient in a quadrupole is undone by
         the quadrupole's own gradient. Most stand for themselves.
         """

@@ -18,7 +18,7 @@ class InsertionDeviceFocusing(ErrorEffect):
     unit = "1/m"
     sign = "integrated gradient k1 L, thin, at the entrance: px -= amount x, py += amount y"
     quantity = "additional integrated gradient"
-    remedy = "correct the focusing of {}"
+    recommended_action = "correct the focusing of {}"
     to_check = (
         "Read its gap and its end coils; compare the focusing in the lattice file with the one "
         "measured, and make it good with the quadrupoles beside it."
@@ -46,7 +46,7 @@ class VerticalFocusing(ThinKickEffect):
     sign = "thin, in the middle: py -= amount y"
     slopes = (0.0, 0.0, 0.0, -1.0)
     quantity = "integrated vertical focusing"
-    remedy = "make the vertical focusing at {} good"
+    recommended_action = "make the vertical focusing at {} good"
     to_check = (
         "Read the gap of the insertion device that stands there, and make its focusing good with "
         "the quadrupoles beside it; of a dipole, compare edge angles and fringe integrals with the "

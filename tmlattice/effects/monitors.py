@@ -15,7 +15,7 @@ class _Offset(ReadingEffect):
     headline = True
     unit = "m"
     sign = "reading minus beam"
-    remedy = "correct the zero of {}"
+    recommended_action = "correct the zero of {}"
     to_check = (
         "Find its zero by steering the beam through the middle of the quadrupole beside it; look "
         "for a lost offset in its electronics."
@@ -59,7 +59,7 @@ class _Gain(ReadingEffect):
     multiplies = True
     headline = True
     calibrates = True
-    remedy = "calibrate {}"
+    recommended_action = "calibrate {}"
     to_check = (
         "Look at its attenuators, gains and cables; near -200 % two cables of the plane are "
         "exchanged, near -100 % a signal is lost."
@@ -111,7 +111,7 @@ class MonitorRoll(ReadingEffect):
     responds = True
     words = "monitor rolled about the beam axis"
     quantity = "roll"
-    remedy = "turn {} upright, or its readings"
+    recommended_action = "turn {} upright, or its readings"
     to_check = "Measure its roll, and look at how its pick-ups are mounted."
     calibrates = True
     unit = "rad"
@@ -137,7 +137,7 @@ class MonitorCoupling(ReadingEffect):
     responds = True
     words = "monitor that mixes its planes"
     quantity = "coupling of its planes"
-    remedy = "calibrate the electronics of {}"
+    recommended_action = "calibrate the electronics of {}"
     to_check = "Measure crosstalk between its channels; compare the gains of its four buttons."
     calibrates = True
     unit = "relative"
@@ -162,7 +162,7 @@ class MonitorSwap(ReadingEffect):
     responds = True
     words = "monitor with its planes exchanged"
     quantity = "planes exchanged"
-    remedy = "exchange the cables of {}"
+    recommended_action = "exchange the cables of {}"
     to_check = "Follow its cables from the pick-ups to the electronics: x and y are exchanged."
     calibrates = True
     unit = "discrete"
@@ -186,7 +186,7 @@ class MonitorTurnOffset(ReadingEffect):
     name = "monitor_turn_offset"
     words = "monitor that counts its turns off"
     quantity = "count of turns"
-    remedy = "set the turn count of {}"
+    recommended_action = "set the turn count of {}"
     to_check = "Look at its trigger and at the delay of its turn clock."
     unit = "turns"
     sign = "what it calls turn t is the beam's turn t + amount"
@@ -212,7 +212,7 @@ class MonitorDead(ReadingEffect):
     name = "monitor_dead"
     words = "dead monitor"
     quantity = "readings"
-    remedy = "repair {}"
+    recommended_action = "repair {}"
     to_check = "Look at its cables, power and electronics, and whether its data are refreshed."
     calibrates = True
     modelled = False

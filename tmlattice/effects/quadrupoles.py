@@ -32,7 +32,7 @@ class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
     unit = "relative"
     sign = "k1 becomes (1 + amount) k1"
     quantity = "integrated gradient"
-    remedy = "set or repair the gradient of {}"
+    recommended_action = "set or repair the gradient of {}"
     to_check = (
         "Read back the current of its supply, and compare setting, calibration and cabling; then "
         "look for a shorted turn or a wrong tap."
@@ -62,7 +62,7 @@ class GradientAbsolute(_Gradient, ErrorEffect):
     words = "focusing error (quadrupole field) in the middle of an element"
     error = "k1l"
     quantity = "additional integrated gradient"
-    remedy = "take the quadrupole field at {} away"
+    recommended_action = "take the quadrupole field at {} away"
     to_check = (
         "Look for a quadrupole field that the model has not: a shorted turn, a trim winding, iron "
         "beside the beam, or a neighbour whose gradient is wrong."
@@ -96,7 +96,7 @@ class SkewGradient(_Gradient, ErrorEffect):
     words = "skew quadrupole field in the middle of an element"
     error = "k1sl"
     quantity = "integrated skew gradient"
-    remedy = "take the skew quadrupole field at {} away"
+    recommended_action = "take the skew quadrupole field at {} away"
     to_check = (
         "Look for a skew quadrupole that is powered, a magnet that has turned, or iron that stands "
         "on one side of the beam."
@@ -126,7 +126,7 @@ class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
     unit = "rad"
     sign = "positive turns the magnet's x axis towards y"
     quantity = "roll"
-    remedy = "turn {} upright"
+    recommended_action = "turn {} upright"
     to_check = (
         "Measure its roll with a level or the survey; if it stands upright, look for a skew field: "
         "poles powered unevenly."
@@ -146,7 +146,7 @@ class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
     unit = "m"
     sign = "x of the magnet's centre"
     quantity = "horizontal displacement"
-    remedy = "move {} back horizontally"
+    recommended_action = "move {} back horizontally"
     to_check = "Survey its horizontal position against its neighbours; look at its supports."
     background = 1e-4
     largest = 2e-3
@@ -163,7 +163,7 @@ class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
     unit = "m"
     sign = "y of the magnet's centre"
     quantity = "vertical displacement"
-    remedy = "move {} back vertically"
+    recommended_action = "move {} back vertically"
     to_check = "Survey its height against its neighbours; look at its supports and its girder."
     background = 1e-4
     largest = 2e-3
@@ -180,7 +180,7 @@ class FamilyGradient(_OnQuadrupole, FamilyEffect):
     unit = "relative"
     sign = "k1 of every member becomes (1 + amount) k1"
     quantity = "integrated gradient of every member"
-    remedy = "set or repair the supply of the family {}"
+    recommended_action = "set or repair the supply of the family {}"
     to_check = (
         "Read back the current of the family's common supply with a second instrument; compare its "
         "setting with the lattice file."

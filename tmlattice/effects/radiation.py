@@ -54,7 +54,7 @@ class _Loss(RingEffect):
     unit = "scale"
     sign = "0: no loss, 1: the expected loss; adds to what the model has"
     largest = 1.2
-    remedy = "let the model radiate"
+    recommended_action = "let the model radiate"
     to_check = "Nothing at the machine: diagnose again with --radiation."
     natural = True
     kind: str

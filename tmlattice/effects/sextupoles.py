@@ -30,7 +30,7 @@ class SextupoleStrength(_OnSextupole, StrengthEffect):
     unit = "relative"
     sign = "k2 becomes (1 + amount) k2; -2 is a reversed one"
     quantity = "integrated strength"
-    remedy = "set or repair the strength of {}"
+    recommended_action = "set or repair the strength of {}"
     to_check = (
         "Read back the current of its supply; near -200 % its cables are exchanged, near -100 % it "
         "is off."
@@ -51,7 +51,7 @@ class SextupoleOffsetX(_OnSextupole, ErrorEffect):
     unit = "m"
     sign = "x of the magnet's centre"
     quantity = "horizontal displacement"
-    remedy = "move {} back horizontally"
+    recommended_action = "move {} back horizontally"
     to_check = "Survey its horizontal position against the quadrupoles beside it."
     background = 1e-4
     largest = 3e-3
@@ -69,7 +69,7 @@ class SextupoleOffsetY(_OnSextupole, ErrorEffect):
     unit = "m"
     sign = "y of the magnet's centre"
     quantity = "vertical displacement"
-    remedy = "move {} back vertically"
+    recommended_action = "move {} back vertically"
     to_check = "Survey its height against the quadrupoles beside it."
     background = 1e-4
     largest = 3e-3
@@ -86,7 +86,7 @@ class FamilySextupole(_OnSextupole, FamilyEffect):
     unit = "relative"
     sign = "k2 of every member becomes (1 + amount) k2; -2 reverses them"
     quantity = "integrated strength of every member"
-    remedy = "set or repair the supply of the family {}"
+    recommended_action = "set or repair the supply of the family {}"
     to_check = (
         "Read back the current of the family's common supply with a second instrument; compare its "
         "setting with the lattice file."

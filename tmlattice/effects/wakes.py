@@ -9,7 +9,7 @@ class _WakeKick(ThinKickEffect):
     unit = "1/m"
     largest = 0.03
     sits_on_text = "cavities, wigglers and their narrow chambers, markers (collimators, tapers)"
-    remedy = "find what drives the wake field at {}"
+    recommended_action = "find what drives the wake field at {}"
     to_check = "Repeat at another charge: a wake field grows with it; look at the chamber there."
     usual = False  # a pulse that is injected to be threaded is too weak for it
 

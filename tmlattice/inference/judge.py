@@ -122,7 +122,7 @@ class Gap:
 
     misfits: tuple[Misfit, ...]
     residuals: Array
-    closed: float | None
+    explained: float | None
     interval: tuple[float, float] | None
     since: int = 0
     readings: int = 0
@@ -143,15 +143,15 @@ def held_out_gap(judged: Sequence[Judged], since: int = 0) -> Gap:
 
     Args:
         judged: by model, the first the design's.
-        since: the model whose gap is closed by the last one.
+        since: the model whose gap is explained by the last one.
     """
     misfits = tuple(_misfit(model.parts) for model in judged)
-    closed, interval = None, None
+    explained, interval = None, None
     if since < len(judged) - 1 and judged[since].parts and judged[-1].parts:
-        closed, interval = _closed(judged[since].parts, judged[-1].parts)
+        explained, interval = _closed(judged[since].parts, judged[-1].parts)
     residuals = np.array([model.residuals for model in judged])
     readings, last = (int(np.isfinite(residuals[i]).sum()) for i in (since, -1))
-    return Gap(misfits, residuals, closed, interval, since, readings, readings != last)
+    return Gap(misfits, residuals, explained, interval, since, readings, readings != last)
 
 
 def _misfit(parts: Sequence[Left]) -> Misfit:
@@ -188,8 +188,8 @@ def _closed(
     left = max(top, 0.0) / bottom
     variance = (spread_top + left**2 * spread_bottom - 2 * left * shared) / bottom**2
     width = 1.96 * float(np.sqrt(max(variance, 0.0)))
-    closed = 1 - left
-    return float(closed), (float(closed - width), float(min(closed + width, 1.0)))
+    explained = 1 - left
+    return float(explained), (float(explained - width), float(min(explained + width, 1.0)))
 
 
 def _together(parts: Sequence[Left]) -> Left:

@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-LAST = ("equivalent", "unknown", "nothing")
+LAST = ("ambiguous", "unknown", "none")
 
 
 def plot_confusion(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:

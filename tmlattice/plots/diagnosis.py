@@ -45,7 +45,7 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     yield "plan", "The ring from above, with what was found.", _figure(ax)
     yield from (response_figures if diagnosis.by_steps else _searched_figures)(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
-        if len(finding.remedies) > 1:
+        if len(finding.recommended_actions) > 1:
             height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
             _, ax = plt.subplots(figsize=(9, height), layout="constrained")
             plot_credible_set(finding, ax)
@@ -281,7 +281,7 @@ def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | N
     ]
     placed = [(s, finding) for s, finding in placed if low <= s <= high]
     for k, (s, finding) in enumerate(placed):
-        name = finding.remedy.effect if finding.remedy is not None else ""
+        name = finding.recommended_action.effect if finding.recommended_action is not None else ""
         own = finding.label if finding.element or not name else ""
         text = f"{name.replace('_', ' ')} {brief(own)}".strip()
         left = s > low + 0.6 * (high - low)

@@ -150,7 +150,7 @@ def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Beta of the result relative to the design, above the lattice."""
     figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
     ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
-    before, after = (twiss(Chain.from_ring(r)) for r in (result.ring, result.repaired))
+    before, after = (twiss(Chain.from_ring(r)) for r in (result.ring, result.corrected))
     for plane, colour in enumerate(("C0", "C3")):
         beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
         ax.plot(before.s, beat, color=colour, linewidth=0.8, label="xy"[plane])

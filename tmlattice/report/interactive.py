@@ -424,7 +424,7 @@ def beta_beat(diagnosis: Diagnosis) -> Figure:
     from tmlattice.beam.chain import Chain
     from tmlattice.optics import twiss
 
-    before, after = (twiss(Chain.from_ring(r)) for r in (diagnosis.ring, diagnosis.repaired))
+    before, after = (twiss(Chain.from_ring(r)) for r in (diagnosis.ring, diagnosis.corrected))
     names = ["start", *(magnet.name for magnet in diagnosis.ring.magnets)]
     traces = []
     for plane, colour in enumerate(("C0", "C3")):

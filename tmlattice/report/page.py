@@ -178,7 +178,7 @@ def page(
         diagnosis=diagnosis,
         correction=correction,
         texts=correction_texts,
-        told=list(tables.notes(diagnosis, stated)),
+        notes=list(tables.notes(diagnosis, stated)),
         report=report,
         dense=response_text,
         tables=tables,

@@ -78,7 +78,7 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
         if optics := optics_rows(diagnosis):
             lines += ["", *columns([optics_head(diagnosis), *optics])]
         lines += ["", *steps_text(diagnosis, width)]
-    if diagnosis.verdict == "nothing":
+    if diagnosis.verdict == "none":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
         if rows:
             lines += ["", "Would have been seen, at half of the places where it can sit, from:"]

@@ -216,9 +216,9 @@ def outlier_texts(result: Diagnosis) -> list[str]:
     return said
 
 
-def pulled_apart_texts(result: Diagnosis) -> list[str]:
+def inconsistency_texts(result: Diagnosis) -> list[str]:
     """That the RF's orbit and the correctors disagree, and about which gradients."""
-    found = result.pulled_apart
+    found = result.inconsistencies
     if found is None:
         return []
     first = (
@@ -257,9 +257,9 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     """The section of a plain text, in lines."""
     lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
     lines += columns([HEAD, *step_rows(result.steps, result.ring.model)], right=True)
-    if result.refused:
+    if result.rejected_steps:
         lines += ["", "Refused, for they did not help or spoilt the RF's response:"]
-        lines += columns([HEAD, *step_rows(result.refused)], right=True)
+        lines += columns([HEAD, *step_rows(result.rejected_steps)], right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.reasons is not None:
         lines += ["", "Few reasons behind the gradients:"]
@@ -277,7 +277,7 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
             lines += ["", "Further off than magnets are, so that something else is likely there:"]
             for text in outliers:
                 lines += wrapped(text, "   ", width)
-        for i, text in enumerate(pulled_apart_texts(result)):
+        for i, text in enumerate(inconsistency_texts(result)):
             lines += wrapped(text, "   ", width) if i else ["", *wrapped(text, "", width)]
     for said, amounts in error_rows(result):
         lines += ["", *wrapped(said, "", width), *wrapped(amounts, "   ", width)]

@@ -14,8 +14,8 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import FREE, Support
 from tmlattice.effects import Cause, RingEffect, find
 from tmlattice.measurement.assume import ASSUMPTIONS
+from tmlattice.report.action_texts import SETTLED
 from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
-from tmlattice.report.remedies import SETTLED
 from tmlattice.report.text import times_usual
 
 TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
@@ -208,11 +208,11 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
     if diagnosis.bad_monitors:
         names = (labelled(name, diagnosis.devices) for name in diagnosis.bad_monitors)
         yield "rejected BPMs", ", ".join(names)
-    if diagnosis.left_out:
+    if diagnosis.outliers:
         places = [
             f"{labelled(row['monitor'], diagnosis.devices)} {row['plane']}"
             + ("" if row.get("shot") is None else f" (shot {row['shot']}, turn {row['turn']})")
-            for row in diagnosis.left_out
+            for row in diagnosis.outliers
         ]
         more = f" and {len(places) - MOST} more" if len(places) > MOST else ""
         yield "readings left out", ", ".join(places[:MOST]) + more

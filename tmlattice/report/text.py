@@ -13,6 +13,13 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.effects import CATALOGUE, find
 from tmlattice.inference.judge import Misfit
+from tmlattice.report.action_texts import (
+    action_text,
+    consequence_text,
+    mechanism_text,
+    or_text,
+    title,
+)
 from tmlattice.report.amounts import (
     all_of,
     amount_text,
@@ -22,13 +29,6 @@ from tmlattice.report.amounts import (
     words,
 )
 from tmlattice.report.next_shot import next_text
-from tmlattice.report.remedies import (
-    consequence_text,
-    mechanism_text,
-    or_text,
-    remedy_text,
-    title,
-)
 from tmlattice.speaks import micrometres
 
 __all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  # of its page too
@@ -89,19 +89,19 @@ def times_usual(diagnosis: Diagnosis, name: str) -> float | None:
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence."""
     text = diagnosis.assessment.sentence("verdict") or _verdict_sentence(diagnosis)
-    if not diagnosis.since_reference or diagnosis.verdict == "nothing":
+    if not diagnosis.since_reference or diagnosis.verdict == "none":
         return text
     return f"Since the reference: {text}"
 
 
 def _verdict_sentence(diagnosis: Diagnosis) -> str:
     found = diagnosis.findings
-    if diagnosis.verdict == "named":
+    if diagnosis.verdict == "identified":
         many = f"{len(found)} faults: " if len(found) > 1 else ""
         return many + "; ".join(_short(finding) for finding in found) + "."
-    if diagnosis.verdict == "equivalent":
+    if diagnosis.verdict == "ambiguous":
         return "; ".join(_open(finding) for finding in found) + "."
-    if diagnosis.verdict == "located":
+    if diagnosis.verdict == "localised":
         return _located_sentence(diagnosis)
     return steps_sentence(diagnosis)
 
@@ -147,25 +147,25 @@ def steps_sentence(diagnosis: Diagnosis) -> str:
 
 
 def _short(finding: Finding) -> str:
-    if finding.remedy is None:
+    if finding.recommended_action is None:
         if finding.words:
             return finding.words
         low, high = finding.where or (float("nan"), float("nan"))
         return f"something unnamed at {low:.1f} m to {high:.1f} m"
-    return remedy_text(finding.remedy)
+    return action_text(finding.recommended_action)
 
 
 SAID = 2
-"""Other remedies that a sentence names."""
+"""Other recommended actions that a sentence names."""
 
 
 def _open(finding: Finding) -> str:
     """A finding, and what else it may be."""
-    text, others = _short(finding), finding.remedies[1:]
+    text, others = _short(finding), finding.recommended_actions[1:]
     if not others:
         return text
     more = len(others) - SAID
-    also = [remedy_text(remedy) for remedy in others[:SAID]]
+    also = [action_text(recommended_action) for recommended_action in others[:SAID]]
     also += [f"{more} more"] if more > 0 else []
     chance = probability_text(finding.probability)
     return f"most probable ({chance}) {text}; alternatives: " + ", or ".join(also)
@@ -179,7 +179,7 @@ def _after_families(diagnosis: Diagnosis) -> str:
     if lacks and not diagnosis.since_reference:
         steps.append("weigh which effect the model lacks (--missing)")
     if any(cause.effect == "quadrupole_gradient" for cause in diagnosis.causes):
-        steps.append("set the gradients that --repaired-out writes")
+        steps.append("set the gradients that --corrected-out writes")
     if not steps:
         return ""
     text = ", ".join(steps)
@@ -194,10 +194,10 @@ def advice(diagnosis: Diagnosis) -> str:
     if text := diagnosis.assessment.sentence("reference"):
         return text
     checks = dict.fromkeys(f.to_check for f in diagnosis.findings if f.to_check)
-    if diagnosis.verdict == "located" and checks:
+    if diagnosis.verdict == "localised" and checks:
         more = everywhere if _errors_in_steps(diagnosis) else ""
         return " ".join([*checks, *([more] if more else [])])
-    if diagnosis.verdict == "located":
+    if diagnosis.verdict == "localised":
         return (
             "Inspect this section: hardware, apertures, cables of the BPMs. More launches show "
             "whether the kick is constant, linear or nonlinear, or changes from shot to shot."
@@ -210,8 +210,8 @@ def headline(diagnosis: Diagnosis) -> str:
     found = diagnosis.findings
     if len(found) < 2:
         return verdict_sentence(diagnosis)
-    several = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "equivalent"]
-    unnamed = [str(n) for n, f in enumerate(found, 1) if f.verdict == "located" and not f.words]
+    several = [str(n) for n, finding in enumerate(found, 1) if finding.verdict == "ambiguous"]
+    unnamed = [str(n) for n, f in enumerate(found, 1) if f.verdict == "localised" and not f.words]
     since = "Since the reference: " if diagnosis.since_reference else ""
     text = f"{since}{len(found)} findings."
     if several:
@@ -223,10 +223,17 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def to_do(diagnosis: Diagnosis) -> list[str]:
     """What to do next, the first first: repairs, then what would tell more."""
-    remedies = [finding.remedy for finding in diagnosis.findings if finding.remedy is not None]
-    done = [f"{remedy.action[0].upper()}{remedy.action[1:]}." for remedy in remedies]
-    if len(diagnosis.findings) == 1 and remedies:
-        done = [f"{done[0]} First: {find(remedies[0].effect).to_check}"]
+    recommended_actions = [
+        finding.recommended_action
+        for finding in diagnosis.findings
+        if finding.recommended_action is not None
+    ]
+    done = [
+        f"{recommended_action.action[0].upper()}{recommended_action.action[1:]}."
+        for recommended_action in recommended_actions
+    ]
+    if len(diagnosis.findings) == 1 and recommended_actions:
+        done = [f"{done[0]} First: {find(recommended_actions[0].effect).to_check}"]
     more = next_text(diagnosis) or advice(diagnosis)
     return [*done, more] if more else done
 
@@ -242,25 +249,28 @@ def gap_sentence(diagnosis: Diagnosis) -> str:
 def finding_rows(finding: Finding) -> list[tuple[str, str]]:
     """What is known of a finding: (name, text)."""
     rows = []
-    remedy = finding.remedy
-    if remedy is not None:
-        rows += [("remedy", remedy.action), ("check", find(remedy.effect).to_check)]
+    recommended_action = finding.recommended_action
+    if recommended_action is not None:
+        rows += [
+            ("recommended_action", recommended_action.action),
+            ("check", find(recommended_action.effect).to_check),
+        ]
     elif finding.to_check:
         rows.append(("check", finding.to_check))
     rows.append(("place", place_text(finding)))
     consequence = consequence_text(finding)
     if consequence:
         rows.append(("stored beam", consequence))
-    if remedy is not None:
+    if recommended_action is not None:
         rows.append(("probability", probability_text(finding.probability)))
     rows.append(("seen", _seen_text(finding)))
     if finding.seen_by is not None and len(finding.seen_by) > 1:
         by = sorted(finding.seen_by.items(), key=lambda pair: -pair[1])
         told = ", ".join(f"{100 * share:.0f} % {name}" for name, share in by if share > 0.005)
         rows.append(("seen by", told))
-    if remedy is not None:
-        rows.append(("mechanism", mechanism_text(remedy)))
-    if len(finding.remedies) > 1:
+    if recommended_action is not None:
+        rows.append(("mechanism", mechanism_text(recommended_action)))
+    if len(finding.recommended_actions) > 1:
         rows.append(("or else", or_text(finding, MOST)))
     return rows
 
@@ -274,7 +284,7 @@ def _seen_text(finding: Finding) -> str:
 
 
 MOST = 6
-"""Other remedies that a finding lists."""
+"""Other recommended actions that a finding lists."""
 
 
 def gap_head(diagnosis: Diagnosis) -> tuple[str, str, str]:

@@ -85,7 +85,7 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(small_ring, further
     )
     found = diagnose(small_ring, measured, seed=seed)
     assert found.response.held[v5] == held
-    assert found.verdict == "located"
+    assert found.verdict == "localised"
     (one,) = found.findings
     assert one.words.startswith("corrector v5 answers as if it stood 0.2 m upstream")
     assert one.elements == ("v5",)
@@ -95,7 +95,7 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(small_ring, further
     schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
     jsonschema.validate(json.loads(json.dumps(document)), schema)
     assert document["findings"][0]["to_check"].startswith("Check its place")
-    assert f"LOCATED: {one.words[0].upper()}{one.words[1:]}." in " ".join(found.report().split())
+    assert f"LOCALISED: {one.words[0].upper()}{one.words[1:]}." in " ".join(found.report().split())
     assert not any("kicked the beam" in said for said in found.warnings)
     assert (found.steps[-1].heldout_chi2_per_dof > 10) == held
     assert not any(c.element == "v5" and abs(c.amount) > 0.01 for c in found.causes)
@@ -109,12 +109,12 @@ def test_small_errors_beside_it_are_told_too_and_it_takes_nobody_s_place(small_r
         rf_step=-3000.0, engine="ocelot", progress=False, seed=1,
     ).measured  # fmt: skip
     found = diagnose(small_ring, measured, max_effects=1)
-    assert found.verdict == "located"
+    assert found.verdict == "localised"
     assert [own.elements for own in found.findings if own.words] == [("v5",)]
     assert [own.element for own in found.findings if own.effect] == ["QD::5"]
     text = " ".join(found.report().split())
     assert "Small errors all along the ring" in text
-    assert "--repaired-out" in text
+    assert "--corrected-out" in text
 
 
 def test_nothing_is_said_of_correctors_that_stand_where_they_should(small_ring):

@@ -27,7 +27,7 @@ def measured(ring, causes, seed=1, **options):
 )
 def test_a_fault_is_named_although_nobody_states_the_small_errors(small_ring, fault):
     found = diagnose(small_ring, measured(small_ring, [fault]))
-    assert found.verdict == "named"
+    assert found.verdict == "identified"
     (finding,) = found.findings
     assert (finding.effect, finding.element) == (fault.effect, fault.element)
     assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
@@ -50,7 +50,7 @@ def test_an_exchanged_monitor_has_no_small_errors_of_what_it_exchanged(small_rin
     """It is set aside first; small errors taken again without it leave its readings to a name."""
     fault = Cause("monitor_swap", "end_1", 1.0)
     found = diagnose(small_ring, measured(small_ring, [fault], seed=4))
-    assert found.verdict == "named"
+    assert found.verdict == "identified"
     assert [(f.effect, f.element) for f in found.findings] == [("monitor_swap", "end_1")]
 
 
@@ -89,7 +89,7 @@ def test_small_errors_alone_are_no_fault_and_have_their_sizes(small_ring):
 def test_no_small_errors_are_learnt_where_there_are_none(small_ring):
     clean = simulate(small_ring, [Cause("quadrupole_gradient", "QD::5", -0.2)], shots=6, seed=1)
     found = diagnose(small_ring, clean.measurement())
-    assert found.verdict == "named"
+    assert found.verdict == "identified"
     assert not found.priors
 
 

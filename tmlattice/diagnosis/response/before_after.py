@@ -334,7 +334,7 @@ def _few_or_all(
 
 def _verdict(state: State) -> str:
     group = state.groups.get(QuadrupoleGradient.name)
-    return "distributed" if group is not None and group.rms > EVERYWHERE else "nothing"
+    return "distributed" if group is not None and group.rms > EVERYWHERE else "none"
 
 
 def _said(

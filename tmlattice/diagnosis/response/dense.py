@@ -135,7 +135,7 @@ class DenseFit:
     design: State
     state: State
     steps: tuple[Step, ...]
-    refused: tuple[Step, ...]
+    rejected_steps: tuple[Step, ...]
     heldout: tuple[Score, Score]
     said: tuple[str, ...] = ()
 
@@ -185,13 +185,16 @@ def fit_steps(
     }  # fmt: skip
     stages.clear()
     state, gone, others = _needed(state, steps, most, progress)
-    refused, doubts = [replace(steps.pop(own), kept=False) for own in gone], [*doubts, *others]
+    rejected_steps, doubts = (
+        [replace(steps.pop(own), kept=False) for own in gone],
+        [*doubts, *others],
+    )
     judged = inner(state)
     enough = int(np.sum(judged.columns[:, 0, 1] > 0)) >= ENOUGH
     spoilt = -lost(inner(replace(design, jitter=state.jitter)), judged)[0]
     nothing = DenseFit(
         design, design, (Step.scored("design", 0, before),),
-        (*refused, *(replace(step, kept=False) for step in steps.values())),
+        (*rejected_steps, *(replace(step, kept=False) for step in steps.values())),
         (before, before), (*odd.said, *doubts),
     )  # fmt: skip
     if enough and spoilt > SPOILT:  # all together spoil what they should mend
@@ -206,7 +209,7 @@ def fit_steps(
     for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since it was asked
         doubts += _doubts(state, trial)
         state = _without(state, trial)
-        refused.append(replace(steps.pop(trial), kept=False))
+        rejected_steps.append(replace(steps.pop(trial), kept=False))
     then = replace(design, good=state.good, exploring=False)
     if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
         astray = (
@@ -218,7 +221,7 @@ def fit_steps(
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
     said = (*odd.said, *doubts, *(() if moving is None else (moving.sentence,)))
-    return DenseFit(design, state, tuple(kept), tuple(refused), (before, after), said)
+    return DenseFit(design, state, tuple(kept), tuple(rejected_steps), (before, after), said)
 
 
 def _needed(

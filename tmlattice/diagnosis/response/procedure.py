@@ -40,10 +40,10 @@ from tmlattice.diagnosis.response.displaced import Displaced, displaced
 from tmlattice.diagnosis.response.exchanged import PutRight, planes_back, righted, swapped
 from tmlattice.diagnosis.response.few import few_causes, knows_more
 from tmlattice.diagnosis.response.first_guess import FAR, strange
+from tmlattice.diagnosis.response.inconsistencies import inconsistencies
 from tmlattice.diagnosis.response.missing import weigh
 from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
 from tmlattice.diagnosis.response.odd_steps import beside
-from tmlattice.diagnosis.response.pulled_apart import pulled_apart
 from tmlattice.diagnosis.response.reasons import explain_gradients
 from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.singled_out import beside_faults, singled_out
@@ -154,13 +154,13 @@ def diagnose_response(
         findings=with_consequences(ring, findings, causes),
         warnings=(*said, *(reversed_ones(fit.state) if few is None else few.said), *_warnings(fit)),
         degenerate=degenerate,
-        rejected=rejected,
+        rejected_channels=rejected,
         correlations=correlated,
         covariance=covariance,
         supports=supports,
         hypotheses=rows,
         reasons=None if few is not None else explain_gradients(fit.state),
-        pulled_apart=None if few is not None else pulled_apart(fit.state, false_alarm),
+        inconsistencies=None if few is not None else inconsistencies(fit.state, false_alarm),
         provenance=provenance(ring, options, seed, begun),
     )  # fmt: skip
 
@@ -267,7 +267,7 @@ def as_diagnosis(
     data, good = fit.state.data, fit.state.good
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     causes = tuple(cause for cause, _ in found)
-    repaired = apply(ring, within)
+    corrected = apply(ring, within)
     blocks = remainder(fit.state)
     errors = tuple(sigma for _, sigma in found)
     named = [(finding.effect or "", finding.element) for finding in told["findings"]]
@@ -284,19 +284,19 @@ def as_diagnosis(
         },
         tunes={
             "before": ring_tunes(ring, data.energy),
-            "after": ring_tunes(repaired, data.energy + fit.state.at.errors.energy),
+            "after": ring_tunes(corrected, data.energy + fit.state.at.errors.energy),
         },
         next=None,
         sensitivity={},
         noise=(noise_x, noise_y),
         ring=ring,
-        repaired=repaired,
+        corrected=corrected,
         causes=causes,
         errors=errors,
         suspects=outliers(ring, causes, errors, named),
         view=_view(fit),
         steps=fit.steps,
-        refused=fit.refused,
+        rejected_steps=fit.rejected_steps,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
         priors={
             name: group.rms
@@ -352,7 +352,7 @@ def _verdict(fit: DenseFit, false_alarm: float) -> str:
     the RF's response; else `distributed`: many small errors."""
     said = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
     chances = [chi2.sf(own.total, own.readings) for own in said if own.readings]
-    return "nothing" if min(chances) > false_alarm / len(chances) else "distributed"
+    return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
 def _warnings(fit: DenseFit) -> tuple[str, ...]:
@@ -376,8 +376,8 @@ def _gap(fit: DenseFit) -> Gap:
     before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
     seen = fit.heldout[0].chi2[0]  # below five sigma of the noise there is no gap to close
     there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
-    closed = 1 - after / before if there and len(misfits) > 1 else None
-    return Gap(misfits, np.zeros((0, 0, 0)), closed, None, 0, seen.readings)
+    explained = 1 - after / before if there and len(misfits) > 1 else None
+    return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, seen.readings)
 
 
 def _patterns(fit: DenseFit) -> dict[str, Any]:

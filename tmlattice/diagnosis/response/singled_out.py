@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from tmlattice.diagnosis.families.orbit_modes import HorizontalOrbit, VerticalOrbit
-from tmlattice.diagnosis.remedies import remedy_of
+from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.dense import ROUGH, DenseFit, Step, fit_chi2
 from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.judges import Chi2, score
@@ -191,7 +191,7 @@ class _Search:
         return None
 
     def leaders(self) -> list[tuple[Hypothesis, float, Array]]:
-        """What is tried: the likeliest by the linear model, one of each remedy; its amount, and
+        """What is tried: the likeliest by the linear model, one of each action; its amount, and
         what each block knows of it."""
         ring = self.state.data.ring
         seen = self.seen(self.state)
@@ -208,7 +208,7 @@ class _Search:
         have = [one.cause for one in self.state.apart]
         for h in order:
             cause = seen.suspects[h].cause
-            same = remedy_of(ring, Cause(*cause, float(own.amount[h])))
+            same = recommended_action(ring, Cause(*cause, float(own.amount[h])))
             if cause not in have and len(found) < self.tries:
                 found.setdefault(same, (cause, float(own.amount[h]), own.information[:, h]))
         return list(found.values())

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from tmlattice.diagnosis.consequences import Beam, Consequences
-from tmlattice.diagnosis.remedies import Remedy, leading, pieces_of
+from tmlattice.diagnosis.recommended_actions import RecommendedAction, leading, pieces_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.lattice import Ring
@@ -20,58 +20,62 @@ SETTLED = Beam((1e-5, 1e-5), (1e-4, 1e-4), (1e-4, 1e-4), (1e-5, 1e-5), (1e-7, 1e
 """A beam that differs from the design's by less is as designed."""
 
 
-def subject(remedy: Remedy) -> str:
+def subject(recommended_action: RecommendedAction) -> str:
     """What it is about: "quadrupole qd::12"."""
-    if remedy.element is None or remedy.kind is None:
+    if recommended_action.element is None or recommended_action.kind is None:
         return "the beam"
-    kind = _KINDS.get(remedy.kind, remedy.kind)
-    family = " family" if remedy.effect.startswith("family") else ""
-    others = [name for name in remedy.pieces if name != remedy.element]
+    kind = _KINDS.get(recommended_action.kind, recommended_action.kind)
+    family = " family" if recommended_action.effect.startswith("family") else ""
+    others = [name for name in recommended_action.pieces if name != recommended_action.element]
     magnet = f" (one magnet with {', '.join(others)})" if others else ""
-    device = f" [{remedy.device}]" if remedy.device else ""
-    return f"{kind}{family} {remedy.element}{device}{magnet}"
+    device = f" [{recommended_action.device}]" if recommended_action.device else ""
+    return f"{kind}{family} {recommended_action.element}{device}{magnet}"
 
 
-def remedy_text(remedy: Remedy) -> str:
+def action_text(recommended_action: RecommendedAction) -> str:
     """What is wrong there, as a line of a logbook."""
-    effect = find(remedy.effect)
-    amount = amount_text(remedy.effect, remedy.amount, remedy.amount_sigma)
+    effect = find(recommended_action.effect)
+    amount = amount_text(
+        recommended_action.effect, recommended_action.amount, recommended_action.amount_sigma
+    )
     if effect.discrete and amount:
         what = amount  # "no signal"
     else:
         what = f"{effect.quantity or effect.words} {amount}".rstrip()
     told = ""
-    if remedy.strength is not None:
-        own = remedy.strength
+    if recommended_action.strength is not None:
+        own = recommended_action.strength
         told = f" ({own.name} {own.before:.4g} -> {own.after:.4g} {own.unit})"
-    return f"{subject(remedy)}, {what}{told}"
+    return f"{subject(recommended_action)}, {what}{told}"
 
 
 def title(finding: Finding) -> str:
     """A finding in one line."""
-    if finding.remedy is None:
+    if finding.recommended_action is None:
         return finding.words or "something that no effect of the catalogue explains"
-    return remedy_text(finding.remedy)
+    return action_text(finding.recommended_action)
 
 
 LIKELY = 0.01
-"""Share of a remedy's probability from which on a mechanism is told."""
+"""Share of a recommended action's probability from which on a mechanism is told."""
 
 
-def mechanism_text(remedy: Remedy) -> str:
-    """Which explanations share a remedy, and how likely each is."""
-    likely = [m for m in remedy.mechanisms if m[1] >= LIKELY * remedy.probability]
+def mechanism_text(recommended_action: RecommendedAction) -> str:
+    """Which explanations share a recommended action, and how likely each is."""
+    likely = [
+        m for m in recommended_action.mechanisms if m[1] >= LIKELY * recommended_action.probability
+    ]
     if len(likely) == 1:
         effect = likely[0][0]
         return f"{words(effect)} ({effect}: {find(effect).sign})"
     told = (f"{words(e)} ({e}) {probability_text(p)}" for e, p in likely)
-    return "; or ".join(told) + ": the remedy is the same"
+    return "; or ".join(told) + ": the action is the same"
 
 
 def or_text(finding: Finding, most: int) -> str:
-    """What else it may be that has another place or another remedy."""
-    others = finding.remedies[1:]
-    shown = [f"{probability_text(r.probability)} {remedy_text(r)}" for r in others[:most]]
+    """What else it may be that has another place or another recommended action."""
+    others = finding.recommended_actions[1:]
+    shown = [f"{probability_text(r.probability)} {action_text(r)}" for r in others[:most]]
     if len(others) > most:
         rest = sum(r.probability for r in others[most:])
         shown.append(f"{len(others) - most} more ({probability_text(rest)} together)")
@@ -88,14 +92,14 @@ def by_hand_text(ring: Ring, causes: Sequence[Cause]) -> str:
     for cause in causes:
         lead = leading(ring, cause)
         place = " + ".join(pieces_of(ring, lead.element)) or "the ring"
-        places = todo.setdefault(find(lead.effect).remedy, [])
+        places = todo.setdefault(find(lead.effect).recommended_action, [])
         places += [place] * (place not in places)
     if not todo:
         return ""
     said = []
-    for remedy, places in todo.items():
+    for recommended_action, places in todo.items():
         more = f" and {len(places) - SAID} more" if len(places) > SAID else ""
-        said.append(remedy.replace("{}", ", ".join(places[:SAID]) + more))
+        said.append(recommended_action.replace("{}", ", ".join(places[:SAID]) + more))
     return f"no setting in it mends what is left to do: {'; '.join(said)}"
 
 
@@ -115,7 +119,7 @@ def consequence_text(finding: Finding) -> str:
 
 
 def _after_text(told: Consequences) -> str:
-    beam = told.repaired
+    beam = told.corrected
     if beam is None or told.design is None:
         return _beam_text(beam, told)
     off = [abs(a - b) for a, b in zip(beam.tunes, told.design, strict=True)]

@@ -10,7 +10,13 @@ from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.next_measurement import LEAST, next_measurement
-from tmlattice.diagnosis.remedies import credible, leading, remedies_of, remedy_of, undone
+from tmlattice.diagnosis.recommended_actions import (
+    credible,
+    leading,
+    recommended_action,
+    recommended_actions,
+    undone,
+)
 from tmlattice.diagnosis.result import Finding, faults_of
 from tmlattice.effects import CATALOGUE, Effect, apply
 from tmlattice.inference.newton import fit
@@ -18,8 +24,8 @@ from tmlattice.inference.rivals import Rival
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import off_momentum, ring_tunes, twiss
+from tmlattice.report.action_texts import consequence_text
 from tmlattice.report.plain import report_text
-from tmlattice.report.remedies import consequence_text
 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.05)
 SHOTS = {"shots": 4, "seed": 1, "amplitude": 3e-4, "noise": 2e-6}
@@ -36,12 +42,12 @@ def weak(small_ring):
 
 def test_every_effect_says_what_to_check_and_what_to_do():
     for name, effect in CATALOGUE.items():
-        assert effect.remedy != Effect.remedy, name
+        assert effect.recommended_action != Effect.recommended_action, name
         assert effect.to_check != Effect.to_check, name
         assert effect.to_check.endswith("."), name
 
 
-# --- what shares a remedy -------------------------------------------------------------------------
+# --- what shares a action -------------------------------------------------------------------------
 def matrix(ring, *causes):
     return Chain.from_ring(apply(ring, causes)).one_turn_map()[1]
 
@@ -63,7 +69,7 @@ def test_remedy_of_another_effect_takes_this_one_away(small_ring, cause):
     an element, differ by some per cent."""
     lead = leading(small_ring, cause)
     assert lead.effect != cause.effect
-    assert remedy_of(small_ring, cause) == remedy_of(small_ring, lead)
+    assert recommended_action(small_ring, cause) == recommended_action(small_ring, lead)
     design = matrix(small_ring)
     change = matrix(small_ring, cause) - design
     left = matrix(small_ring, cause, Cause(lead.effect, lead.element, -lead.amount)) - design
@@ -71,14 +77,25 @@ def test_remedy_of_another_effect_takes_this_one_away(small_ring, cause):
 
 
 def test_other_actions_and_other_places_are_other_remedies(small_ring):
-    def remedies(*causes):
-        return {remedy_of(small_ring, Cause(*c, 1e-3)) for c in causes}
+    def recommended_actions(*causes):
+        return {recommended_action(small_ring, Cause(*c, 1e-3)) for c in causes}
 
-    assert len(remedies(("quadrupole_gradient", "QD::5"), ("quadrupole_gradient", "QD::6"))) == 2
-    assert len(remedies(("quadrupole_gradient", "QD::5"), ("quadrupole_roll", "QD::5"))) == 2
-    assert len(remedies(("gradient_absolute", "sd::5"), ("sextupole_offset_x", "sd::5"))) == 2
-    assert len(remedies(("monitor_gain_x", "end_3"), ("monitor_roll", "end_3"))) == 2
-    assert len(remedies(("family_gradient", "QD"), ("quadrupole_gradient", "QD::5"))) == 2
+    assert (
+        len(recommended_actions(("quadrupole_gradient", "QD::5"), ("quadrupole_gradient", "QD::6")))
+        == 2
+    )
+    assert (
+        len(recommended_actions(("quadrupole_gradient", "QD::5"), ("quadrupole_roll", "QD::5")))
+        == 2
+    )
+    assert (
+        len(recommended_actions(("gradient_absolute", "sd::5"), ("sextupole_offset_x", "sd::5")))
+        == 2
+    )
+    assert len(recommended_actions(("monitor_gain_x", "end_3"), ("monitor_roll", "end_3"))) == 2
+    assert (
+        len(recommended_actions(("family_gradient", "QD"), ("quadrupole_gradient", "QD::5"))) == 2
+    )
 
 
 def test_pieces_of_one_magnet_are_one_place(petra3):
@@ -87,13 +104,15 @@ def test_pieces_of_one_magnet_are_one_place(petra3):
     assert len(halves) == 2
     one, two = (Cause("sextupole_offset_x", name, 1e-3) for name in halves)
     other = Cause("sextupole_offset_x", "s1::46", 1e-3)
-    first, second = remedies_of(petra3, [two, one, other], [0.5, 0.4, 0.1])
+    first, second = recommended_actions(petra3, [two, one, other], [0.5, 0.4, 0.1])
     assert first.probability == pytest.approx(0.9)
     assert (first.element, first.pieces) == (two.element, halves)
     assert first.mechanisms == (("sextupole_offset_x", pytest.approx(0.9)),)
     assert second.element == "s1::46"
     assert (
-        remedy_of(petra3, one) == remedy_of(petra3, two) == "move s1::48 + s1::49 back horizontally"
+        recommended_action(petra3, one)
+        == recommended_action(petra3, two)
+        == "move s1::48 + s1::49 back horizontally"
     )
 
 
@@ -103,7 +122,7 @@ def test_probability_of_a_remedy_is_that_of_all_that_share_it(small_ring):
         Cause("gradient_absolute", "sd::5", 0.03),
         Cause("gradient_absolute", "QD::5", 0.036),
     ]
-    first, second = remedies_of(small_ring, causes, [0.5, 0.3, 0.2], sigma=0.01)
+    first, second = recommended_actions(small_ring, causes, [0.5, 0.3, 0.2], sigma=0.01)
     assert (first.effect, first.element) == ("quadrupole_gradient", "QD::5")
     assert first.probability == pytest.approx(0.7)
     assert [effect for effect, _ in first.mechanisms] == [
@@ -121,12 +140,12 @@ def test_magnets_own_amount_is_told_where_the_thin_one_is_likelier(small_ring):
         Cause("gradient_absolute", "QD::5", 0.036),
         Cause("quadrupole_gradient", "QD::5", -0.1),
     ]
-    (remedy,) = remedies_of(small_ring, causes, [0.6, 0.4])
-    assert remedy.cause == causes[1]
-    assert remedy.strength.after == pytest.approx(0.9 * small_ring["QD::5"].k1)
+    (recommended_action,) = recommended_actions(small_ring, causes, [0.6, 0.4])
+    assert recommended_action.cause == causes[1]
+    assert recommended_action.strength.after == pytest.approx(0.9 * small_ring["QD::5"].k1)
     thin = Finding(
         "gradient_absolute", "QD::5", None, 0.036, None, "1/m", 1.0, None, None, (), (), 1.0,
-        (remedy,),
+        (recommended_action,),
     )  # fmt: skip
     assert faults_of([thin], causes[:1]) == (causes[1],)
 
@@ -134,10 +153,12 @@ def test_magnets_own_amount_is_told_where_the_thin_one_is_likelier(small_ring):
 def test_thin_gradient_is_told_as_the_magnets_own_strength(small_ring):
     magnet = small_ring["QD::5"]
     thin = 0.1 * magnet.length  # k1 L of 0.1 1/m2 over the magnet
-    (remedy,) = remedies_of(small_ring, [Cause("gradient_absolute", "QD::5", thin)], [1.0], 1e-4)
-    assert remedy.strength.before == magnet.k1
-    assert remedy.strength.after == pytest.approx(magnet.k1 + 0.1)
-    assert remedy.amount_sigma == pytest.approx(1e-4 / abs(magnet.k1 * magnet.length))
+    (recommended_action,) = recommended_actions(
+        small_ring, [Cause("gradient_absolute", "QD::5", thin)], [1.0], 1e-4
+    )
+    assert recommended_action.strength.before == magnet.k1
+    assert recommended_action.strength.after == pytest.approx(magnet.k1 + 0.1)
+    assert recommended_action.amount_sigma == pytest.approx(1e-4 / abs(magnet.k1 * magnet.length))
 
 
 @pytest.mark.parametrize("cause", [WEAK, Cause("quadrupole_roll", "QF::9", 6e-3)], ids=str)
@@ -145,13 +166,16 @@ def test_wrong_quadrupole_of_the_at_machine_is_one_finding(small_ring, cause):
     """Named, though a thin field in its middle explains the data as well."""
     result = found(small_ring, [cause])
     (finding,) = result.findings
-    assert result.verdict == finding.verdict == "named"
+    assert result.verdict == finding.verdict == "identified"
     assert len(finding.credible_set) == 2
-    assert len({member.remedy for member in finding.credible_set}) == 1
-    assert finding.remedy.effect == cause.effect
-    assert finding.remedy.element == cause.element
-    assert abs(finding.remedy.amount - cause.amount) < 4 * finding.remedy.amount_sigma + 1e-3
-    assert finding.probability == finding.remedy.probability > 0.95
+    assert len({member.recommended_action for member in finding.credible_set}) == 1
+    assert finding.recommended_action.effect == cause.effect
+    assert finding.recommended_action.element == cause.element
+    assert (
+        abs(finding.recommended_action.amount - cause.amount)
+        < 4 * finding.recommended_action.amount_sigma + 1e-3
+    )
+    assert finding.probability == finding.recommended_action.probability > 0.95
     assert result.next is None  # which mechanism it is changes nothing
 
 
@@ -226,8 +250,8 @@ def test_consequences_vs_twiss_and_orbits_of_two_energies(small_ring, weak):
     change = np.sqrt(np.mean((faulty_d - design_d) ** 2, axis=0))
     # differences over +-1e-4 leave the third order in delta
     assert told.found.dispersion_rms[0] == pytest.approx(change[0], rel=1e-3)
-    assert told.repaired.tunes == pytest.approx(told.design, abs=1e-9)
-    assert max(told.repaired.beta_beat_max) < 1e-9
+    assert told.corrected.tunes == pytest.approx(told.design, abs=1e-9)
+    assert max(told.corrected.beta_beat_max) < 1e-9
 
 
 def test_orbit_of_an_offset_is_told_and_repaired(small_ring):
@@ -236,7 +260,7 @@ def test_orbit_of_an_offset_is_told_and_repaired(small_ring):
     told = result.findings[0].consequences
     orbit = Chain.from_ring(result.as_found).closed_orbit()[0][:-1, 0]
     assert told.found.orbit_rms[0] == pytest.approx(np.sqrt(np.mean(orbit**2)), rel=1e-6)
-    assert told.repaired.orbit_rms[0] < 1e-9
+    assert told.corrected.orbit_rms[0] < 1e-9
 
 
 def test_of_two_faults_the_other_is_still_there_after_a_repair(small_ring):
@@ -246,7 +270,7 @@ def test_of_two_faults_the_other_is_still_there_after_a_repair(small_ring):
     for finding in result.findings:
         (other,) = (c for c in result.causes if c.element != finding.element)
         left = ring_tunes(apply(small_ring, [other]))
-        assert finding.consequences.repaired.tunes == pytest.approx(tuple(left), abs=1e-9)
+        assert finding.consequences.corrected.tunes == pytest.approx(tuple(left), abs=1e-9)
 
 
 def test_ring_without_a_stable_orbit_is_said_to_be_unstable(small_ring, weak):
@@ -254,7 +278,7 @@ def test_ring_without_a_stable_orbit_is_said_to_be_unstable(small_ring, weak):
     assert ring_tunes(apply(small_ring, [strong])) is None
     (told,) = consequences(small_ring, [strong]).values()
     assert told.found is None
-    assert told.repaired is not None
+    assert told.corrected is not None
     text = consequence_text(replace(weak.findings[0], consequences=told))
     assert "unstable: no beam can be stored" in text
 

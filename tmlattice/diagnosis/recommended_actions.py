@@ -1,11 +1,11 @@
 """What is to be done about a finding: explanations that the same adjustment takes away are one.
 
 A thin gradient in the middle of a quadrupole and a wrong strength of it are two hypotheses and one
-line in a logbook: the gradient of that magnet. Which effects share a remedy at an element, and in
+line in a logbook: the gradient of that magnet. Which effects share a action at an element, and in
 which amount, the catalogue says (`Effect.stands_for`). A magnet that stands in pieces is one.
 
->>> remedy = remedies_of(ring, rivals, probability)[0]
->>> remedy.action, remedy.amount, remedy.probability
+>>> action = recommended_actions(ring, rivals, probability)[0]
+>>> action.action, action.amount, action.probability
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from tmlattice.lattice import Element, Kind, Ring
 Array = NDArray[np.float64]
 
 STRENGTHS = {"k1": "1/m2", "k2": "1/m3"}
-"""Strengths that a remedy tells before and after, with their units."""
+"""Strengths that a recommended action tells before and after, with their units."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Strength:
 
 
 @dataclass(frozen=True)
-class Remedy:
+class RecommendedAction:
     """What takes a finding away at one place.
 
     Attributes:
-        effect, element: that the remedy is named for; None for the beam.
+        effect, element: that the recommended action is named for; None for the beam.
         pieces: of the magnet that the element is a piece of, or the element alone; empty for the
             beam.
         kind: of the element; of a family that of its members.
@@ -97,7 +97,7 @@ class Remedy:
 
 def action(effect: str, pieces: Sequence[str]) -> str:
     """What takes an effect away, in words."""
-    return find(effect).remedy.replace("{}", " + ".join(pieces) or "the ring")
+    return find(effect).recommended_action.replace("{}", " + ".join(pieces) or "the ring")
 
 
 def pieces_of(ring: Ring, name: str | None) -> tuple[str, ...]:
@@ -108,26 +108,26 @@ def pieces_of(ring: Ring, name: str | None) -> tuple[str, ...]:
 
 
 def leading(ring: Ring, cause: Cause) -> Cause:
-    """The cause whose remedy takes this one away too, with the amount that does as much."""
+    """The cause whose action takes this one away too, with the amount that does as much."""
     if cause.element is None or not _is_element(ring, cause.element):
         return cause
     effect, scale = find(cause.effect).stands_for(ring[cause.element])
     return Cause(effect, cause.element, scale * cause.amount)
 
 
-def remedy_of(ring: Ring, cause: Cause) -> str:
+def recommended_action(ring: Ring, cause: Cause) -> str:
     """What takes a cause away, in words: the same for causes that one adjustment takes away."""
     lead = leading(ring, cause)
     return action(lead.effect, pieces_of(ring, lead.element))
 
 
-def remedies_of(
+def recommended_actions(
     ring: Ring,
     causes: Sequence[Cause],
     probability: Sequence[float] | Array,
     sigma: float | None = None,
-) -> tuple[Remedy, ...]:
-    """The remedies of rival explanations.
+) -> tuple[RecommendedAction, ...]:
+    """The recommended actions of rival explanations.
 
     Args:
         ring: the design.
@@ -138,7 +138,7 @@ def remedies_of(
     Returns:
         That of the first one first, the others by falling probability.
     """
-    found: dict[tuple[str, tuple[str, ...]], Remedy] = {}
+    found: dict[tuple[str, tuple[str, ...]], RecommendedAction] = {}
     for cause, share in zip(causes, np.asarray(probability).tolist(), strict=True):
         lead = leading(ring, cause)
         key = (lead.effect, pieces_of(ring, lead.element))
@@ -157,28 +157,32 @@ def remedies_of(
         error = None
         if cause is causes[0] and sigma is not None:
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
-        found[key] = Remedy(
+        found[key] = RecommendedAction(
             lead.effect, lead.element, key[1], element_kind(ring, lead.element), lead.amount,
             error, share, own, _strength(ring, lead),
         )  # fmt: skip
     if not found:
         return ()
     first, *rest = found.values()
-    return (first, *sorted(rest, key=lambda remedy: -remedy.probability))
+    return (first, *sorted(rest, key=lambda recommended_action: -recommended_action.probability))
 
 
-def _more(known: Remedy, mechanism: tuple[str, float]) -> tuple[tuple[str, float], ...]:
+def _more(known: RecommendedAction, mechanism: tuple[str, float]) -> tuple[tuple[str, float], ...]:
     """Mechanisms with one more, those of the same effect (in other pieces) added up."""
     shares = dict(known.mechanisms)
     shares[mechanism[0]] = shares.get(mechanism[0], 0.0) + mechanism[1]
     return tuple(shares.items())
 
 
-def credible(remedies: Sequence[Remedy], mass: float) -> tuple[Remedy, ...]:
+def credible(
+    recommended_actions: Sequence[RecommendedAction], mass: float
+) -> tuple[RecommendedAction, ...]:
     """The fewest that hold the mass, the first with them."""
-    order = sorted(remedies, key=lambda remedy: -remedy.probability)
+    order = sorted(
+        recommended_actions, key=lambda recommended_action: -recommended_action.probability
+    )
     count = int(np.searchsorted(np.cumsum([r.probability for r in order]), mass)) + 1
-    return (remedies[0], *(r for r in order[:count] if r is not remedies[0]))
+    return (recommended_actions[0], *(r for r in order[:count] if r is not recommended_actions[0]))
 
 
 def _is_element(ring: Ring, name: str) -> bool:

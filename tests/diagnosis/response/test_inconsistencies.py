@@ -9,13 +9,13 @@ from tmlattice import diagnose
 from tmlattice.diagnosis.families.dispersion import USUAL, HorizontalKicks
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.dense import fit_steps
-from tmlattice.diagnosis.response.pulled_apart import CLEAR, pulled_apart
+from tmlattice.diagnosis.response.inconsistencies import CLEAR, inconsistencies
 from tmlattice.effects import Cause, apply
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
-from tmlattice.report.response_text import pulled_apart_texts
+from tmlattice.report.response_text import inconsistency_texts
 
 WITHOUT = STEPS[:3]
 """Calibrations, gains, gradients."""
@@ -51,7 +51,7 @@ def measured(ring, kicks, rf_step=-3000.0):
 def apart(ring, read, steps):
     data = response_data(ring, read)
     split = split_columns(data, 0.2, np.random.default_rng(0))
-    return pulled_apart(fit_steps(data, split, steps).state)
+    return inconsistencies(fit_steps(data, split, steps).state)
 
 
 def test_they_agree_where_gradients_make_the_rfs_orbit(small_ring):
@@ -80,9 +80,9 @@ def test_without_an_rf_there_is_nothing_to_compare(small_ring):
 def test_a_diagnosis_says_so(small_ring):
     effects = ["quadrupole_gradient", "dipole_field"]
     found = diagnose(small_ring, measured(small_ring, 3), effects=effects)
-    told = found.as_json()["pulled_apart"]
+    told = found.as_json()["inconsistencies"]
     assert told["chi2"] > 2 * told["readings"]
-    assert f"{told['pulls'][0]['name']} " in pulled_apart_texts(found)[1]
+    assert f"{told['pulls'][0]['name']} " in inconsistency_texts(found)[1]
     assert "pull gradients apart" in found.report()
 
 

@@ -54,7 +54,7 @@ class Pull:
 
 
 @dataclass(frozen=True)
-class PulledApart:
+class Inconsistency:
     """That the two disagree.
 
     Attributes:
@@ -76,7 +76,7 @@ class PulledApart:
         return {**vars(self), "pulls": [dict(vars(own)) for own in self.pulls]}
 
 
-def pulled_apart(state: State, false_alarm: float = DEFAULT.false_alarm) -> PulledApart | None:
+def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> Inconsistency | None:
     """What the two disagree about; None where they agree, no gradients were fitted or no RF's orbit
     was read.
 
@@ -111,7 +111,7 @@ def pulled_apart(state: State, false_alarm: float = DEFAULT.false_alarm) -> Pull
     for found in (alone, both):
         spread = mean @ found.spread[at]
         said.append((mean @ found.values[at], np.sum(spread @ found.covariance * spread, axis=1)))
-    return PulledApart(
+    return Inconsistency(
         float(np.sqrt(np.mean(missed**2))),
         float(np.sqrt(np.mean(np.diag(covariance)))),
         total,

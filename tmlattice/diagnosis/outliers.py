@@ -99,15 +99,15 @@ SHOWN = 4
 """Readings left out that a warning names."""
 
 
-def about_rejected(left_out: Sequence[Mapping[str, Any]]) -> list[str]:
+def about_rejected(outliers: Sequence[Mapping[str, Any]]) -> list[str]:
     """A sentence about rejected readings, if there are any."""
-    if not left_out:
+    if not outliers:
         return []
     some = "; ".join(
         f"{row['monitor']} {row['plane']}, "
         + ("the reference" if row["shot"] is None else f"shot {row['shot']}")
         + (f", turn {row['turn']}" if row["turn"] else "")
-        for row in left_out[:SHOWN]
+        for row in outliers[:SHOWN]
     )
-    more = f"; and {len(left_out) - SHOWN} more" if len(left_out) > SHOWN else ""
-    return [f"{len(left_out)} single readings are wrong for once and were left out: {some}{more}"]
+    more = f"; and {len(outliers) - SHOWN} more" if len(outliers) > SHOWN else ""
+    return [f"{len(outliers)} single readings are wrong for once and were left out: {some}{more}"]
