@@ -23,7 +23,8 @@ A machine whose fault is known, what its monitors read, and what that says:
 
 Your own: a folder, or a control room's file (`tmlattice import --example --out x` has templates):
 
->>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")
+>>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")      # or a pandas DataFrame
+>>> diagnosis.tables["errors"]                                          # and data frames back
 
 The paper's experiment, one orbit to the tunes, by the recipe and by what does better:
 

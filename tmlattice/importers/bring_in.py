@@ -241,11 +241,14 @@ def _bring(
     )
 
 
-def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
+def _table(source: Path | Any, ring: Ring | None, options: Options) -> Imported:
     """A response by its columns, else readings as they come."""
-    if path.suffix.lower() in CSV and is_response_table(read_columns(path)):
-        return bring_table(path, ring, options.told)
-    return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
+    name, columns = label(source), read_columns(source)
+    plain_text = not isinstance(source, Path) or source.suffix.lower() in CSV
+    if plain_text and is_response_table(columns):
+        return bring_table(name, columns, ring, options.told)
+    told = with_unit(options.told, options.unit, options.noise)
+    return bring_readings(name, columns, ring, told)
 
 
 def _framed(frame: Any, options: Options) -> Imported:
@@ -254,9 +257,7 @@ def _framed(frame: Any, options: Options) -> Imported:
     stated = of_document(as_frame(frame))
     if stated is not None:
         return Imported(stated, ring, ("everything is as `to_dataframe` wrote it",))
-    if is_response_table(read_columns(frame)):
-        return bring_table(frame, ring)
-    return bring_readings(frame, ring, with_unit(options.told, options.unit, options.noise))
+    return _table(frame, ring, options)
 
 
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
@@ -269,7 +270,7 @@ def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
         if options.turns or ring is None or path.suffix.lower() not in SDDS:
             raise
         told = with_unit(options.told, options.unit, options.noise)
-        return bring_readings(path, ring, told)
+        return bring_readings(label(path), read_columns(path), ring, told)
 
 
 def _with_conventions(brought: Imported, ring: Ring | None, options: Options) -> Imported:
