@@ -135,7 +135,7 @@ def test_the_oracle_finds_something_in_noise_at_the_stated_rate(tmp_path):
     assert 6 <= found <= 45  # 20 expected; Poisson, and N known to 15 %
 
 
-def test_the_oracle_of_several_causes_is_told_the_others(tmp_path):
+def test_the_oracle_of_several_causes_is_given_the_others(tmp_path):
     make("C", 1, 2, tmp_path, lattice=LATTICE, effects=EFFECTS, signal=(30, 60), progress=False)
     case, truth = read_case(tmp_path, "0000"), read_truth(tmp_path, "0000")
     judged = evaluate((case, truth))
@@ -369,7 +369,7 @@ def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
     shutil.copy(SMALL, "ring.py")
     folder, options = tmp_path / "set", {"lattice": "ring.py", "shots": 2, "progress": False}
     make("A", 1, 1, folder, **options)
-    with pytest.raises(TmlatticeError, match="holds another challenge"):
+    with pytest.raises(TmlatticeError, match="contains another challenge"):
         make("A", 2, 2, folder, **options)
     ring = (tmp_path / "ring.py").read_text()
     (tmp_path / "ring.py").write_text(ring.replace("k = 0.9\n", "k = 0.91\n"))
@@ -391,7 +391,7 @@ def test_a_damaged_truth_is_closed_again(made, tmp_path):
     assert not [own for own in told if own.category is ResourceWarning]
 
 
-def test_a_damaged_result_or_truth_is_told_and_not_fatal(made, tmp_path):
+def test_a_damaged_result_or_truth_is_reported_and_not_fatal(made, tmp_path):
     folder = tmp_path / "set"
     shutil.copytree(made, folder)
     run(folder, jobs=1, progress=False, lattice=LATTICE)

@@ -60,7 +60,7 @@ def wrong(small_ring, quadrupoles):
     return [Cause("quadrupole_gradient", quadrupoles[3 + 7 * i], a) for i, a in enumerate(amounts)]
 
 
-def test_single_quadrupoles_undo_their_own_errors(small_ring, wrong):
+def test_single_quadrupoles_correct_their_own_errors(small_ring, wrong):
     machine = apply(small_ring, wrong)
     found = correct(machine, goal=small_ring, knobs=["quadrupoles"], targets=NO_ORBIT)
     assert {s.knob.name for s in found.settings[:4]} == {cause.element for cause in wrong}
@@ -77,7 +77,7 @@ def test_single_quadrupoles_undo_their_own_errors(small_ring, wrong):
     np.testing.assert_allclose(predicted, before, rtol=0.01)
 
 
-def test_supplies_gain_what_at_says(small_ring, wrong, quadrupoles):
+def test_supplies_gain_as_in_at(small_ring, wrong, quadrupoles):
     """Two supplies that are wrong by themselves, and errors of magnets that they cannot undo."""
     supplies = [Cause("family_gradient", "QF", 0.01), Cause("family_gradient", "QD", -0.006)]
     machine = apply(small_ring, [*wrong, *supplies])
@@ -235,11 +235,11 @@ def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
     ("- {knob: nothing}", "state its members"),
     ("- {knob: QF, present: 0}", "present strength is 0"),
     ("- {knob: QF, low: 2, high: 1}", "limits are 2 and 1"),
-    ("- {knob: QF, curve: '0:0 1:1 2:0.5', unit: A, present: 1}", "has to rise, or fall"),
+    ("- {knob: QF, curve: '0:0 1:1 2:0.5', unit: A, present: 1}", "must rise, or fall"),
     ("- {knob: QF, unit: A}", "state its present setting"),
-    ("- {knob: QF, step: much}", "no number"),
+    ("- {knob: QF, step: much}", "not a number"),
     ("- {knob: QF, colour: red}", "unknown column"),
-    ("- {knob: QF}\n- {knob: QF}", "stands twice"),
+    ("- {knob: QF}\n- {knob: QF}", "occurs twice"),
     ("- {knob: q, members: QF::1, kind: pump}", "no kind 'pump'"),
     ("knob: QF", "no list of knobs"),
 ])  # fmt: skip

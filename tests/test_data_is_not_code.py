@@ -267,9 +267,9 @@ def test_a_case_runs_no_lattice_that_is_not_named(tmp_path, monkeypatch):
     case = Path("set/cases/0000/case.json")
     case.write_text(case.read_text().replace("small_ring.py", "evil.py"))
     told = run(Path("set"), jobs=1, progress=False, lattice="small_ring.py")
-    assert "say --lattice evil.py" in told["0000"]["error"]
+    assert "give --lattice evil.py" in told["0000"]["error"]
     with pytest.raises(TmlatticeError, match="is Python code, which would be run"):
         run(Path("set"), jobs=1, progress=False)
     done = tmlattice("dev", "challenge", "run", "set", "-q", cwd=tmp_path, check=2)
-    assert "say --lattice small_ring.py" in done.stderr
+    assert "give --lattice small_ring.py" in done.stderr
     assert not Path("MARK").exists()

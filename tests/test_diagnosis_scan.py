@@ -161,7 +161,7 @@ def test_the_least_amount_that_is_seen_reaches_the_threshold(base, name):
     assert seen @ seen == pytest.approx(found.threshold(judgement.false_alarm), rel=0.01)
 
 
-def test_noise_is_estimated_within_five_percent_beside_a_strong_fault(petra3):
+def test_noise_is_estimated_within_five_percent_despite_a_strong_fault(petra3):
     causes = [Cause("quadrupole_gradient", "qd::12", -0.2), Cause("monitor_swap", "bpm_a4_3", 1.0)]
     base = Base(petra3, causes, noise=(3e-5, 1.5e-5))
     blind = base.data

@@ -149,7 +149,7 @@ def test_an_effect_leaves_the_given_ring_unchanged(petra3, name):
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_an_effect_says_what_it_is(petra3, name):
+def test_an_effect_describes_itself(petra3, name):
     effect = CATALOGUE[name]
     assert effect.name == name
     assert all([effect.unit, effect.sign, effect.sits_on_text])
@@ -347,7 +347,7 @@ def test_energy_spread_is_a_gaussian_average():
         (Cause("monitor_swap", "bpm_a4_3", 0.3), EffectError, "there or not"),
     ],
 )
-def test_impossible_causes_are_refused_with_the_mend(petra3, cause, error, says):
+def test_impossible_causes_are_errors_with_a_remedy(petra3, cause, error, says):
     with pytest.raises(error, match=says):
         check(petra3, [cause])
 

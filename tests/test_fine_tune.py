@@ -75,7 +75,7 @@ def test_early_stop_ends_a_fit_that_has_settled(small_network):
     assert not fit(small_network, settled, epochs=50, patience=None).stopped_early
 
 
-def test_missing_readings_are_left_out(small_network, weakened):
+def test_missing_readings_are_ignored(small_network, weakened):
     readings = weakened.readings.copy()
     readings[0, 0, 3:9, 0] = np.nan
     readings[1, 0, 20] = np.nan
@@ -129,7 +129,7 @@ def test_penalty_relative_to_the_design_starts_at_zero(small_network, weakened):
     assert result.penalty[-1] > 0
 
 
-def test_diverging_fit_says_what_to_change(small_network, weakened):
+def test_diverging_fit_reports_what_to_change(small_network, weakened):
     with pytest.raises(BeamLostError, match=r"diverged in epoch .*lower the learning rate"):
         fit(small_network, weakened, learning_rate=10.0)
 

@@ -140,7 +140,7 @@ def test_sparse_states_how_far_explanations_are_apart(small_ring, small_network)
     np.testing.assert_allclose(both.tune_sigma, apart / np.sqrt(2), rtol=0.05)
 
 
-def test_sparse_says_what_it_needs(small_ring, small_network):
+def test_sparse_reports_what_it_needs(small_ring, small_network):
     _, measurement = measured(small_ring, ["QD::5"], -0.05)
     bare = TaylorNetwork(small_network.maps)
     with pytest.raises(TmlatticeError, match="ring="):

@@ -284,6 +284,12 @@ def test_a_frame_that_lacks_a_column_names_it(small_ring, measured):
         OrbitResponse.from_dataframe(frame, ring=small_ring)
     with pytest.raises((MeasurementError, UnknownNameError), match="no monitor 'nowhere'"):
         tmlattice.diagnose(small_ring, frame.assign(monitor="nowhere").iloc[:1])
+    frame.attrs["units"] = "mm"
+    with pytest.raises(MeasurementError, match="give the unit of each column"):
+        Measurement.from_dataframe(frame)
+    frame.attrs = {"measurement": "{"}
+    with pytest.raises(MeasurementError, match="is no JSON"):
+        Measurement.from_dataframe(frame)
     changed = measured.to_dataframe()
     changed.loc[3, "x"] = 5.0
     with pytest.raises(MeasurementError, match=r"DataFrame.*line 5: x = 5 m is above"):

@@ -116,7 +116,7 @@ def test_a_learnt_response_may_step_some_correctors(small_ring, tmp_path, monkey
     with pytest.raises(TmlatticeError, match="17 correctors, no 18"):
         evenly(small_ring, 18)
     assert len(set(evenly(small_ring, 17))) == 17
-    with pytest.raises(TmlatticeError, match="say --learnt too"):
+    with pytest.raises(TmlatticeError, match="give --learnt too"):
         make("B", 1, folder=tmp_path / "other", correctors=6, progress=False, **some)
 
     def lost(*_, **__):

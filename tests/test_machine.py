@@ -214,7 +214,7 @@ def test_background_is_scaled_and_named_effects_win(small_ring):
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
-        ({"energy_offset": None}, "no usual size; say energy_offset=RMS"),
+        ({"energy_offset": None}, "no usual size; give energy_offset=RMS"),
         ({"monitor_roll": -1.0}, "zero or more"),
         ({"all": float("nan")}, "zero or more"),
     ],
@@ -273,7 +273,7 @@ def test_written_folder_reads_back_as_the_measurement(simulation, tmp_path):
     )  # fmt: skip
 
 
-def test_folder_tells_nothing_of_the_truth(simulation, tmp_path):
+def test_folder_contains_nothing_of_the_truth(simulation, tmp_path):
     simulation.write(tmp_path / "day", progress=False)
     files = sorted(path.name for path in (tmp_path / "day").iterdir())
     assert files == ["measurement.json", "readings.csv"]

@@ -314,5 +314,5 @@ def test_the_command_line_states_the_lattice_too(machine, tmp_path):
         out = tmp_path / "info.json"
         tmlattice(*words, "--json", out, cwd=machine, check=0)
         assert json.loads(out.read_text())["energy_gev"] == 2.5
-    done = tmlattice("effects", "--energy", "3", check=2)
+    done = tmlattice("effects", "--energy", "3", cwd=tmp_path, check=2)
     assert "--energy has no meaning for effects" in done.stderr

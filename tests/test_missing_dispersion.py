@@ -134,7 +134,7 @@ def measured(small_ring, beside):
     return causes, plain, with_kicks(small_ring, plain, beside)
 
 
-def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, measured):
+def test_gradients_are_not_biased_by_other_dispersion(small_ring, measured):
     causes, plain, kicked = measured
     amounts = {cause.element: cause.amount for cause in causes}
     missed, said = [], []
@@ -260,7 +260,7 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
     for row, said in (
         ('{"element": "QF::1", "x": 0, "y": 0}', "is a quadrupole"),
         ('{"element": "v1", "x": 1e999, "y": 0}', "is no number"),
-        ('{"element": "v1", "x": 0, "y": 0}, {"element": "v1", "x": 0, "y": 0}', "stands twice"),
+        ('{"element": "v1", "x": 0, "y": 0}, {"element": "v1", "x": 0, "y": 0}', "occurs twice"),
     ):
         other = tmp_path / "other.json"
         other.write_text(
@@ -291,7 +291,7 @@ def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, besid
     assert said[0].amount < 5e-5 < said[1].amount < 1e-3
 
 
-def test_without_the_rf_nothing_is_said_of_it(small_ring):
+def test_without_the_rf_nothing_is_reported_of_it(small_ring):
     measured = simulated(small_ring, [], kick=1e-5, noise=2e-8, engine="ocelot")
     state = state_of(small_ring, replace(measured, rf=None), False)
     assert HYPOTHESES["dispersion"](state) is None
@@ -346,7 +346,7 @@ def test_a_kick_that_a_particle_of_another_energy_misses(ring_kicking_x, monkeyp
 
 
 @pytest.mark.parametrize("plane", [0, 1])
-def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_ring, plane):
+def test_a_model_with_orbit_kicks_has_their_dispersion_and_its_slopes(small_ring, plane):
     """In a ring that is changed, too: the layers that are made anew have theirs. Slopes against
     differences, to what these are good for."""
     design = ResponseModel(small_ring)

@@ -84,13 +84,17 @@ def test_at_lattice_is_the_ring_of_its_file():
         load_ring(lattice)
 
 
-def test_at_misalignments_and_periods_come_over():
+def test_at_misalignments_periods_and_particle_come_over():
     lattice = at.load_lattice(str(SHIPPED / "hmba.mat"))
     assert load_ring(lattice).length == pytest.approx(lattice.periodicity * lattice.cell_length)
     at.shift_elem(lattice[20], 2e-4, -1e-4)
     name = lattice[20].FamName.lower()
     moved = load_ring(lattice)[f"{name}*"][0]
     assert (moved.errors.dx, moved.errors.dy) == (2e-4, -1e-4)
+    lattice.particle = at.Particle("proton")
+    proton = load_ring(lattice)
+    assert proton.mass == pytest.approx(load_ring(proton, particle="proton").mass, rel=1e-6)
+    assert not proton.radiates
 
 
 def test_ocelot_elements_in_lists_and_lattices():
@@ -172,6 +176,27 @@ def test_sequence_of_cpymad_with_its_errors_has_madx_optics(madx, what):
     np.testing.assert_allclose(found.x[0], theirs.x[0], rtol=0, atol=2e-8)
     np.testing.assert_allclose(found.y[0], theirs.y[0], rtol=0, atol=2e-8)
     np.testing.assert_allclose(found.dx[0], theirs.dx[0], rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("kind", ["line", "sequence"])
+def test_offset_of_an_element_acts_as_in_madx(madx, kind):
+    """In a LINE it does nothing, in a SEQUENCE it does."""
+    elements = """beam, particle=electron, energy=3; m: monitor; d: drift, l=0.5;
+    qf: quadrupole, l=0.4, k1=0.91, dx=1e-4; qd: quadrupole, l=0.4, k1=-1;
+    b: sbend, l=1.2, angle=2*pi/16;"""
+    line = "cell: line=(qf, d, b, d, qd, d, m, d); ring: line=(16*cell);"
+    cells = "".join(f"cell, at={4 * i}; " for i in range(16))
+    sequence = f"""cell: sequence, l=4, refer=entry; qf, at=0; b, at=0.9; qd, at=2.6; m, at=3.5;
+    endsequence; ring: sequence, l=64, refer=entry; {cells} endsequence;"""
+    one = madx(elements + {"line": line, "sequence": sequence}[kind] + "use, sequence=ring;")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        orbit = load_ring(one).twiss().x[0]
+    assert any("DX of the QUADRUPOLE (as in a LINE)" in str(w.message) for w in caught) == (
+        kind == "line"
+    )
+    assert orbit == pytest.approx(one.twiss().x[0], abs=1e-12)
+    assert (abs(orbit) > 1e-4) == (kind == "sequence")
 
 
 def test_sequence_of_cpymad_is_that_of_its_file(madx, tmp_path):
@@ -421,6 +446,25 @@ def test_cavity_of_xtrack_is_at_the_stable_phase(madx):
         assert 0 < quiet(line.twiss).qs < 0.1
 
 
+def test_errors_of_monitors_are_read_by_madx(small_ring, madx):
+    """What MAD-X's CORRECT takes for readings of the closed orbit: gain, then offset."""
+    offset, gain = Cause("monitor_offset_x", "bpm::7", 2e-4), Cause("monitor_gain_x", "bpm::7", 0.1)
+    other = Cause("monitor_offset_x", "bpm::3", 1e-3)
+    ring = apply(small_ring, FAULTS)
+    with pytest.warns(UserWarning, match="monitor_roll of bpm::1 cannot be written"):
+        text = ring.to_madx([offset, gain, other, Cause("monitor_roll", "bpm::1", 0.01)])
+    one = madx(text)
+    one.twiss()
+    one.input("correct, plane=x, mode=lsq, monerror=1, monscale=1, error=1e-8;")
+    table = one.table.mon
+    read = dict(zip(table.name, table["x.old"], strict=True))
+    optics = ring.twiss()
+    beam = dict(zip(optics.name, optics.x, strict=True))
+    for k in range(16):
+        expected = beam[f"bpm::{k}"] * (1.1 if k == 7 else 1.0) + {7: 2e-4, 3: 1e-3}.get(k, 0.0)
+        assert read[f"bpm:{k + 1}"] == pytest.approx(expected, abs=1e-9), k
+
+
 def test_objects_do_not_share_their_elements_with_the_ring(small_ring):
     lattice = small_ring.to_ocelot()
     magnet = next(e for e in lattice.sequence if e.id == "QD")
@@ -499,7 +543,7 @@ def test_methods_are_seen_by_editors(small_ring):
     for name in ("to_at", "to_ocelot", "to_xtrack", "to_madx", "to_dataframe", "twiss"):
         method = getattr(small_ring, name)
         assert name in dir(small_ring)
-        assert not inspect.signature(method).parameters
+        assert [*inspect.signature(method).parameters] == ["calibration"] * (name == "to_madx")
         assert method.__doc__.startswith("Return")
 
 

@@ -82,10 +82,10 @@ def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
         ]
         return np.sqrt(np.mean(np.square(left)))
 
-    tried = replace(state, closed=(BendGradient(),))
+    tried = replace(state, rejected=(BendGradient(),))
     assert pull(state) > 10
     assert pull(tried) < 3  # their scale is a first guess, one number
-    assert not allow(tried, [BendGradient()]).closed
+    assert not allow(tried, [BendGradient()]).rejected
 
 
 def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):

@@ -19,7 +19,7 @@ from tmlattice.observe.calibration import (
     read_calibration,
     write_calibration,
 )
-from tmlattice.observe.predict import predict
+from tmlattice.observe.response_errors import predict
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 CAUSES = [

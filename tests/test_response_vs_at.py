@@ -16,7 +16,7 @@ from tmlattice.effects import CATALOGUE, RingEffect, apply
 from tmlattice.errors import EffectError, MeasurementError, UnknownNameError
 from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine
-from tmlattice.observe.predict import predict
+from tmlattice.observe.response_errors import predict
 
 REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"
 real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no PETRA III response")
@@ -207,7 +207,7 @@ def test_refusals(small_ring):
     model = ResponseModel(small_ring)
     with pytest.raises(UnknownNameError, match="did you mean"):
         model.response(["v33"])
-    with pytest.raises(MeasurementError, match="no corrector"):
+    with pytest.raises(MeasurementError, match="not a corrector"):
         model.response(["QF::0"])
     with pytest.raises(EffectError, match="does not act on the ring"):
         derivatives(model, [("monitor_gain_x", "last_a")])

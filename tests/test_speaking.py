@@ -182,8 +182,10 @@ def test_a_name_or_a_path_goes_where_a_ring_or_a_measurement_does(
     network = tmlattice.TaylorNetwork.from_ring(small_ring)
     fit = tmlattice.fine_tune(network, tmp_path / "day", method="sparse", launch_sigma=np.inf)
     assert set(fit.changes) == {"QD::5"}
+    again = tmlattice.fine_tune(network, tmp_path / "a.csv", method="sparse", noise=1e-6)
+    assert set(again.changes) == {"QD::5"}  # the names are those of the network's ring
     with pytest.raises(MeasurementError, match="give the ring with it"):
-        tmlattice.fine_tune(network, tmp_path / "a.csv")
+        tmlattice.fine_tune(tmlattice.TaylorNetwork(network.maps), tmp_path / "a.csv")
     with pytest.raises(tmlattice.TmlatticeError, match="no lattice 'petra4'; did you mean"):
         tmlattice.simulate("petra4")
 

@@ -164,7 +164,7 @@ def test_bad_monitors_harm_no_other(rng):
     assert_pulls(pulls(result, amplitude, good))  # that with spikes too
     said = " ".join(result.warnings)
     assert "monitor 'b2' stands still" in said
-    assert "more than 8 times the noise off" in said
+    assert "more than 8 times the noise from the fit" in said
     assert result.noise[8].min() > 20 * NOISE
     # a turn late: the phase of the mode's own tune
     late = result.amplitude[0, 12, 0, 0] / result.amplitude[0, 13, 0, 0]
@@ -209,7 +209,7 @@ def test_tune_above_half_is_not_folded(rng):
     assert np.std(left) < 1.1 * NOISE  # the convention as it is stated
 
 
-def test_modes_are_told_by_plane_and_not_by_strength(rng):
+def test_modes_are_identified_by_plane_and_not_by_strength(rng):
     readings, _ = signal(rng, size=(5e-5, 2e-3))
     assert_allclose(found(readings).tune, [Q] * SHOTS, atol=1e-4)
     exchanged = signal(rng, tunes=Q[::-1])[0]
@@ -225,7 +225,7 @@ def test_one_plane_alone(rng):
     assert "no monitor reads y" in " ".join(result.warnings)
 
 
-def test_mode_that_was_not_kicked_is_missing_and_said(rng):
+def test_mode_that_was_not_kicked_is_missing_and_reported(rng):
     result = found(signal(rng, size=(1e-3, 0.0))[0])
     assert np.isfinite(result.tune[:, 0]).all()
     assert np.isnan(result.tune[:, 1]).all()
@@ -233,7 +233,7 @@ def test_mode_that_was_not_kicked_is_missing_and_said(rng):
     assert "no line of the mode nearer to y is found" in result.warnings[0]
 
 
-def test_tunes_that_are_not_parted_are_said(rng):
+def test_unresolved_tunes_are_reported(rng):
     near = found(signal(rng, tunes=(0.2, 0.2 + 1.5 / TURNS), turns=TURNS)[0])
     assert np.isnan(near.amplitude).all()
     assert "600 turns do not resolve their lines" in near.warnings[0]
@@ -251,8 +251,8 @@ def test_noise_has_no_lines(rng):
         assert "no betatron line exceeds the noise" in result.warnings[0]
 
 
-def test_noise_that_is_stated_wrongly_is_said(rng):
+def test_noise_that_is_stated_wrongly_is_reported(rng):
     readings, _ = signal(rng)
-    assert lines(recorded(readings, noise=(NOISE, NOISE))).said == ()
-    (said,) = lines(recorded(readings, noise=(NOISE / 5, NOISE / 5))).said
+    assert lines(recorded(readings, noise=(NOISE, NOISE))).warnings == ()
+    (said,) = lines(recorded(readings, noise=(NOISE / 5, NOISE / 5))).warnings
     assert "is 5 times the stated noise" in said

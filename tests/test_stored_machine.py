@@ -91,7 +91,7 @@ def test_lines_of_a_small_kick_are_at_modes(tiny):
     vectors, tunes = at_modes(tiny, UPRIGHT)
     simulation = simulate_turns(tiny, UPRIGHT, turns=200, amplitude=1e-6, noise=1e-11)
     found = lines(simulation.measured, near=tunes, at=places(tiny))
-    assert found.said == ()
+    assert found.warnings == ()
     assert_allclose(found.tune[0], tunes, atol=1e-7)
     off = deviations(found, vectors)
     assert 0.7 < np.sqrt(np.mean(off**2)) < 1.3  # 120 numbers
@@ -212,7 +212,7 @@ def test_same_seed_same_readings_and_more_shots_keep_the_first(tiny):
     assert not np.array_equal(one, readings(shots=2, seed=5))
 
 
-def test_truth_says_what_was_done(tiny):
+def test_truth_states_what_was_done(tiny):
     simulation = simulate_turns(tiny, CAUSES, turns=20, particles=2, background={"all": None})
     truth = simulation.truth()
     assert [e["effect"] for e in truth["effects"]] == [c.effect for c in CAUSES]

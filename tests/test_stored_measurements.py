@@ -174,7 +174,7 @@ NAN = math.nan
         (lambda: TuneReading([[0.1, 0.2]], None, None, [[0.1, 0.1]]), "need chromaticities"),
     ],
 )
-def test_records_that_cannot_be_say_why(make, words):
+def test_impossible_records_are_errors_with_a_reason(make, words):
     with pytest.raises((MeasurementError, UnknownNameError), match=words):
         make()
 

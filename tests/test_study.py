@@ -85,7 +85,7 @@ def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(mon
     assert summary["methods"]["sparse"]["predicted"] == 2
 
 
-def test_no_scheduler_and_no_method_are_said(tmp_path):
+def test_no_scheduler_and_no_method_are_reported(tmp_path):
     with pytest.raises(TmlatticeError, match="no method 'magic'"):
         study_tune_fit(SMALL, ["magic"])
 

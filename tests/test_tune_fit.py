@@ -14,7 +14,7 @@ from tmlattice.optics import matrix_tunes
 QUICK = {"progress": False, "epochs": 20}
 
 
-def test_a_change_that_nobody_gave_is_one_that_the_ring_survives(small_ring):
+def test_the_default_change_leaves_the_ring_stable(small_ring):
     """At each step down the ring is unstable until it is taken."""
     stiff = small_ring
     for name in ("QD::5", "QD::6"):  # two together leave less room
@@ -33,7 +33,7 @@ def test_a_change_that_nobody_gave_is_one_that_the_ring_survives(small_ring):
     assert change == steps[unstable.index(False)]
 
 
-def test_an_unstable_change_names_the_options_that_mend_it(small_ring):
+def test_an_unstable_change_names_the_options_that_fix_it(small_ring):
     with pytest.raises(UnstableRingError, match=r"'QD::5' changed by -300 %.*--change.*--magnet"):
         tune_fit(small_ring, "QD::5", -3.0, **QUICK)
 
@@ -97,7 +97,7 @@ def test_every_method_fits_launches_that_are_off(small_ring, weak):
     assert outcome.best is outcome.trusted is sparse
 
 
-def test_a_fit_that_leaves_more_than_the_noise_says_so(small_ring):
+def test_a_residual_above_the_noise_is_reported(small_ring):
     """A tilted quadrupole is no change of strength: no method explains it."""
     tilted = simulate(
         small_ring, [Cause("quadrupole_roll", "QD::5", 0.05)], shots=3, amplitude=3e-4,

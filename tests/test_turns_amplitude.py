@@ -114,7 +114,7 @@ def test_a_quadrupole_is_found_at_a_large_amplitude(small_ring):
     assert found.findings[0].element == "QD::3"
 
 
-def test_an_amplitude_beyond_second_order_is_said():
+def test_an_amplitude_beyond_second_order_is_reported():
     with pytest.warns(UserWarning, match="octupoles"):
         ring = load_ring(SHIPPED / "hmba.mat", correctors="SH*")
     turns = simulate_turns(ring, amplitude=2e-3, turns=256, seed=0).measured

@@ -166,7 +166,7 @@ def test_harmonic_numbers_of_known_rings(tmp_path, length, harmonic):
     assert rf_of(load_ring(path)).harmonic == harmonic
 
 
-def test_a_cavity_says_its_harmonic_and_voltage(with_cavities):
+def test_a_cavity_gives_its_harmonic_and_voltage(with_cavities):
     rf = rf_of(with_cavities)
     assert rf.harmonic == round(5e8 * with_cavities.length / 299792458)
     assert rf.voltage == pytest.approx(2e6)
@@ -174,7 +174,7 @@ def test_a_cavity_says_its_harmonic_and_voltage(with_cavities):
     assert rf_of(with_cavities, harmonic=7, voltage=1e5).harmonic == 7
 
 
-def test_a_lost_beam_says_shot_turn_and_magnet(small_ring):
+def test_a_lost_beam_states_shot_turn_and_magnet(small_ring):
     """Between the last monitor that sees it and the first that does not."""
     settings = [{}, {"v5": {"kick": 0.02}}, {}]
     model = Model(small_ring, settings, 2)

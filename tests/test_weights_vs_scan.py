@@ -146,7 +146,7 @@ def test_a_symplectic_change_without_a_name_is_symplectic(
 ):
     """The flow of H = x px y behind a magnet: no effect of the catalogue does that."""
     layer = layer_of(small_ring, name)
-    own = small_network.layer_map(layer)
+    own = TaylorMap([w[layer] for w in small_network.weights()])
     bends = np.zeros((4, 10))
     bends[0, 2] = 1e-3  # x' = dH/dpx = x y: the pair (x, y)
     bends[1, 5] = -1e-3  # px' = -dH/dx = -px y
@@ -168,7 +168,7 @@ def test_a_change_that_is_not_symplectic_is_the_rest(
     """x and px both grow with y: no H does that. A symplectic change comes nearest to three
     quarters of it, in what monitors see, and no effect to any."""
     layer = layer_of(small_ring, "QF::5")
-    own = small_network.layer_map(layer)
+    own = TaylorMap([w[layer] for w in small_network.weights()])
     bends = np.zeros((4, 10))
     bends[0, 2] = bends[1, 5] = 1e-3
     bent = TaylorMap([np.zeros(4), np.eye(4), bends]).after(own, 2)
@@ -259,7 +259,7 @@ def test_symplectic_directions_are_all_and_only_those_without_defect(small_netwo
     assert np.abs(conditions @ rows.T).max() < 1e-5 * size  # OCELOT's own defect is 2e-6
 
 
-def test_the_designs_network_says_nothing(small_ring, small_network, measurement, effects):
+def test_the_designs_network_has_no_score(small_ring, small_network, measurement, effects):
     reading = read_network(small_ring, small_network, measurement, effects)
     assert not reading.raw.any()
     assert not reading.amount.any()

@@ -6,10 +6,12 @@ is wrong.
 
 The tour
 --------
-A ring is a built-in name, a lattice file (OCELOT, AT, MAD-X, elegant, Xsuite), or a `Ring`:
+A ring is a built-in name, a lattice file (OCELOT, AT, MAD-X, elegant, Xsuite), an object of AT,
+Xsuite, OCELOT or cpymad, or a `Ring`:
 
 >>> import tmlattice
 >>> ring = tmlattice.load_ring("petra3")
+>>> ring["qd*"], ring.twiss().to_dataframe(), ring.to_at()
 >>> figure = ring.plot()                                   # betas and magnets
 
 A machine whose fault is known, what its monitors read, and what that says:
@@ -21,7 +23,8 @@ A machine whose fault is known, what its monitors read, and what that says:
 
 Your own: a folder, or a control room's file (`tmlattice import --example --out x` has templates):
 
->>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")
+>>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")      # or a pandas DataFrame
+>>> diagnosis.tables["errors"]                                          # and data frames back
 
 The paper's experiment, one orbit to the tunes, by the recipe and by what does better:
 

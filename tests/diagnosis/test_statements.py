@@ -16,6 +16,7 @@ from tmlattice.effects import background_rms
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.machine.response import simulate_response
 from tmlattice.report.page import page
+from tmlattice.report.plain import report_text
 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
 USUAL = background_rms({"all": None})
@@ -93,6 +94,18 @@ def test_text_page_and_json_state_the_same_sentences(results, name):
         assert sentence in html
         assert sentence in stated.values()
     assert document["unexplained"]["p_value"] == document["assessment"]["p_value"]
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_terminal_has_the_answer_and_names_what_it_leaves_out(results, name):
+    result = results[name]
+    whole, short = (report_text(result, 80, most) for most in (None, 34))
+    assert len(short.splitlines()) <= 34
+    assert short.splitlines()[0] == whole.splitlines()[0]
+    assert in_a_line(result.assessment.sentence("gap")) in in_a_line(short)
+    for paragraph in whole.split("\n\n"):
+        if paragraph not in short:
+            assert "More in report.txt of --out DIR" in short
 
 
 CONTRADICTIONS = (

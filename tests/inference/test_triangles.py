@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.triangles import MAX_LAPACK, inverse_of_lower, lower_factor
+from tmlattice.inference.normal import MAX_LAPACK, inverse_of_lower, lower_factor
 
 
 @pytest.mark.parametrize("n", [1, 7, MAX_LAPACK, MAX_LAPACK + 1, 3 * MAX_LAPACK + 5, 431])

@@ -54,7 +54,7 @@ def test_maps_follow_growth_collapse_and_rebound():
     assert steps[smallest].max() < steps.max()
 
 
-def test_a_ladder_that_is_too_short_says_so():
+def test_a_ladder_that_is_too_short_is_an_error():
     bubble = Bubble(drive=0.8)
     with pytest.raises(OdeError, match="more halvings"):
         ladder(bubble, order=3, halvings=2).follow(bubble.start, bubble.period)

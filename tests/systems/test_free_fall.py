@@ -45,7 +45,7 @@ def test_runge_kutta_is_a_map_of_degree_16_that_is_right_to_the_fifth_power_of_t
     np.testing.assert_allclose(runge_kutta_map(step)([v]), [by_hand], rtol=1e-14)
 
 
-def test_errors_fall_with_the_step_as_the_orders_say():
+def test_errors_fall_with_the_step_by_the_order():
     errors = step_errors([0.2, 0.1])
     slopes = {k: np.log2(e[0] / e[1]) for k, e in errors.taylor.items()}
     assert np.log2(errors.euler[0] / errors.euler[1]) == pytest.approx(1, abs=0.1)

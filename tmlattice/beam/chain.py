@@ -19,7 +19,7 @@ from tmlattice.beam.sweeps import curved
 from tmlattice.by_name import by_name
 from tmlattice.errors import BeamLostError, UnstableRingError
 from tmlattice.lattice.ring import Ring
-from tmlattice.maps import RingMaps, TaylorMap, ring_maps
+from tmlattice.maps import RingMaps, ring_maps
 
 Array = NDArray[np.float64]
 
@@ -291,10 +291,6 @@ class Chain(LayerChain):
     def turn(self) -> Layers:
         """A copy of the layers of one turn, with the drift to the ring's end."""
         return Layers.of(self.maps, self.weights())
-
-    def layer_map(self, layer: int) -> TaylorMap:
-        """One layer as a Taylor map."""
-        return TaylorMap([w[layer] for w in self.weights()])
 
     def _forward(self, size: sweeps.Size, states: Array) -> None:
         W0, W1, W2 = self.weights()

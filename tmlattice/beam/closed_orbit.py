@@ -72,7 +72,7 @@ class ResponseModel:
             x and y, see `beam.kicks`, rad, [magnet, 2]; six coordinates. None: no kicks.
 
     Attributes:
-        ring, layers, maps, frequency, astray: what it was made from.
+        ring, layers, maps, frequency, orbit_kicks: arguments.
         state: the closed orbit at the start of the ring, [n].
         path: at the start, at the layers' exits and at the end of the ring, [layer + 2, n].
         tangents: matrices from the start to there, [layer + 2, n, n].

@@ -1,4 +1,4 @@
-"""The blind challenge: the diagnosis checked on data whose cause is withheld.
+"""The blind challenge: the diagnosis tested on data whose cause is withheld.
 
 >>> make("A", 300, 1, Path("blind"))
 >>> run(Path("blind"))                       # reads no truth

@@ -1,6 +1,6 @@
-"""What plain methods make of a case: they know the design, and fit the launches first.
+"""Simple methods on a case: they have the design, and fit the launches first.
 
-Each names three suspects at most, whatever the data: none of them can say that nothing is wrong.
+Each returns three suspects at most for any data: none of them can report that nothing is wrong.
 """
 
 import warnings
@@ -29,11 +29,11 @@ CHUNK = 512
 
 
 def baselines(case: Case) -> dict[str, Guesses]:
-    """First guesses, {"effect", "element"}, by method.
+    """Return first guesses, {"effect", "element"}, by method.
 
     "svd_gradients" is the pseudo-inverse over all gradients, "omp" orthogonal matching pursuit and
     "lasso" the LASSO over the whole catalogue; "weight_change" is the magnet whose layer changes
-    most when a network is fine-tuned by the paper's recipe, and names no effect.
+    most when a network is fine-tuned by the paper's recipe, without an effect.
     """
     ring = ring_of(case.lattice)
     data = of_measurement(ring, case.fit)
@@ -75,7 +75,7 @@ def baselines(case: Case) -> dict[str, Guesses]:
 
 
 def pursuits(rows: Array, residual: Array) -> dict[str, Array]:
-    """Weights of signatures, each of unit length, by matching pursuit and by the LASSO.
+    """Return weights of signatures of unit length by matching pursuit and by the LASSO.
 
     Args:
         rows: signatures, nuisances projected out, [hypothesis, row].
@@ -91,10 +91,10 @@ def pursuits(rows: Array, residual: Array) -> dict[str, Array]:
     unit = (rows[seen] / size[seen, None]).T
     atoms, weights = np.zeros((2, len(rows)))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # nearly equal columns: that is what makes them baselines
+        warnings.simplefilter("ignore")  # nearly equal columns
         atoms[seen] = orthogonal_mp(unit, residual, n_nonzero_coefs=SUSPECTS)
         level = np.sqrt(2 * np.log(len(seen)))  # the universal threshold
-        strong = np.flatnonzero(np.abs(unit.T @ residual) >= level)  # the others stay out at first
+        strong = np.flatnonzero(np.abs(unit.T @ residual) >= level)  # the others start at zero
         if len(strong):
             lasso = Lasso(alpha=level / len(residual), fit_intercept=False, max_iter=100, tol=1e-3)
             weights[seen[strong]] = lasso.fit(unit[:, strong], residual).coef_
@@ -107,14 +107,14 @@ def _design(lattice: str) -> TaylorNetwork:
 
 
 def _weight_change(case: Case, data: Data, paths: Paths, launches: Array) -> Guesses:
-    """Layers that change most, fine-tuned on the orbits that the ring would have unset.
+    """Layers that change most, fine-tuned on the orbits of the unset ring.
 
-    The network is the design's, without the correctors that a shot sets: what the model says of
-    them is taken from the readings.
+    The network is the design's, without the correctors that a shot sets: their modelled effect is
+    subtracted from the readings.
     """
     network = _design(case.lattice)
     at_energy = launches.copy()
-    at_energy[:, 4] = 0.0  # a network of four coordinates has none
+    at_energy[:, 4] = 0.0  # not a coordinate of a network of four
     unset = network.readings(at_energy[:, :4])
     readings = np.where(data.valid, data.readings - paths.readings + unset, np.nan)
     orbit = Measurement(at_energy, readings[:, None], network.monitors, noise=case.fit.noise)

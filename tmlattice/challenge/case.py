@@ -1,14 +1,14 @@
-"""A challenge on disk: what everybody may see, and, in a folder apart, what was really there.
+"""A challenge on disk: its public part, and the truth in a separate folder.
 
 DIR/challenge.json                   tier and lattice
-DIR/cases/NAME/case.json             options that the diagnosis may know
+DIR/cases/NAME/case.json             options of the diagnosis
 DIR/cases/NAME/fit|heldout|reference measurement folders of first turns, or one of each kind, and
                                      before_KIND of the machine before the fault
 DIR/cases/NAME/learnt                its orbit response before the fault
 DIR/truth/NAME.json, NAME.npz        causes, launches, readings without noise
-DIR/truth/made.json                  seed, and what was drawn anew
+DIR/truth/made.json                  seed, and rejected draws
 DIR/results/NAME.json                the diagnosis
-DIR/oracle/NAME.json                 what the data allow, and plain baselines
+DIR/oracle/NAME.json                 the oracle's answer, and those of simple baselines
 """
 
 from collections.abc import Mapping
@@ -51,23 +51,23 @@ CAUSES = {
 TIERS = tuple(CAUSES)
 
 BEFORE = "before_"
-"""What the folder of a kind is called that was measured before the fault."""
+"""Prefix of the folder of a kind that was measured before the fault."""
 LEARNT = "learnt"
-"""What the folder is called of an orbit response of the machine before the fault."""
+"""Folder of an orbit response of the machine before the fault."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What a diagnosis may know.
+    """Public part of a case.
 
     Attributes:
         name: of the case.
-        lattice: what `load_ring` takes.
-        parts: the measurements by folder: fit, heldout and perhaps reference of first turns; or
-            one of each kind by its name, and `before_KIND` of the machine before the fault; and
-            `learnt`, an orbit response of that.
+        lattice: argument of `load_ring`.
+        parts: measurements by folder: fit, heldout and perhaps reference of first turns; or one of
+            each kind by its name, and `before_KIND` of the machine before the fault; and `learnt`,
+            an orbit response of that machine.
         options: of `diagnose`: background, effects.
-        kinds: those that are diagnosed together; () of first turns.
+        kinds: measurements that are diagnosed together; () of first turns.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Case:
 
     @property
     def heldout(self) -> Measurement:
-        """First turns for the gap."""
+        """Held-out first turns."""
         return cast(Measurement, self.parts["heldout"])
 
     @property
@@ -93,39 +93,39 @@ class Case:
 
     @property
     def learnt(self) -> OrbitResponse | None:
-        """Of the machine before the fault, or None."""
+        """Orbit response of the machine before the fault, or None."""
         return cast(OrbitResponse | None, self.parts.get(LEARNT))
 
     @property
     def measured(self) -> dict[str, AnyMeasurement]:
-        """By kind."""
+        """Measurements by kind."""
         return {kind: self.parts[kind] for kind in self.kinds}
 
     @property
     def before(self) -> dict[str, AnyMeasurement]:
-        """Those before the fault by kind; none where there is no reference."""
+        """Measurements before the fault by kind; empty without a reference."""
         return {k: self.parts[BEFORE + k] for k in self.kinds if BEFORE + k in self.parts}
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What was really there.
+    """Secret part of a case.
 
     Attributes:
         name, tier: of the case.
         causes: of the catalogue; () for an unknown and for no effect.
-        unknown: what is not in the catalogue: kind, element, s, amount; or None. For an effect
-            that was taken out of the catalogue the kind is "taken_out" and the effect stands in
+        unknown: a fault that is not in the catalogue: kind, element, s, amount; or None. For an
+            effect that was removed from the catalogue the kind is "taken_out" and the effect is in
             `causes`.
-        signal_to_noise: of each cause alone, or of the unknown; NaN for what has no signal.
+        signal_to_noise: of each cause alone, or of the unknown; NaN without a signal.
         total: signal to noise of all together.
-        background: rms of small errors, by effect.
-        amplitude, noise: m; of a case of kinds 0, and in units of what each kind usually has.
+        background: rms of distributed errors, by effect.
+        amplitude, noise: m; of a case of kinds 0, and in units of each kind's usual noise.
         seed: of the case.
         launches: true ones by part (fit, heldout, reference), [shot, 5].
         clean: readings without noise by part, and "before": those of the fit without the fault,
-            [shot, monitor, 2], m. Neither is kept of a case of kinds.
-        alone: of a case of several kinds the signal to noise in each, by kind.
+            [shot, monitor, 2], m. A case of kinds has neither.
+        alone: signal to noise in each kind of a case of several kinds.
     """
 
     name: str
@@ -145,12 +145,12 @@ class Truth:
 
 @lru_cache(maxsize=2)
 def ring_of(lattice: str) -> Ring:
-    """The design, loaded once in a process."""
+    """Return the design, loaded once per process."""
     return load_ring(lattice)
 
 
 def write_case(folder: Path, case: Case, truth: Truth) -> None:
-    """Public and secret part; the public one is whole when its `case.json` is there."""
+    """Write public and secret part; the public one is complete with its `case.json`."""
     own = folder / "cases" / case.name
     for name, measurement in case.parts.items():
         write_measurement(own / name, measurement, force=True)
@@ -193,10 +193,10 @@ def _write_truth(folder: Path, truth: Truth) -> None:
 
 
 def read_set(folder: Path) -> dict[str, Any]:
-    """The public description of a challenge.
+    """Return the public description of a challenge.
 
     Raises:
-        TmlatticeError: the folder is none, or the description is damaged.
+        TmlatticeError: no challenge in the folder, or a damaged description.
     """
     path = folder / "challenge.json"
     found = _read(path, SET)
@@ -206,27 +206,27 @@ def read_set(folder: Path) -> dict[str, Any]:
 
 
 def case_names(folder: Path) -> list[str]:
-    """All whole cases, in order."""
+    """Names of all complete cases, in order."""
     return sorted(path.parent.name for path in (folder / "cases").glob("*/case.json"))
 
 
 def check_lattice(place: Path, lattice: Any, trusted: str | None) -> str:
-    """A challenge's lattice, where loading it runs nothing that the caller has not named.
+    """Return a challenge's lattice, if loading it runs only code that the caller trusts.
 
     Args:
-        place: the file that names it, for the error.
+        place: file with the name, for the error.
         lattice: a built-in name or a path.
         trusted: the lattice whose code may be run.
 
     Raises:
-        TmlatticeError: Python code that is not the trusted one, or no name.
+        TmlatticeError: Python code that is not trusted, or no name.
     """
     if not isinstance(lattice, str) or not lattice:
         raise TmlatticeError(f"{place}: its lattice is {lattice!r:.40}; it should be a name")
     if Path(lattice).suffix.casefold() == ".py" and lattice != trusted:
         raise TmlatticeError(
             f"{place}: its lattice '{lattice}' is Python code, which would be run; if you trust "
-            f"that file, say --lattice {lattice} (in Python: lattice=)"
+            f"that file, give --lattice {lattice} (in Python: lattice=)"
         )
     return lattice
 
@@ -236,28 +236,28 @@ CONTENTS = "lattice_contents"
 
 
 def check_contents(folder: Path, described: Mapping[str, Any]) -> None:
-    """Whether the lattice is still the one that the challenge was made with, where that is known.
+    """Raise if the lattice differs from the one of the challenge, where that is recorded.
 
     Raises:
-        TmlatticeError: it is another.
+        TmlatticeError: it differs.
     """
     known = described.get(CONTENTS)
     if known not in (None, fingerprint(contents(ring_of(described["lattice"])))):
         raise TmlatticeError(
-            f"'{folder}' was made with another '{described['lattice']}' than the one that is there "
-            "now; put that back, or make the challenge anew"
+            f"'{folder}' was made with another '{described['lattice']}' than the present one; "
+            "restore that, or make the challenge again"
         )
 
 
 def trusted_case(folder: Path, name: str, trusted: str | None) -> Case:
-    """A case whose lattice may be loaded, see `check_lattice`."""
+    """Return a case whose lattice may be loaded, see `check_lattice`."""
     case = read_case(folder, name)
     check_lattice(folder / "cases" / name / "case.json", case.lattice, trusted)
     return case
 
 
 def made_by(folder: Path, name: str, lattice: str) -> str:
-    """The fingerprint of what a case's results depend on: lattice, data, options, version."""
+    """Return the fingerprint of a case's inputs: lattice, data, options, version."""
     from tmlattice import __version__
 
     own = folder / "cases" / name
@@ -266,7 +266,7 @@ def made_by(folder: Path, name: str, lattice: str) -> str:
 
 
 def read_case(folder: Path, name: str) -> Case:
-    """The public part of a case."""
+    """Return the public part of a case."""
     own = folder / "cases" / name
     public = _read(own / "case.json", PUBLIC)
     kinds = public.get("kinds", [])
@@ -282,7 +282,7 @@ def read_case(folder: Path, name: str) -> Case:
         parts[folder_name] = read_measurement(own / folder_name)
         if not isinstance(parts[folder_name], RECORDS[kind]):
             raise TmlatticeError(
-                f"'{own / folder_name}' is no {kind.replace('_', ' ')}; make the challenge anew"
+                f"'{own / folder_name}' is no {kind.replace('_', ' ')}; make the challenge again"
             )
     return Case(name, public["lattice"], parts, public["options"], tuple(kinds))
 
@@ -291,10 +291,10 @@ RECORDS: Mapping[str, type] = {kind: record for kind, (record, _) in KINDS.items
 
 
 def read_truth(folder: Path, name: str) -> Truth:
-    """The secret part of a case: for `score` alone.
+    """Return the secret part of a case: for `score` alone.
 
     Raises:
-        TmlatticeError: it is not there, or damaged.
+        TmlatticeError: it is missing or damaged.
     """
     try:
         truth = _truth(folder, name)
@@ -351,6 +351,6 @@ def _truth(folder: Path, name: str) -> Truth:
 def _read(path: Path, kind: str) -> dict[str, Any]:
     document = json_of(path, TmlatticeError)
     if not isinstance(document, dict) or document.get("format") != kind:
-        raise TmlatticeError(f"{path} is not of the format '{kind}'; make the challenge anew")
+        raise TmlatticeError(f"{path} is not of the format '{kind}'; make the challenge again")
     check_shape(path, document, kind.removeprefix("tmlattice-"), TmlatticeError)
     return document

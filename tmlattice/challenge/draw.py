@@ -1,4 +1,4 @@
-"""Causes drawn for a case: effect, then place, evenly; the amount for a signal to noise."""
+"""Random causes of a case: effect, then place, uniformly; the amount by its signal to noise."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,29 +11,29 @@ from tmlattice.errors import TmlatticeError
 
 TRIES = 1000
 SUDDEN = 2.0
-"""Times the signal to noise that was asked for, from which on an amount does not set it."""
+"""Ratio to the wanted signal to noise above which an amount does not determine it."""
 
 Lost = tuple[str, str | None, float]
-"""What was asked for and could not be reached: effect, place, the signal to noise that came."""
+"""Effect, place, and the signal to noise that was reached instead of the wanted one."""
 
 
 class Measures(Protocol):
-    """What knows the signal to noise of causes, NaN where no beam survives them."""
+    """Signal to noise of causes, NaN if no beam survives them."""
 
     def of(self, causes: Sequence[Cause]) -> float:
-        """Of all of them together."""
+        """Return that of all causes together."""
 
 
 @dataclass
 class Draw:
-    """What is drawn, and what was drawn in vain.
+    """Random draws, and rejected ones.
 
     Attributes:
-        random: where from.
+        random: generator.
         signal: smallest and largest signal to noise, log-uniform.
         amount: of every effect instead, of random sign.
-        halves: how often a largest amount that no beam survives is halved.
-        unreachable: what has no amount with the signal to noise that was asked for.
+        halves: number of halvings of a largest amount that no beam survives.
+        unreachable: effects without an amount of the wanted signal to noise.
     """
 
     random: np.random.Generator
@@ -43,7 +43,7 @@ class Draw:
     unreachable: list[Lost] = field(default_factory=list)
 
     def target(self) -> float:
-        """A signal to noise."""
+        """Return a random signal to noise."""
         return float(np.exp(self.random.uniform(*np.log(self.signal))))
 
     def one(
@@ -52,10 +52,10 @@ class Draw:
         effects: Sequence[str],
         places_of: Callable[[Effect], Sequence[str | None]],
     ) -> Cause:
-        """One cause, up to the largest of its effect.
+        """Return one cause, up to the largest amount of its effect.
 
         Raises:
-            TmlatticeError: none can be seen.
+            TmlatticeError: no effect is visible.
         """
         for _ in range(TRIES):
             name = effects[int(self.random.integers(len(effects)))]
@@ -81,8 +81,8 @@ class Draw:
     def sized(
         self, ruler: Measures, caps: Sequence[Cause], target: float
     ) -> tuple[Cause, ...] | None:
-        """Causes in this proportion, and no larger, with this signal to noise; None: too small,
-        or as large as that however little there is of it (energy losses turn an RF on)."""
+        """Return causes in this proportion, and no larger, with this signal to noise; None: too
+        small, or large for any amount (energy losses switch an RF on)."""
         share, size = 1.0, ruler.of(caps)
         for _ in range(self.halves):
             if np.isfinite(size):

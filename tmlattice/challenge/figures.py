@@ -1,4 +1,4 @@
-"""The figures of merit of many scored cases: shares with their intervals, tables, quantiles."""
+"""Metrics of scored cases: rates with their intervals, tables, quantiles."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,18 +16,18 @@ RATES = (
     "detected", "place", "element_first", "element_in_three", "element_in_set", "effect_first",
     "effect_in_set", "first", "in_set",
 )  # fmt: skip
-"""Shares of cases, of all that were asked for: what was not detected is not right."""
+"""Rates over all cases: an undetected one is not correct."""
 
 PROBABILITIES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 
 Row = dict[str, Any]
 
 ALONE = "alone: "
-"""What the answer of one kind of several is called."""
+"""Prefix of the answer of one kind of several."""
 
 
 def rate(flags: Sequence[bool]) -> dict[str, Any]:
-    """A share with its 95 % interval (Wilson)."""
+    """Return a rate with its 95 % interval (Wilson)."""
     k, n = int(sum(flags)), len(flags)
     if not n:
         return {"share": None, "cases": 0, "interval": None}
@@ -36,14 +36,14 @@ def rate(flags: Sequence[bool]) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
-    """All metrics of the rows."""
+    """Return all metrics of the rows."""
     seconds = [row["seconds"] for row in rows if row["seconds"] is not None]
     out: dict[str, Any] = {
         "seconds": _quantiles(seconds),
         "verdicts": dict(Counter(row["verdict"] for row in rows)),
     }
     if tier == "E":
-        # errors everywhere are no alarm where there are some
+        # distributed errors are no false alarm if there are some
         out["false_alarms"] = rate(
             [
                 row["answers"]["tool"]["detected"] if row["small"] else row["verdict"] != "none"
@@ -95,8 +95,8 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
 
 
 def together(rows: Sequence[Row]) -> dict[str, Any]:
-    """Of several kinds: what all of them find of what the best single one finds, and of what none
-    of them finds alone. Found is a first finding within one monitor gap."""
+    """Return the rates at which several kinds find what the best single one finds, and what none of
+    them finds alone. Found is a first finding within one monitor gap."""
     split: dict[bool, list[bool]] = {True: [], False: []}
     for row in rows:
         answers = row["answers"]
@@ -106,13 +106,13 @@ def together(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _known_share(rows: Sequence[Row], name: str) -> dict[str, Any]:
-    """Share of the cases of which this flag is known."""
-    told = [row.get(name) for row in rows]
-    return rate([flag for flag in told if flag is not None])
+    """Rate over the cases in which this flag is known."""
+    flags = [row.get(name) for row in rows]
+    return rate([flag for flag in flags if flag is not None])
 
 
 def _exact(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """Share of cases in which all causes were found, by method."""
+    """Rate of cases in which all causes were found, by method."""
     found = dict.fromkeys(name for row in rows for name in row["exact"])
     return {n: rate([row["exact"][n] for row in rows if n in row["exact"]]) for n in found}
 
@@ -122,7 +122,7 @@ def _effect(row: Row) -> str | None:
 
 
 def methods(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """Every rate, by method."""
+    """Return every rate, by method."""
     found = dict.fromkeys(name for row in rows for name in row["answers"])
     return {
         name: {
@@ -134,7 +134,7 @@ def methods(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 
 
 def detection(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Share detected by signal to noise, tool and oracle."""
+    """Return the detection rate by signal to noise, of tool and oracle."""
     edges = np.geomspace(5, 100, 8)
     out = []
     for low, high in pairwise(edges.tolist()):
@@ -148,7 +148,7 @@ def detection(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def confusion(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
-    """True effect -> column -> cases; beside the effects stand equivalent, unknown, nothing."""
+    """Return true effect -> column -> cases; further columns: equivalent, unknown, nothing."""
     table: dict[str, Counter[str]] = {}
     for row in rows:
         name = _effect(row)
@@ -158,7 +158,7 @@ def confusion(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
 
 
 def calibration(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Members of credible sets by their stated probability: its mean, and how many are true."""
+    """Return mean stated probability and true share of members of credible sets."""
     both = [pair for row in rows for pair in row["stated"]]
     out = []
     for low, high in pairwise(PROBABILITIES):
@@ -169,7 +169,7 @@ def calibration(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def coverage(rows: Sequence[Row]) -> dict[str, Any]:
-    """Credible sets of named findings: how many hold the truth, beside their stated mass."""
+    """Return the share of credible sets that contain the truth, and their stated mass."""
     named = [r["answers"]["tool"] for r in rows if r["answers"]["tool"]["mass"]]
     strong = [
         r["answers"]["tool"]
@@ -191,7 +191,7 @@ def coverage(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def classes(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Effects that stayed together, the most frequent first, and what one more shot would bring."""
+    """Return effects that were not distinguished, by frequency, and the gain of one more shot."""
     found: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         if row["class"] is not None:
@@ -211,7 +211,7 @@ def classes(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def pulls(values: Sequence[float | None]) -> dict[str, Any]:
-    """Mean and width of (amount - true) / error; the width also without the outer 5 %."""
+    """Return mean and width of (amount - true) / error; the width also without the outer 5 %."""
     there = np.array([v for v in values if v is not None])
     if len(there) < 2:
         return {"cases": len(there), "mean": None, "width": None, "robust_width": None}
@@ -225,12 +225,11 @@ def pulls(values: Sequence[float | None]) -> dict[str, Any]:
 
 
 def _explained(rows: Sequence[Row]) -> dict[str, Any]:
-    """Where something is to be seen: error on clean held-out readings at most 5 % of before.
+    """Rate of visible faults with an error on clean held-out readings of at most 5 % of before.
 
-    An amount known to 1 / (signal to noise) leaves that share of the gap: nobody reaches 5 % at a
-    signal to noise of 10. `of_the_floor` is the share left in units of that, and
-    `expected_within_5_percent` what a least squares fit reaches that knows the cause and only its
-    amount not.
+    An amount known to 1 / (signal to noise) leaves that share of the gap: no method reaches 5 % at
+    a signal to noise of 10. `of_the_floor` is the share left in units of that.
+    `expected_within_5_percent` is the rate of a least squares fit of the true cause's amount.
     """
     ratios, floors, expected = [], [], []
     for row in rows:
@@ -284,7 +283,7 @@ def _unknowns(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _relative(rows: Sequence[Row]) -> dict[str, Any]:
-    """Of the cases in which the oracle is right first, those in which the tool is too."""
+    """Rate at which the tool is right first, among cases in which the oracle is."""
     out = {}
     for key in ("element_first", "effect_first", "first"):
         own = [r for r in rows if "oracle" in r["answers"] and r["answers"]["oracle"][key]]

@@ -1,8 +1,8 @@
-"""What the data of any kinds allow, and what plain methods make of them.
+"""Oracle and simple methods for any kinds of measurement.
 
-The oracle knows the noise and the sizes of the small errors exactly, and that there is one cause.
-It weighs every hypothesis by its fall of chi-square, the leading ones refitted through the full
-model. Plain methods know the design, the noise and the nuisances; each names three suspects.
+The oracle has the exact noise and sizes of the distributed errors, and assumes one cause. It weighs
+every hypothesis by its fall of chi-square, the leading ones refitted through the full model. Simple
+methods have the design, the noise and the nuisances; each returns three suspects.
 """
 
 from collections.abc import Sequence
@@ -26,10 +26,10 @@ from tmlattice.inference.scan import Scan, scan
 Array = NDArray[np.float64]
 
 MAX_BEHIND = 60.0
-"""Chi-square behind the best of the scan from which on a hypothesis is not refitted."""
+"""Chi-square below the best of the scan at which a hypothesis is not refitted."""
 
 MOST_NUMBERS = 2**27
-"""Of all signatures: a gigabyte; plain methods are not asked about more."""
+"""Numbers of all signatures: a gigabyte; simple methods are not run with more."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Refitted:
     """Every hypothesis about one case.
 
     Attributes:
-        problem: rows in the covariance of noise and small errors.
-        start: nuisances alone.
-        seen: the scan about it.
+        problem: rows whitened by noise and distributed errors.
+        start: fit of the nuisances alone.
+        seen: the scan of its residual.
         statistic: fall of chi-square within the largest fault, [hypothesis].
-        amount: that does it, [hypothesis].
+        amount: of that fall, [hypothesis].
     """
 
     problem: Problem
@@ -52,14 +52,14 @@ class Refitted:
 
 
 def evaluate_kinds(argument: tuple[Case, Truth]) -> dict[str, Any]:
-    """What the oracle says of a case of kinds, as `oracle.judge` says it."""
+    """Return the oracle's answer for a case of kinds, as `oracle.evaluate` does."""
     case, truth = argument
     said = _as_answer(refitted(case, truth))
     return {"oracles": [said], "residual": None}
 
 
 def refitted(case: Case, truth: Truth) -> Refitted:
-    """The hypotheses about a case, the leading ones refitted."""
+    """Return the hypotheses about a case, the leading ones refitted."""
     ring = ring_of(case.lattice)
     problem = problem_of(ring, case.measured, case.before, truth.background)
     start = fit(problem, (), problem.first)
@@ -112,7 +112,7 @@ def _as_answer(found: Refitted) -> dict[str, Any]:
 
 
 def plain_kinds(case: Case) -> dict[str, Guesses]:
-    """First guesses of a case of kinds by method, as of `baselines`, but for the network."""
+    """Return first guesses of a case of kinds by method, as `baselines` without the network."""
     problem = problem_of(ring_of(case.lattice), case.measured, case.before, {})
     start = fit(problem, (), problem.first)
     hypotheses = _hypotheses(case, problem)

@@ -1,4 +1,4 @@
-"""Cases of any kinds of measurement: what is wrong, what AT makes of it, how clearly it is seen."""
+"""Cases of any kinds of measurement: faults, measurements by AT, and signal to noise."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,41 +29,41 @@ TIER_KINDS: Mapping[str, tuple[str, ...]] = {
     "P": ("orbit_response",),
     "M": ("trajectory", "turn_by_turn", "closed_orbit", "dispersion", "tunes"),
 }
-"""What is measured in a tier; of several, M draws two or three for each case."""
+"""Measurements of a tier; M draws two or three of several for each case."""
 
 FAINTER, LOUDER = 0.5, 2.0
-"""The noise of a case in units of what the kind usually has, log-uniform."""
+"""Range of a case's noise in units of the kind's usual noise, log-uniform."""
 
 TURNS = 500
-"""Of the stored beam."""
+"""Turns of a stored beam."""
 
 HALVES = 6
-"""How often a largest fault that no stored beam survives is halved."""
+"""Halvings of a largest fault that no stored beam survives."""
 
 READING_NOISE = 2e-5
-"""m; of a first turn."""
+"""m; noise of a first turn."""
 
 CHANGES = (
     ("quadrupole_gradient",), ("family_gradient",), ("insertion_device_focusing",),
     ("family_sextupole",), ("corrector_calibration",), ("monitor_gain_x", "monitor_gain_y"),
 )  # fmt: skip
-"""What a pair may differ by, drawn evenly."""
+"""Possible differences of a pair, drawn uniformly."""
 
 
 @dataclass(frozen=True)
 class CaseSettings:
-    """What is made of every case.
+    """Settings of every case of a challenge.
 
     Attributes:
         tier: of the challenge.
-        lattice, ring: what `load_ring` takes, and what it makes of it.
+        lattice, ring: argument of `load_ring`, and its result.
         seed: of the challenge.
         kinds: see `TIER_KINDS`.
         effects: drawn from these; None: from all usual ones.
         shots: of first turns, and kicks of a stored beam.
         signal, amount: see `Draw`.
-        background: rms of small errors by effect.
-        told: the diagnosis is told them.
+        background: rms of distributed errors by effect.
+        told: whether the diagnosis is given these rms.
     """
 
     tier: str
@@ -83,18 +83,18 @@ class CaseSettings:
 def measure(
     kind: str, ring: Ring, causes: Sequence[Cause], noise: float, shots: int, **own: Any
 ) -> Measured:
-    """One measurement of a machine by AT.
+    """Return one measurement of a machine by AT.
 
     Args:
         kind: of measurement.
         ring: the design.
-        causes: what is wrong with it.
-        noise: in units of what the kind usually has.
+        causes: errors of the machine.
+        noise: in units of the kind's usual noise.
         shots: of first turns and of turns.
         own: background, seed and machine_seed.
 
     Raises:
-        TmlatticeError: no beam survives them.
+        TmlatticeError: no beam survives the causes.
     """
     fine = tuple(noise * rms for rms in NOISE)
     made: Mapping[str, Callable[[], Any]] = {
@@ -128,7 +128,7 @@ def problem_of(
     before: Mapping[str, Measured],
     background: Mapping[str, float],
 ) -> Problem:
-    """Measurements as rows, among small errors of known sizes where there are any."""
+    """Return measurements as a problem, with distributed errors of known sizes if there are any."""
     places = {name: float(max(len(find(name).places(ring)), 1)) for name in modelled(turns=True)}
     how = How(ring, places, DEFAULT)
     first, then = (
@@ -157,7 +157,7 @@ class Ruler:
         self.start = fit(problem, (), problem.first)
 
     def of(self, causes: Sequence[Cause]) -> float:
-        """NaN where no beam is stored."""
+        """Return the signal to noise; NaN if no beam is stored."""
         seen = [c for c in causes if self.problem.sees((c.effect, c.element))]
         point = self.problem.at(seen, self.start.nuisances)
         if point.lost:
@@ -168,7 +168,7 @@ class Ruler:
 
 # --- a case ---------------------------------------------------------------------------------------
 def kinds_case(asked: CaseSettings, number: int, name: str) -> tuple[Case, Truth, Draw]:
-    """The public and the secret part of a case, and what was drawn in vain."""
+    """Return the public and the secret part of a case, and the rejected draws."""
     random = stream(asked.seed, "challenge", asked.tier, number)
     seed = int(random.integers(2**31))
     noise = float(np.exp(random.uniform(np.log(FAINTER), np.log(LOUDER))))
@@ -216,7 +216,7 @@ def _drawn(
     ruler: Ruler,
     machine: Callable[[Sequence[Cause]], dict[str, Measured]],
 ) -> tuple[tuple[Cause, ...], dict[str, Measured]]:
-    """What is wrong, and what is measured of it."""
+    """Draw a fault, and measure it."""
     for _ in range(100):
         causes = _pair(asked, draw, ruler) if asked.tier == "P" else _single(asked, draw, ruler)
         if causes is None:

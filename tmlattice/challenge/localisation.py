@@ -1,8 +1,8 @@
-"""Which place a network names: by its raw weights, and by weights normalised by their information.
+"""Localisation by a network: raw weight changes, and changes normalised by their information.
 
-One quadrupole's gradient is changed in the AT engine, by as much as gives the readings the asked
-signal to noise; a network is fine-tuned by the paper's recipe, with launches that were fitted to
-the design before; and each ranking's first layer is held against the true magnet.
+One quadrupole's gradient is changed in the AT engine, for a given signal to noise of the readings.
+A network is fine-tuned by the paper's recipe, with launches that were fitted to the design before.
+Each ranking's first layer is compared with the true magnet.
 """
 
 import time
@@ -32,17 +32,17 @@ the loss at the design."""
 
 @dataclass(frozen=True)
 class Case:
-    """One fault, measured and read.
+    """One fault, its measurement and the rankings.
 
     Attributes:
         element, s: the changed quadrupole.
         amount: relative change of its gradient.
-        signal_to_noise: what was asked for.
+        signal_to_noise: wanted.
         shots: of the measurement.
-        named: the magnet that each ranking names first, see `RANKINGS`.
+        named: the first magnet of each ranking, see `RANKINGS`.
         gaps: number of monitors between it and the true one, by ranking.
         chi2_per_reading: of the design with its launch fitted, and of the fine-tuned network.
-        seconds: of the fine-tuning, and of the two readings of it.
+        seconds: of the fine-tuning, and of the two rankings.
     """
 
     element: str
@@ -69,9 +69,9 @@ def study_localisation(
     seed: int = 0,
     progress: bool = True,
 ) -> Iterator[Case]:
-    """Faults at random quadrupoles; each is measured with every number of shots.
+    """Rank faults at random quadrupoles, each measured with every number of shots.
 
-    A quadrupole that would need more than the effect's largest fault, or that no monitor sees, is
+    A quadrupole that would need more than the effect's largest fault, or that is invisible, is
     drawn again.
 
     Args:
@@ -83,7 +83,7 @@ def study_localisation(
         noise: rms of one reading, m.
         epochs, learning_rate: see `fine_tune`.
         seed: of faults, launches and noise.
-        progress: show a bar where there is a terminal.
+        progress: show a bar on a terminal.
 
     Raises:
         TmlatticeError: no quadrupole of the ring can reach the signal to noise.
@@ -107,7 +107,7 @@ def study_localisation(
             else:
                 raise TmlatticeError(
                     f"no quadrupole of '{ring.name}' reaches a signal to noise of "
-                    f"{max(signal_to_noise):g}; ask for less"
+                    f"{max(signal_to_noise):g}; give a smaller one"
                 )
             sign = random.choice([-1.0, 1.0])
             for ratio in signal_to_noise:
@@ -195,13 +195,13 @@ def _case(
 
 
 def summarise(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """How often each ranking's first layer is near the true magnet.
+    """Return how often each ranking's first layer is near the true magnet.
 
     Returns:
         For each signal to noise and number of shots: {"signal_to_noise", "shots", "cases",
         "rankings": {name: {"element", "within_one_gap", "median_gaps"}}, "chi2_before",
         "chi2_after", "seconds_fine_tuning", "seconds_reading"}: shares of the cases, medians.
-        Within one gap: at most one monitor stands between.
+        Within one gap: at most one monitor is between.
     """
     rows = []
     for ratio, shots in sorted({(c.signal_to_noise, c.shots) for c in cases}):

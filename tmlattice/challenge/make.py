@@ -1,4 +1,4 @@
-"""Cases with a withheld cause: AT is the real machine, every case has random numbers of its own."""
+"""Cases with a withheld cause: AT is the real machine, every case has its own random numbers."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -55,8 +55,8 @@ AMPLITUDE = (1e-3, 3e-3)
 NOISE = (5e-6, 5e-5)
 
 SET_CORRECTORS = 4
-"""So many random correctors are set in every case, whatever is wrong: the settings betray nothing,
-and correctors that kick wrongly or stand askew can be seen."""
+"""Random correctors that are set in every case, independently of the fault, so that wrong kicks and
+rolls are visible."""
 
 SET_KICK = (2e-5, 5e-5)
 
@@ -82,33 +82,33 @@ def make(
     kinds: Sequence[str] = (),
     progress: bool = True,
 ) -> dict[str, int]:
-    """Make a challenge; cases that are there already are kept.
+    """Make a challenge; existing cases are kept.
 
     Args:
-        tier: A one effect; B one effect among small errors everywhere; C two or three; D one that
-            the catalogue does not hold; E none. Those are in first turns; R is one effect in an
-            orbit response, T in turns of a stored beam, M in two or three kinds together, P what
-            changed between two measurements of one machine.
-        cases: how many.
-        seed: of everything.
+        tier: A one effect; B one effect among distributed errors; C two or three; D one that the
+            catalogue does not contain; E none. Those are in first turns; R is one effect in an
+            orbit response, T in turns of a stored beam, M in two or three kinds together, P a
+            change between two measurements of one machine.
+        cases: number of cases.
+        seed: of all random numbers.
         folder: for the challenge.
-        lattice: what `load_ring` takes.
+        lattice: argument of `load_ring`.
         reference: tier B, with a measurement from before the fault.
-        learnt: tier B, with an orbit response from before the fault, from whose diagnosis that of
-            the case starts. A machine that stores no beam has none, and is diagnosed without.
-        correctors: that response steps so many, evenly along the ring; None: all of them.
+        learnt: tier B, with an orbit response from before the fault, whose diagnosis is the prior
+            of the case's. A machine that stores no beam has none, and is diagnosed without.
+        correctors: number of correctors of that response, evenly along the ring; None: all.
         shots: of first turns and kicks of a stored beam; of the fit, two more are held out.
         effects: draw from these alone.
-        amount: of the effect, of random sign, instead of a signal to noise that is drawn.
+        amount: of the effect, of random sign, instead of a random signal to noise.
         signal: smallest and largest signal to noise.
-        background: tiers of kinds and tier B, rms of the small errors by effect (None: the
-            catalogue's own); every usual one if not given in tiers B and P.
-        told: the diagnosis is told those sizes; else it has to learn them.
+        background: tiers of kinds and tier B, rms of the distributed errors by effect (None: the
+            catalogue's); default in tiers B and P: every usual one.
+        told: the diagnosis is given these rms; else it estimates them.
         kinds: of measurement, for tiers E, M and P; of M two or three are drawn.
-        progress: show a bar where there is a terminal.
+        progress: show a bar on a terminal.
 
     Returns:
-        How often each effect was drawn and could not reach the smallest signal to noise.
+        How often each effect was drawn without reaching the smallest signal to noise.
 
     Raises:
         TmlatticeError: another tier, or a folder of another challenge.
@@ -118,7 +118,7 @@ def make(
     kinds = _kinds(tier, kinds)
     _check(tier, kinds, reference, learnt, told, bool(background))
     if correctors is not None and not learnt:
-        raise TmlatticeError("correctors are those of a learnt response; say --learnt too")
+        raise TmlatticeError("correctors are those of a learnt response; give --learnt too")
     everywhere = background or ({"all": None} if tier in ("B", "P") else {})
     rms = background_rms(everywhere) if everywhere else {}
     chosen = names(effects)
@@ -177,7 +177,7 @@ def make(
 def _check(
     tier: str, kinds: Sequence[str], reference: bool, learnt: bool, told: bool, background: bool
 ) -> None:
-    """Whether a tier has what is asked of it."""
+    """Raise if a tier does not have the requested options."""
     if reference and tier != "B":
         raise TmlatticeError("a reference is for tier B; leave --reference out")
     if learnt and (tier != "B" or reference or told):
@@ -186,15 +186,15 @@ def _check(
         )
     if background and tier != "B" and not kinds:
         raise TmlatticeError(
-            "small errors everywhere are for tier B and for those of kinds; leave --background out"
+            "distributed errors are for tier B and for those of kinds; leave --background out"
         )
     if told and "orbit_response" in kinds:
-        raise TmlatticeError("an orbit response says those sizes by itself; leave --told out")
+        raise TmlatticeError("an orbit response determines those rms by itself; leave --told out")
 
 
 def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Case:
-    """With the orbit response of its machine without the fault, in usual noise; as it is where that
-    machine stores no beam."""
+    """Add the orbit response of the case's machine without the fault, in usual noise; nothing if
+    that machine stores no beam."""
     own: dict[str, Any] = {"machine_seed": drawn.seed, "seed": drawn.seed + 2}
     own["background"] = drawn.background
     if correctors is not None:
@@ -207,7 +207,7 @@ def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Cas
 
 
 def evenly(ring: Ring, count: int) -> list[str]:
-    """So many correctors of a ring, evenly along it in each plane, half of each where there are.
+    """Return correctors of a ring, evenly along it in each plane, half of each if possible.
 
     Raises:
         TmlatticeError: the ring has fewer.
@@ -226,7 +226,7 @@ def evenly(ring: Ring, count: int) -> list[str]:
 
 
 def _kinds(tier: str, asked: Sequence[str]) -> tuple[str, ...]:
-    """What is measured in a tier; () of first turns."""
+    """Measurements of a tier; () of first turns."""
     if not asked:
         return TIER_KINDS.get(tier, ())
     if tier not in "EMP":
@@ -235,16 +235,16 @@ def _kinds(tier: str, asked: Sequence[str]) -> tuple[str, ...]:
         if kind not in RECORDS:
             raise TmlatticeError(f"no kind '{kind}'; there are {', '.join(RECORDS)}")
     if tier == "M" and len(set(asked)) < 2:
-        raise TmlatticeError("tier M is of kinds together; name two of them or more")
+        raise TmlatticeError("tier M is of kinds together; name at least two of them")
     return tuple(dict.fromkeys(asked))
 
 
 def _begin(folder: Path, public: Mapping[str, Any], seed: int) -> None:
-    """The folder of a new challenge, or of the same one."""
+    """Make the folder of a new challenge, or check that of the same one."""
     if (folder / "challenge.json").exists():
         described = read_set(folder)
         if {CONTENTS: public[CONTENTS], **described} != public or _seed(folder) not in (None, seed):
-            raise TmlatticeError(f"'{folder}' holds another challenge; name another folder")
+            raise TmlatticeError(f"'{folder}' contains another challenge; name another folder")
         return
     folder.mkdir(parents=True, exist_ok=True)
     with output_file(folder / "challenge.json") as path:
@@ -252,7 +252,7 @@ def _begin(folder: Path, public: Mapping[str, Any], seed: int) -> None:
 
 
 def _seed(folder: Path) -> int | None:
-    """The seed that a challenge was made with, where that is known."""
+    """Seed of a challenge, if recorded."""
     try:
         made = json_of(folder / "truth" / "made.json", TmlatticeError)
         return int(made["seed"])
@@ -261,7 +261,7 @@ def _seed(folder: Path) -> int | None:
 
 
 class CaseDraw:
-    """Everything about one case, drawn from its own random numbers."""
+    """One case, drawn from its own random numbers."""
 
     def __init__(
         self,
@@ -307,7 +307,7 @@ class CaseDraw:
         return draw_shots(self.ring, count, self.amplitude, settings=settings, seed=seed)
 
     def make(self, name: str) -> tuple[Case, Truth]:
-        """Its public and its secret part."""
+        """Return its public and its secret part."""
         healthy = clean_readings(Machine(self.ring, self.small), self.shots)
         fit = slice(0, self.fit_shots)
         launches = _five(self.shots)[fit]
@@ -357,13 +357,13 @@ class CaseDraw:
 
     # --- what is wrong --------------------------------------------------------------------------
     def _cause(self, ruler: Ruler, effects: Sequence[str]) -> Cause:
-        """Correctors only where they are set, if it is their setting that is wrong."""
+        """Draw a cause; one that acts on settings at a corrector that is set."""
         return self.draw.one(
             ruler, effects, lambda e: self.set if e.acts_on_settings else e.places(self.ring)
         )
 
     def _unknown_kind(self) -> str:
-        """Unknowns and effects taken out share the cases half and half, each in turn."""
+        """Draw unknowns and removed effects for half of the cases each, every kind in turn."""
         taken = [name for name in modelled() if find(name).places(self.ring)]
         kinds = list(LARGEST)
         which = self.number // 2

@@ -1,11 +1,11 @@
-"""What the data allow.
+"""The oracle: the best possible answer from the data.
 
-The oracle knows the statistics exactly: the true launches (the point about which it is linear; what
-is known of launches beforehand it takes as everybody else), the true noise and background, and the
-largest fault. It weighs every hypothesis by its likelihood ratio, the leading ones by the finite
-change of the readings. Its class is every hypothesis within a chi-square of 9 of the best.
+It has the exact statistics: the true launches (where it is linearised; priors of launches are those
+of every method), the true noise and background, and the largest fault. It weighs every hypothesis
+by its likelihood ratio, the leading ones by the finite change of the readings. Its class is every
+hypothesis within a chi-square of 9 of the best.
 
-Of several causes it is asked one by one, and told all the others: no method can do better.
+Of several causes it seeks one at a time, given all the others: no method can do better.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from tmlattice.observe.data import Data, joined, of_measurement
 Array = NDArray[np.float64]
 
 CLASS = 9.0
-"""Chi-square within which the oracle cannot tell hypotheses apart."""
+"""Chi-square within which the oracle does not distinguish hypotheses."""
 
 DRAWS = 200
 REFINED = 60
@@ -36,11 +36,11 @@ CHUNK = 512
 
 
 class Oracle:
-    """Every hypothesis about one case, linear about the true launches.
+    """Every hypothesis about one case, linearised at the true launches.
 
     Args:
         case, truth: both parts of it.
-        told: causes that it knows.
+        given: known causes.
         seed: of the simulated null.
     """
 
@@ -55,9 +55,9 @@ class Oracle:
             launches = np.concatenate([truth.launches["reference"], launches])
         self.data = _without_dead(data, truth, [m.name for m in ring.monitors])
         self.launches = launches
-        # Small errors make an orbit of millimetres: a gradient kicks by that orbit, not by the
-        # design's. The oracle is linear about the machine as it was before the fault; its data are
-        # those of the linear model of the small errors.
+        # Distributed errors make an orbit of millimetres: a gradient kicks by that orbit, not by
+        # the design's. The oracle is linearised at the machine before the fault; its data are those
+        # of the linear model of the distributed errors.
         small = draw_background(ring, truth.background, truth.seed)
         set_there = {name for setting in data.settings for name in setting}
         known, self.small = [], []  # in the ring for good, and with every reading
@@ -88,19 +88,19 @@ class Oracle:
         self.threshold = self._threshold(seed)
 
     def residual(self, readings: Array) -> Array:
-        """Whitened rows of the readings of the fit, with those of a reference as they are."""
+        """Return whitened rows of the fit's readings, with those of a reference unchanged."""
         whole = self.data.readings.copy()
         whole[self.data.active] = np.nan_to_num(readings)
         difference = np.where(self.data.valid, whole - self.paths.readings + self.linear, 0.0)
         return self.projection.out(self.whitening.residual(difference, self.launches))
 
     def statistics(self, clean: Array) -> tuple[Array, Array]:
-        """Fall of chi-square, and the best amount ** power within the largest fault."""
+        """Return the fall of chi-square, and the best amount ** power within the largest fault."""
         inner = self.rows @ clean
         return _best(inner, self.norm, self.cap, self.discrete)
 
     def refined(self, clean: Array) -> tuple[Array, Array]:
-        """The same, of the leading ones by their finite changes."""
+        """Return the same, of the leading hypotheses by their finite changes."""
         statistic, amount = self.statistics(clean)
         base = self.model.readings(self.launches, self.small)
         active = self.data.active[:, None, None]
@@ -136,7 +136,7 @@ class Oracle:
         return rows
 
     def _threshold(self, seed: int) -> float:
-        """The largest statistic that noise reaches in 0.5 % of data sets: its simulated tail."""
+        """Statistic that noise reaches in 0.5 % of data sets, from its simulated tail."""
         draws = np.random.default_rng([seed, 7]).standard_normal((DRAWS, self.whitening.rows))
         inner = self.rows @ self.projection.out(draws).T  # [hypothesis, draw]
         largest = _best(inner.T, self.norm, self.cap, self.discrete)[0].max(axis=1)
@@ -161,7 +161,7 @@ def _without_dead(data: Data, truth: Truth, monitors: Sequence[str]) -> Data:
 
 
 def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
-    """What the oracle says of a case, as JSON: {"oracles": one for each cause, "residual"}.
+    """Return the oracle's answer for a case, as JSON: {"oracles": one per cause, "residual"}.
 
     A case of an unknown, or of none, has one oracle and, of an unknown, the residual after the best
     member of the catalogue, in sigma.
@@ -169,7 +169,7 @@ def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
     case, truth = argument
     causes = truth.causes
     if len(causes) > 1:
-        # a monitor without a signal is known to everybody
+        # a monitor without a signal is known as such
         asked = [cause for cause in causes if find(cause.effect).modelled]
         given = [tuple(c for c in causes if c is not cause) for cause in asked]
         return {
@@ -180,7 +180,7 @@ def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
     left = None
     if truth.unknown is not None:
         quiet = oracle.residual(truth.clean["fit"])
-        if case.reference is not None:  # the reference's noise is in it: only the change counts
+        if case.reference is not None:  # with the reference's noise: only the change counts
             quiet = quiet - oracle.residual(truth.clean["before"])
         best = oracle.refined(quiet)[0].max()
         left = float(np.sqrt(max(float(quiet @ quiet) - best, 0.0)))
@@ -207,12 +207,12 @@ def answer(
     prior: Array,
     threshold: float,
 ) -> dict[str, Any]:
-    """What an oracle says of its hypotheses, as JSON.
+    """Return the oracle's answer from its hypotheses, as JSON.
 
     Args:
-        hypotheses: all that it weighed.
-        statistic, amount, prior: fall of chi-square, best amount, log probability beforehand of
-            each, [hypothesis].
+        hypotheses: all hypotheses.
+        statistic, amount, prior: fall of chi-square, best amount, log prior probability of each,
+            [hypothesis].
         threshold: of the largest statistic.
     """
     weight = statistic / 2 + prior
@@ -245,7 +245,7 @@ def answer(
 
 
 def _priors(hypotheses: Sequence[Hypothesis]) -> list[float]:
-    """Effects are drawn evenly, then places."""
+    """Log prior probabilities: effects are drawn uniformly, then places."""
     count: dict[str, int] = {}
     for name, _ in hypotheses:
         count[name] = count.get(name, 0) + 1

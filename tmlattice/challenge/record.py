@@ -1,7 +1,7 @@
-"""One case judged: an answer held against the truth, as one flat row of plain values.
+"""Comparison of an answer with the truth, as one flat row of plain values.
 
-An answer is what the diagnosis, the oracle or a baseline said, in the diagnosis' own JSON.
-Places: two elements are within one monitor gap where at most one monitor stands between them.
+An answer is that of the diagnosis, the oracle or a baseline, in the diagnosis' JSON. Two elements
+are within one monitor gap if at most one monitor is between them.
 """
 
 from bisect import bisect_left, bisect_right
@@ -18,13 +18,13 @@ from tmlattice.lattice import Ring
 Pair = tuple[str | None, str | None]
 
 ALIASED = 10.0
-"""An unknown whose residual after the best catalogue member is below this is aliased, in sigma."""
+"""Residual of an unknown after the best catalogue member, in sigma, below which it is aliased."""
 
 REFUSED = ("localised", "distributed")
 
 
 class Places:
-    """Where elements, families and monitors stand."""
+    """Positions of elements, families and monitors."""
 
     def __init__(self, ring: Ring) -> None:
         self.ring = ring
@@ -38,7 +38,7 @@ class Places:
                 self.s[element.family] = members
 
     def between(self, a: float, b: float) -> int:
-        """Monitors strictly between two positions."""
+        """Number of monitors strictly between two positions."""
         low, high = min(a, b), max(a, b)
         return max(
             bisect_left(self.monitors, high - 1e-9) - bisect_right(self.monitors, low + 1e-9), 0
@@ -51,19 +51,19 @@ class Places:
         return any(self.between(a, b) <= 1 for a in self.s[true] for b in found)
 
     def of(self, element: str | None, s: float | None) -> list[float]:
-        """Positions of a finding."""
+        """Return the positions of a finding."""
         if element is not None and element in self.s:
             return self.s[element]
         return [] if s is None else [s]
 
 
 def pairs(finding: Mapping[str, Any]) -> list[Pair]:
-    """The credible set of a finding, likeliest first."""
+    """Return the credible set of a finding, the most probable first."""
     return [(m["effect"], m["element"]) for m in finding["credible_set"]]
 
 
 def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places) -> dict[str, Any]:
-    """How one finding fits one true cause."""
+    """Return how one finding matches one true cause."""
     true = (cause.effect, cause.element)
     if finding is None:
         keys = (
@@ -77,7 +77,7 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
     effects = list(dict.fromkeys(effect for effect, _ in members))
     first = (finding["effect"], finding["element"])
     if cause.element is None:
-        place = first == true  # the beam has no other place than its name
+        place = first == true  # the beam has no place but its name
     else:
         place = places.near(cause.element, places.of(finding["element"], finding["s"]))
     named = finding["effect"] is not None
@@ -90,7 +90,7 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
         pull = float((found - amount) / sigma)
     return {
         "place": place,
-        # a baseline may name an element and no effect
+        # a baseline may give an element without an effect
         "element_first": (named or cause.element is not None)
         and finding["element"] == cause.element,
         "element_in_three": cause.element in elements[:3],
@@ -133,7 +133,7 @@ def oracle_one_action(evaluated: Mapping[str, Any], cause: Cause, ring: Ring) ->
 
 
 def column(result: Mapping[str, Any], cause: Cause) -> str:
-    """The column of the confusion table."""
+    """Return the column of the confusion table."""
     if not result["findings"]:
         refused = result["verdict"] == "distributed" and not result.get("priors")
         return "unknown" if refused else "none"
@@ -148,7 +148,7 @@ def column(result: Mapping[str, Any], cause: Cause) -> str:
 
 
 def stated(result: Mapping[str, Any], causes: Sequence[Cause]) -> list[tuple[float, bool]]:
-    """Every stated probability of a member of a credible set, and whether the member is true."""
+    """Return stated probabilities of members of credible sets, and whether each is true."""
     true = {(cause.effect, cause.element) for cause in causes}
     return [
         (float(m["probability"]), (m["effect"], m["element"]) in true)
@@ -158,7 +158,7 @@ def stated(result: Mapping[str, Any], causes: Sequence[Cause]) -> list[tuple[flo
 
 
 def exact(result: Mapping[str, Any], causes: Sequence[Cause]) -> bool:
-    """Every cause in the credible set of a finding of its own, and no finding without one."""
+    """Whether every cause is in the credible set of one finding each, without further findings."""
     findings = list(result["findings"])
     if len(findings) != len(causes):
         return False
@@ -171,10 +171,10 @@ def exact(result: Mapping[str, Any], causes: Sequence[Cause]) -> bool:
 
 
 def oracle_answer(evaluated: Mapping[str, Any], ranking: str) -> dict[str, Any]:
-    """The oracle in the words of a diagnosis.
+    """Return the oracle's answer in the form of a diagnosis.
 
     Args:
-        judged: see `judge`.
+        evaluated: see `evaluate`.
         ranking: "class", all within a chi-square of 9, or "posterior", a 95 % credible set.
     """
     findings = [_oracle_finding(o, ranking) for o in evaluated["oracles"] if o["detected"]]
@@ -187,7 +187,7 @@ def oracle_answer(evaluated: Mapping[str, Any], ranking: str) -> dict[str, Any]:
 def _oracle_finding(oracle: Mapping[str, Any], ranking: str) -> dict[str, Any]:
     members = list(oracle[ranking])
     if ranking == "posterior":
-        total = np.cumsum([m["probability"] or 0.0 for m in members])  # null: it sees nothing
+        total = np.cumsum([m["probability"] or 0.0 for m in members])  # null: invisible
         members = members[: int(np.searchsorted(total, 0.95)) + 1]
     first = members[0]
     return {
@@ -202,11 +202,11 @@ def _oracle_finding(oracle: Mapping[str, Any], ranking: str) -> dict[str, Any]:
 def baseline_answer(
     guesses: Sequence[Mapping[str, Any]], separate: int | None = None
 ) -> dict[str, Any]:
-    """A baseline in the words of a diagnosis; it always finds something.
+    """Return a baseline's answer in the form of a diagnosis; it always has a finding.
 
     Args:
         guesses: see `baselines`.
-        apart: so many guesses are findings of their own; None: all are of one finding.
+        separate: number of guesses that are findings of their own; None: one finding.
     """
     parts = [list(guesses)] if separate is None else [[guess] for guess in guesses[:separate]]
     findings = []

@@ -1,7 +1,7 @@
 """Signal to noise: the finite change of all fit readings over their noise, launches projected out.
 
-The noise is that of a reading, and on a machine with small errors everywhere that background too:
-then the change is measured in units of both (Mahalanobis), with a reference jointly with it.
+The noise is that of a reading, and of distributed errors if there are some: the change is then
+measured in units of both (Mahalanobis), with a reference jointly with it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,15 +21,15 @@ UNKNOWN_LAUNCH = (np.inf, np.inf, np.inf, np.inf, 0.0)
 
 
 class Ruler:
-    """Measures changes of readings.
+    """Signal to noise of changes of readings.
 
     Args:
         ring: the design.
         launches: true ones, those of a reference first, [shot, 5].
         settings: of each shot.
         noise: rms of a reading, m.
-        background: rms of small errors, by effect.
-        reference: how many of the shots are from before the fault.
+        background: rms of distributed errors, by effect.
+        reference: number of shots from before the fault.
     """
 
     def __init__(
@@ -66,14 +66,14 @@ class Ruler:
         self._reference = reference
 
     def size(self, change: Array) -> float:
-        """Signal to noise of a change of the readings after the fault, [shot, monitor, 2], m."""
+        """Return that of a change of the readings after the fault, [shot, monitor, 2], m."""
         whole = np.zeros(self._shape)
         whole[self._reference :] = np.nan_to_num(change)
         rows = self._projection.out(self._whitening.signature(whole))
         return float(np.linalg.norm(rows))
 
     def of(self, causes: Sequence[Cause]) -> float:
-        """Signal to noise of causes by the model: quick, and good for finding amounts."""
+        """Return that of causes by the model: fast, to find amounts."""
         change = self.model.readings(self.launches, causes) - self._base
         return self.size(change[self._reference :])
 
@@ -81,14 +81,14 @@ class Ruler:
 def background_signatures(
     model: Model, paths: Paths, launches: Array, rms: Mapping[str, float]
 ) -> tuple[list[Hypothesis], Array, Array]:
-    """Every small error along these trajectories.
+    """Return signatures of every distributed error along these trajectories.
 
     Args:
-        model, paths, launches: the base.
+        model, paths, launches: the trajectories.
         rms: by effect.
 
     Returns:
-        Which they are; the rms of each, [error]; rms times signature, [error, shot, reading, 2], m.
+        The errors; the rms of each, [error]; rms times signature, [error, shot, reading, 2], m.
     """
     hypotheses = model.hypotheses(list(rms))
     scale = np.array([rms[name] for name, _ in hypotheses])

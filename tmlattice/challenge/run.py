@@ -1,4 +1,4 @@
-"""The diagnosis of every case, which knows the public part and nothing else."""
+"""The diagnosis of every case from its public part alone."""
 
 import logging
 import time
@@ -23,8 +23,8 @@ log = logging.getLogger(__name__)
 
 
 def diagnose_case(case: Case) -> dict[str, Any]:
-    """The diagnosis of one case as JSON, and the seconds it took; of several kinds also what is
-    found in each alone. Where the machine was learnt before, from what that left known."""
+    """Return the diagnosis of one case as JSON, with its seconds; of several kinds also the
+    findings of each alone. A learnt machine is diagnosed first, and its posterior is the prior."""
     ring = ring_of(case.lattice)
     begun = time.perf_counter()
     if case.kinds:
@@ -64,7 +64,7 @@ def run(
 
     Args:
         folder: of the challenge; its truth is not read and may be absent.
-        lattice: the challenge's, where it is Python code that may be run, see `check_lattice`.
+        lattice: the challenge's, if it is trusted Python code, see `check_lattice`.
         jobs, scheduler, progress: see `run_batch`.
 
     Returns:

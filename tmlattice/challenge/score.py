@@ -1,4 +1,4 @@
-"""The figures of merit of a challenge: the diagnosis beside the oracle and plain baselines."""
+"""The metrics of a challenge: the diagnosis compared with the oracle and simple baselines."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -62,13 +62,13 @@ def score(
     progress: bool = True,
     lattice: str | None = None,
 ) -> dict[str, Any]:
-    """All metrics of a challenge, in the format `tmlattice-challenge`.
+    """Return all metrics of a challenge, in the format `tmlattice-challenge`.
 
     Args:
         folder: of the challenge, with results and truth.
         oracle: with oracle and baselines, which take some seconds a case the first time.
         jobs, scheduler, progress: of the oracle, see `run_batch`.
-        lattice: the challenge's, where it is Python code that may be run, see `check_lattice`.
+        lattice: the challenge's, if it is trusted Python code, see `check_lattice`.
 
     Raises:
         TmlatticeError: no results.
@@ -107,7 +107,7 @@ def score(
                 results[name], truths[name], evaluated.get(name), guessed.get(name), places
             )
             row |= clean_gap(ring, partial(read_case, folder, name), truths[name], results[name])
-            summary([row], described["tier"])  # values that nobody can count spoil no other case
+            summary([row], described["tier"])  # invalid values spoil no other case
         except (
             ArithmeticError, LookupError, TypeError, ValueError, AttributeError, TmlatticeError
         ) as error:  # fmt: skip
@@ -139,7 +139,7 @@ def _others(
     lattice: str | None,
     where: Mapping[str, Any],
 ) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
-    """Oracle and plain methods, by case."""
+    """Oracle and simple methods, by case."""
     of_kinds = bool(described.get("kinds"))
 
     def load(name: str) -> Callable[[], tuple[Case, Truth]]:
@@ -164,7 +164,7 @@ def row_of(
     guessed: Mapping[str, Any] | None,
     places: Places,
 ) -> Row:
-    """One case: what was there, what the diagnosis said, and oracle and baselines likewise."""
+    """Return one case: the truth, and the answers of diagnosis, oracle and baselines."""
     causes, unknown = truth.causes, truth.unknown
     snr = truth.total if len(truth.signal_to_noise) != 1 else truth.signal_to_noise[0]
     row: Row = {
@@ -196,7 +196,7 @@ def row_of(
     if guessed is not None and "error" not in guessed:
         for name, guesses in guessed.items():
             if name != "seconds":
-                # of several causes they are told how many there are
+                # of several causes they are given the number
                 separate = len(causes) if len(causes) > 1 else None
                 answers[name] = baseline_answer(guesses, separate)
     row["answers"] = {name: _answer(answer, truth, places) for name, answer in answers.items()}
@@ -218,7 +218,7 @@ def row_of(
 def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
     findings = list(answer["findings"])
     first = findings[0] if findings else None
-    small = bool(answer.get("priors"))  # errors everywhere are no fault
+    small = bool(answer.get("priors"))  # distributed errors are no fault
     row: Row = {"detected": bool(findings) or (answer["verdict"] == "distributed" and not small)}
     if len(truth.causes) == 1:
         return row | finding_row(first, truth.causes[0], places)
@@ -229,7 +229,7 @@ def _answer(answer: Mapping[str, Any], truth: Truth, places: Places) -> Row:
 
 
 def _refused(result: Mapping[str, Any]) -> bool:
-    """Whether something is there and the catalogue is said not to hold it."""
+    """Whether a fault outside the catalogue is reported."""
     unnamed = any(finding["effect"] is None for finding in result["findings"])
     if result.get("priors") and not result["findings"]:
         return False
@@ -242,7 +242,7 @@ def _after(result: Mapping[str, Any]) -> float | None:
 
 
 def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
-    """Whether the held-out misfit of so many scored monitors lies within its 99 % interval."""
+    """Whether the held-out misfit of the scored monitors is within its 99 % interval."""
     left = _after(result)
     if left is None or not np.isfinite(left) or not result["gap"]["heldout"]["shots"]:
         return None
@@ -252,8 +252,8 @@ def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
 
 
 def _class(result: Mapping[str, Any]) -> Row | None:
-    """What the data did not part, where one thing was found: effects, number of elements, and the
-    next shot that was proposed: whether it changes a setting, and by how much it would part them.
+    """Equivalent explanations of a single finding: effects, number of elements, and the proposed
+    next shot: whether it changes a setting, and its separation.
     """
     if len(result["findings"]) != 1 or len(result["findings"][0]["credible_set"]) < 2:
         return None
@@ -270,10 +270,10 @@ def _class(result: Mapping[str, Any]) -> Row | None:
 def clean_gap(
     ring: Ring, load: Callable[[], Case], truth: Truth, result: Mapping[str, Any]
 ) -> dict[str, float | None]:
-    """rms error on held-out readings without noise, design and with the findings in it, m.
+    """Return the rms error on held-out readings without noise, of design and with findings, m.
 
-    In each shot the launch is fitted to one half of the monitors, the other half is scored. None of
-    kinds: of those no reading without noise is kept, and tables of turns take long to read.
+    In each shot the launch is fitted to one half of the monitors, the other half is scored. None
+    of kinds: they have no readings without noise, and tables of turns take long to read.
     """
     if truth.background or not truth.clean or not (truth.causes or truth.unknown):
         return {"clean_before": None, "clean_after": None}

@@ -1,4 +1,4 @@
-"""Faults that the catalogue does not hold, tracked by AT."""
+"""Faults outside the catalogue, tracked by AT."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -24,10 +24,10 @@ LARGEST: Mapping[str, float] = {
 """Kinds, and the largest amount.
 
 hysteresis: relative gradient error of a quadrupole, of either sign from shot to shot.
-octupole: integrated k3 L of a quadrupole, 1/m^3. kick_jitter: rms kick of a corrector, drawn anew
-for every shot, rad. monitor_cubic: x_read = x + a x^3, the same in y, 1/m^2.
-monitor_quadratic: x_read = x + a (x^2 - y^2), y_read = y - 2 a x y, 1/m. exchanged_cables: the
-cables of a monitor and of the next one are exchanged, both planes; it is there or not.
+octupole: integrated k3 L of a quadrupole, 1/m^3. kick_jitter: rms kick of a corrector, drawn for
+every shot, rad. monitor_cubic: x_read = x + a x^3, the same in y, 1/m^2. monitor_quadratic:
+x_read = x + a (x^2 - y^2), y_read = y - 2 a x y, 1/m. exchanged_cables: the cables of a monitor and
+of the next one are swapped, both planes; discrete.
 """
 
 DISCRETE = ("exchanged_cables",)
@@ -52,9 +52,9 @@ class Unknown:
     Args:
         ring: the design.
         kind: see `LARGEST`.
-        shots: all that are measured.
+        shots: all shots of the measurement.
         clean: their readings without a fault or noise, [shot, monitor, 2], m.
-        random: for the place, and for what differs from shot to shot.
+        random: for the place, and for differences between shots.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Unknown:
         self.draw = random.standard_normal(len(shots))
 
     def readings(self, amount: float) -> Array:
-        """Without noise, [shot, monitor, 2], m."""
+        """Return readings without noise, [shot, monitor, 2], m."""
         by_kind: dict[str, Callable[[float], Array]] = {
             "hysteresis": self._hysteresis,
             "octupole": self._octupole,
@@ -117,6 +117,6 @@ class Unknown:
 
 
 def clean_readings(machine: Machine, shots: Shots) -> Array:
-    """Readings without noise of one turn, [shot, monitor, 2], m."""
+    """Return readings without noise of one turn, [shot, monitor, 2], m."""
     beam = machine.beam(shots.launches, 1, shots.settings)
     return machine.monitors.read(beam)[:, 0]

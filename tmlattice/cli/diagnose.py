@@ -96,9 +96,9 @@ log = logging.getLogger(__name__)
     "--lattice-out",
     type=FILE,
     metavar="FILE",
-    help="The ring as found, with its errors: .json (the package's own), .at.json (AT), .madx or "
-    ".seq (MAD-X), .py (OCELOT). FILE.calibration.json beside it holds what monitors and "
-    "correctors do (`tmlattice predict`).",
+    help="The ring as found, with its errors: .json (the package's own), .at.json (AT), "
+    ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json beside it "
+    "holds what monitors and correctors do (`tmlattice predict`).",
 )
 @click.option(
     "--corrected-out",
@@ -442,6 +442,10 @@ def _write_folder(
     write_files(result, folder, document, correction)
 
 
+LINES = 34
+"""Of a report on a terminal; with what is written where, and a correction, 40."""
+
+
 def _print(
     result: "Diagnosis",
     correction: "Correction | None",
@@ -454,7 +458,8 @@ def _print(
 
     screen = console()
     width = min(screen.width, 120)
-    screen.print(report_text(result, width), soft_wrap=True)
+    most = LINES if screen.is_terminal else None  # a pipe takes all of it
+    screen.print(report_text(result, width, most), soft_wrap=True)
     if correction is not None:
         text = "\n".join(wrapped(f"Correction: {correction.words}", "", width))
         screen.print(f"\n{text}", soft_wrap=True)

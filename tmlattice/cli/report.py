@@ -26,5 +26,8 @@ def report(result: Path, out: Path | None, quiet: bool) -> None:
     if not quiet:
         screen = console()
         screen.print(report_text(found), soft_wrap=True)
-        place = out or (result if result.is_dir() else result.parent)
+        folder = result if result.is_dir() else result.parent
+        if (folder / "correction.json").is_file():
+            screen.print("\nThe correction is not in the new page: see correction.txt.")
+        place = out or folder
         screen.print(f"\nwritten: {place / 'report.html'}, {place / 'report.txt'}")

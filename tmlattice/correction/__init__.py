@@ -1,4 +1,4 @@
-"""Settings of power supplies that bring a diagnosed ring to its goal, with the expected gain.
+"""Power-supply settings that bring a diagnosed ring to its goal, with the expected gain.
 
 >>> correction = correct(diagnosis)                  # or of the files of `diagnose --lattice-out`
 >>> print(correction.report())
@@ -35,13 +35,13 @@ __all__ = ["Correction", "Knob", "Setting", "correct", "default_knobs", "read_kn
 Array = np.ndarray
 
 DRAWS = 200
-"""From the posterior: the ends of an interval scatter by a tenth of its half width."""
+"""Draws from the posterior: the ends of an interval scatter by a tenth of its half width."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
-"""Of knobs, for which the gain is told."""
+"""Numbers of knobs with a stated gain."""
 INTERVAL = (50.0, 15.87, 84.13)
 """Percentiles: the median and the central 68.27 %."""
 SIGMAS = 3.0
-"""By how many standard deviations tunes stay clear of integers and half integers."""
+"""Standard deviations by which tunes stay clear of integers and half integers."""
 
 
 def correct(
@@ -53,7 +53,7 @@ def correct(
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> Correction:
-    """Settings of knobs that bring the ring, as the data have it, closest to a goal.
+    """Return settings of knobs that bring the estimated ring closest to a goal.
 
     Args:
         diagnosis: of any measurement; or an `Estimate`; or a ring that is taken as certain, as all
@@ -61,14 +61,14 @@ def correct(
         goal: the ring whose optics are wanted, and whose strengths are the present settings of a
             ring that is given as one; None: the diagnosis's design.
         knobs: devices; kinds of `default_knobs`; or the path of a table. None: quadrupole supplies
-            and skew quadrupoles, and correctors where the closed orbit is a target.
-        targets: names of `TARGETS`, with tolerances where a mapping gives them. None: the optics,
-            and the closed orbit where it was measured.
+            and skew quadrupoles, and correctors if the closed orbit is a target.
+        targets: names of `TARGETS`, optionally with tolerances. None: the optics, and the closed
+            orbit if it was measured.
         seed: of the draws from the posterior.
         progress: called with the name of each stage.
 
     Raises:
-        TmlatticeError: a ring without a goal, or no knob that acts.
+        TmlatticeError: a ring without a goal, or no effective knob.
         ChoiceError, MeasurementError, UnknownNameError: targets or knobs that cannot be used.
         UnstableRingError: the estimated ring, or the goal, stores no beam.
     """
@@ -146,7 +146,7 @@ def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
 
 
 def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
-    """What the result says."""
+    """Fields of the result."""
     problem, targets = end.problem, end.problem.targets
     rows = targets.rows(begin.open)
     change = 2 * rows @ (begin.rows - end.rows)

@@ -1,4 +1,4 @@
-"""What applied settings did: the calibration of each knob, from a change between two measurements.
+"""Effect of applied settings: each knob's calibration, from a change between two measurements.
 
 >>> for own in applied(diagnosis, read_settings(Path("settings.csv"))):
 ...     print(own.device, own.ratio, own.ratio_error)
@@ -19,7 +19,7 @@ from tmlattice.input_files import text_of
 
 @dataclass(frozen=True)
 class Applied:
-    """Of one device that was set.
+    """One device that was set.
 
     Attributes:
         device: its name.
@@ -34,7 +34,7 @@ class Applied:
 
     @property
     def ratio(self) -> float:
-        """Found over asked."""
+        """Measured over requested change."""
         return self.found / self.asked
 
     @property
@@ -44,7 +44,7 @@ class Applied:
 
 
 def read_settings(path: Path) -> dict[str, tuple[float, float]]:
-    """Present and new setting by device, of the settings.csv of a correction.
+    """Return present and new setting by device, from the settings.csv of a correction.
 
     Raises:
         MeasurementError: a table that cannot be read.
@@ -59,7 +59,7 @@ def read_settings(path: Path) -> dict[str, tuple[float, float]]:
                 f"correction (found: {plain(str(row), 80)})"
             ) from None
     if not found:
-        raise MeasurementError(f"{path}: it holds no setting")
+        raise MeasurementError(f"{path}: it contains no setting")
     return found
 
 
@@ -68,19 +68,19 @@ def applied(
     settings: dict[str, tuple[float, float]],
     knobs: Sequence[Knob] | None = None,
 ) -> list[Applied]:
-    """Asked and measured changes of the devices whose strengths a change since a reference shows.
+    """Return requested and measured changes of the devices that a change since a reference shows.
 
     Args:
         diagnosis: of the measurement after, with the one before as its reference.
         settings: present and new by device, see `read_settings`.
-        knobs: those of the correction; None: as the lattice shows them.
+        knobs: those of the correction; None: those of the lattice.
 
     Raises:
         MeasurementError: a diagnosis without a reference.
     """
     if not diagnosis.has_reference:
         raise MeasurementError(
-            "settings are compared with a change: give the measurement from before as --reference"
+            "settings are compared with a change: give the measurement before as --reference"
         )
     kinds = ("supplies", "quadrupoles", "skew_quadrupoles", "sextupoles")
     every = default_knobs(diagnosis.ring, kinds) if knobs is None else knobs
@@ -108,8 +108,8 @@ def applied(
 
 
 def sentence(own: Applied) -> str:
-    """Of one device, in words."""
+    """Return a sentence on one device."""
     return (
-        f"{own.device}: asked {100 * own.asked:+.3g} %, measured {100 * own.found:+.3g} ± "
+        f"{own.device}: requested {100 * own.asked:+.3g} %, measured {100 * own.found:+.3g} ± "
         f"{100 * own.error:.2g} %, calibration {own.ratio:.3g} ± {own.ratio_error:.2g}"
     )

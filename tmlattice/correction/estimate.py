@@ -1,4 +1,4 @@
-"""The estimated ring with its posterior: what a correction starts from.
+"""The estimated ring with its posterior: the start of a correction.
 
 >>> estimate = estimate_of(diagnosis)
 >>> estimate.draw(200, np.random.default_rng(0)).shape      # [draw, error]
@@ -27,17 +27,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A ring as the data have it, and what they leave open.
+    """An estimated ring and its uncertainty.
 
     Attributes:
         ring: the posterior mean.
-        settings: the ring whose strengths are the present settings.
-        hypotheses: errors that are not certain, (effect, place), of the ring.
-        known: their posterior about the mean; None: nothing is left open.
-        kept: which of the errors of `known` these are.
+        settings: the ring with the present settings.
+        hypotheses: uncertain errors, (effect, place), of the ring.
+        known: their posterior; None: no uncertainty.
+        kept: indices of these errors in `known`.
         calibrations: of correctors, kick over setting, by name.
-        dispersion: what the data show beside the ring's, m, [BPM, plane], or 0.
-        energy, energy_error: of the stored beam beside the ring's at its RF frequency, relative.
+        dispersion: measured beyond the ring's, m, [BPM, plane], or 0.
+        energy, energy_error: of the stored beam relative to the ring's at its RF frequency.
     """
 
     ring: Ring
@@ -53,13 +53,13 @@ class Estimate:
     def with_beam(
         self, dispersion: Dispersion, energy: float = 0.0, energy_error: float = 0.0
     ) -> "Estimate":
-        """With the dispersion and the energy that were found beside the ring's."""
+        """Return the estimate with a measured dispersion and energy beyond the ring's."""
         names = [monitor.name for monitor in self.ring.monitors]
         more = np.array([dispersion.get(name, (0.0, 0.0)) for name in names]).reshape(-1, 2)
         return replace(self, dispersion=more, energy=energy, energy_error=energy_error)
 
     def draw(self, count: int, random: np.random.Generator) -> Array:
-        """Errors drawn from the posterior, less their mean, [draw, error]."""
+        """Return errors drawn from the posterior, less their mean, [draw, error]."""
         if self.known is None:
             return np.zeros((count, 0))
         known = self.known
@@ -68,12 +68,12 @@ class Estimate:
 
 
 def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -> Estimate:
-    """The estimate of a ring beside which stands what is known of its errors.
+    """Return the estimate of a ring with the posterior of its errors.
 
     Args:
         ring: the estimated ring, as `diagnose --lattice-out` writes it.
-        settings: the ring whose strengths are the present settings.
-        known: of its small errors; None: the ring is taken as certain.
+        settings: the ring with the present settings.
+        known: posterior of its distributed errors; None: no uncertainty.
     """
     if known is None:
         return Estimate(ring, settings)
@@ -98,14 +98,14 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
 
 
 def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:
-    """The estimate of a diagnosis: the ring with what was found, and its posterior.
+    """Return the estimate of a diagnosis: the ring with the findings, and its posterior.
 
     Args:
         diagnosis: of any measurement.
-        known: its `known_of`, where that is at hand.
+        known: its `known_of`, if available.
 
-    Of a change since a reference, and where no covariance of the small errors is known, each
-    amount has its own standard deviation.
+    Of a change since a reference, and without a covariance of the distributed errors, each amount
+    has its own standard deviation.
     """
     known = known_of(diagnosis) if known is None else known
     if known is None:
@@ -132,15 +132,15 @@ def _of_ring(name: str) -> bool:
 
 
 def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tuple[str, ...]]:
-    """The estimate that `diagnose --lattice-out` wrote, and what a reader should know of it.
+    """Return the estimate that `diagnose --lattice-out` wrote, and warnings.
 
     Args:
-        path: of the lattice file; beside it are what is known of its errors and its calibration.
-        settings: the ring whose strengths are the present settings.
+        path: of the lattice file; next to it are the posterior of its errors and its calibration.
+        settings: the ring with the present settings.
         ring: of that file.
 
     Raises:
-        MeasurementError: a file beside it that is damaged, or of another ring.
+        MeasurementError: a damaged file next to it, or one of another ring.
         LatticeError: the two rings do not have the same elements.
     """
     if [e.name for e in ring.elements] != [e.name for e in settings.elements]:
@@ -151,7 +151,7 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
     with_beam, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
     said: tuple[str, ...] = ()
     if not with_beam.is_file():
-        said = (f"'{with_beam.name}' is not there: the estimated ring is taken as certain",)
+        said = (f"'{with_beam.name}' is missing: the estimated ring is taken as certain",)
     found = estimate_with(ring, settings, read_known(with_beam, ring) if not said else None)
     if calibration.is_file():
         energy = read_energy(calibration, ring)

@@ -1,7 +1,7 @@
-"""Threading: steering a beam that is not stored, so that it comes round and closes.
+"""Threading: steering an injected beam until it closes on itself.
 
-The target is the trajectory of a beam that is launched on the axis, at the BPMs on two turns: a
-trajectory that stays near the axis on both has come round, and has closed.
+The target is the trajectory of a beam that is launched on the axis, at the BPMs on two turns: if it
+stays near the axis on both, it is closed.
 """
 
 from collections.abc import Sequence
@@ -19,8 +19,8 @@ Hypothesis = tuple[str, str | None]
 
 TURNS = 2
 LOST = 0.1
-"""m: what a reading of a lost beam counts as. It is beyond any aperture, so that the first readings
-outside of one still say where the beam went."""
+"""m; reading of a lost beam. It is beyond any aperture, so that the first readings outside of one
+still show the beam's direction."""
 
 
 class Trajectory:
@@ -38,7 +38,7 @@ class Trajectory:
         paths = self._model.paths(np.zeros((1, 5)))
         beam = paths.beam[0]
         self._alive = np.cumsum(~(np.abs(beam) < LOST).all(axis=1)) == 0
-        if not self._alive.all():  # behind, the maps have grown beyond all bounds
+        if not self._alive.all():  # the maps behind have overflown
             behind = int(self._model.where[int(np.argmin(self._alive))]) + 1
             states, tangents = paths.states.copy(), paths.tangents.copy()
             states[:, behind:], tangents[:, behind:] = 0.0, np.eye(states.shape[-1])
@@ -48,15 +48,15 @@ class Trajectory:
         self.values = np.where(self._alive[:, None], np.nan_to_num(beam), LOST)
 
     def moved(self, ring: Ring, frequency: float) -> "Trajectory":
-        """Of a ring with other elements; an RF frequency has no part in it."""
+        """Return that of a ring with other elements; the RF frequency has no effect."""
         return Trajectory(ring)
 
     def by_frequency(self) -> Array:
-        """Nothing, [1, reading, plane]."""
+        """Return zeros, [1, reading, plane]."""
         return np.zeros((1, *self.values.shape))
 
     def derivatives(self, hypotheses: Sequence[Hypothesis]) -> Array:
-        """Change per unit of effects on the ring, up to where the beam is lost, m."""
+        """Return the change per unit of effects on the ring, up to a loss of the beam, m."""
         found = self._model.signatures(self._paths, list(hypotheses), np.zeros((1, 5)))[:, 0]
         return np.where(self._alive[:, None], np.nan_to_num(found), 0.0)
 
@@ -76,13 +76,13 @@ class Threading(Weighted):
         self.s = np.concatenate([places + turn * goal.length for turn in range(TURNS)])
 
     def begin(self, ring: Ring, energy: float) -> Trajectory:
-        """Of a ring; of the injected beam's energy nothing is known."""
+        """Return the trajectory of a ring; the injected beam's energy is the nominal one."""
         return Trajectory(ring)
 
     def errors(self, values: Array) -> dict[str, Array]:
-        """By target, [reading, plane], m."""
+        """Return errors by target, [reading, plane], m."""
         return {THREADING: values}
 
     def changes(self, derivatives: Array) -> dict[str, Array]:
-        """The derivatives of `errors`."""
+        """Return the derivatives of `errors`."""
         return {THREADING: derivatives}

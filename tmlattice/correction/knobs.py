@@ -1,7 +1,7 @@
 """Knobs of a correction: power supplies, magnets and the RF, with their settings and limits.
 
-A knob moves an effect of the catalogue at all of its members alike. Its setting is in the unit of
-its supply; an excitation curve says what strength a setting makes.
+A knob applies an effect of the catalogue to all of its members alike. Its setting is in the unit of
+its supply; an excitation curve gives the strength of a setting.
 
 >>> knobs = default_knobs(ring)
 >>> knobs = read_knobs(Path("knobs.yaml"), ring)
@@ -31,12 +31,12 @@ class Kind:
     """A kind of knob.
 
     Attributes:
-        effect: of the catalogue that it moves at each member; None: the RF frequency.
-        strength: OCELOT's attribute that it sets, as snippets write it.
+        effect: of the catalogue, applied to each member; None: the RF frequency.
+        strength: OCELOT's attribute that it sets, as in snippets.
         unit: of the strength.
-        relative: the effect's amount is the relative change of the strength, not the change.
-        error: relative error of a change, where the table has none: calibration and hysteresis of
-            quadrupoles are known to a percent, a corrector's to the usual size of its error.
+        relative: whether the effect's amount is the relative change of the strength.
+        error: default relative error of a change: calibration and hysteresis of quadrupoles are
+            known to a per cent, a corrector's to the usual size of its error.
     """
 
     effect: str | None
@@ -75,7 +75,7 @@ class Knob:
         curve: points (setting, strength) in rising settings; none: the strength is proportional to
             the setting (of an effect that adds, equal to it).
         error: relative error of a change.
-        scale: strength over what the curve says: a corrector's calibration.
+        scale: strength over the curve's: a corrector's calibration.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Knob:
     scale: float = 1.0
 
     def strength(self, setting: float) -> float:
-        """By the excitation curve, beyond its ends as along its last piece."""
+        """Return the strength by the excitation curve, extrapolated along its last piece."""
         if not self.curve:
             return setting
         x, y = np.array(self.curve).T
@@ -99,7 +99,7 @@ class Knob:
         return float(y[i] + (setting - x[i]) * (y[i + 1] - y[i]) / (x[i + 1] - x[i]))
 
     def setting(self, amount: float) -> float:
-        """That makes this amount of the effect."""
+        """Return the setting of an amount of the effect."""
         now = self.strength(self.present)
         wanted = now * (1 + amount) if KINDS[self.kind].relative else now + amount / self.scale
         if not self.curve:
@@ -108,12 +108,12 @@ class Knob:
         return inverse.strength(wanted)
 
     def amount(self, setting: float) -> float:
-        """Of the effect, at this setting."""
+        """Return the amount of the effect at a setting."""
         now, then = self.strength(self.present), self.strength(setting)
         return then / now - 1 if KINDS[self.kind].relative else self.scale * (then - now)
 
     def rounded(self, amount: float) -> float:
-        """The amount at the nearest setting that the limits and the step allow."""
+        """Return the amount at the nearest setting within the limits and the step."""
         setting = self.setting(amount)
         if self.step:
             setting = self.present + self.step * round((setting - self.present) / self.step)
@@ -125,14 +125,14 @@ class Knob:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Of the amount; a present setting beyond its limits may stay."""
+        """Limits of the amount; a present setting beyond its limits may stay."""
         rises = math.copysign(1.0, self.amount(self.present + 1.0))
         ends = (min(self.low, self.present), max(self.high, self.present))
         low, high = sorted(self.amount(e) if math.isfinite(e) else rises * e for e in ends)
         return low, high
 
     def causes(self, amount: float) -> list[Cause]:
-        """What it changes in the ring."""
+        """Return the causes of an amount in the ring."""
         effect = KINDS[self.kind].effect
         if effect is None or not amount:
             return []
@@ -140,17 +140,17 @@ class Knob:
 
 
 def kinds_for(targets: Collection[str]) -> list[str]:
-    """The kinds of knobs that some targets are corrected with, where nobody names any."""
+    """Return the default kinds of knobs for some targets."""
     orbit = {"closed_orbit", "first_turn"} & set(targets)
     kinds = [] if set(targets) <= orbit else ["supplies", "skew_quadrupoles"]
     return kinds + ["correctors"] * bool(orbit)
 
 
 def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:
-    """The knobs that a lattice shows: quadrupole supplies, skew quadrupoles, correctors.
+    """Return the knobs of a lattice: quadrupole supplies, skew quadrupoles, correctors.
 
     Args:
-        ring: whose strengths are the present settings.
+        ring: with the present settings.
         kinds: instead, any of "supplies", "quadrupoles" (each magnet alone), "skew_quadrupoles",
             "correctors", "sextupoles" (by families), "rf".
 
@@ -182,7 +182,7 @@ def _upright(ring: Ring, name: str) -> bool:
 
 
 def _supplies(ring: Ring) -> list[Knob]:
-    """By family or likeness in the design; quadrupoles of no family each alone."""
+    """Knobs by family or equal design strength; quadrupoles of no family one by one."""
     names = [pieces[0].name for pieces in magnets(ring, ("quadrupole",), powered=True)]
     kinds, belongs = supplied_alike(ring)
     knobs, taken = [], set()
@@ -208,7 +208,7 @@ def _each(ring: Ring, kind: str) -> list[Knob]:
 
 
 def _skew(ring: Ring) -> list[Knob]:
-    """Quadrupoles that are turned by 45 degrees."""
+    """Quadrupoles rolled by 45 degrees."""
     return [
         _knob(own[0].name, "skew_quadrupole", (own[0].name,),
               sum(p.errors.k1sl + p.k1 * p.length * -math.sin(2 * p.tilt) for p in own))
@@ -238,7 +238,7 @@ def _sextupoles(ring: Ring) -> list[Knob]:
 COLUMNS = (
     "knob", "kind", "members", "unit", "present", "low", "high", "step", "error", "curve",
 )  # fmt: skip
-"""Of a table of knobs; `members` are names separated by spaces, `curve` is points
+"""Columns of a table of knobs; `members` are names separated by spaces, `curve` is points
 `setting:strength` separated by spaces. All but the knob may be empty."""
 
 
@@ -248,7 +248,7 @@ def read_knobs(path: Path, ring: Ring) -> list[Knob]:
 
     Raises:
         MeasurementError: a table that cannot be read, with the knob.
-        UnknownNameError: a member that the ring does not have.
+        UnknownNameError: a member that is not in the ring.
     """
     if path.suffix.lower() in (".yaml", ".yml"):
         rows = yaml_of(path, MeasurementError)
@@ -271,14 +271,14 @@ def knobs_of(rows: Any, path: Path, ring: Ring) -> list[Knob]:
         MeasurementError, UnknownNameError: as of `read_knobs`.
     """
     if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows) or not rows:
-        raise MeasurementError(f"{path}: it holds no list of knobs; `--example` writes one")
+        raise MeasurementError(f"{path}: it contains no list of knobs; `--example` writes one")
     every = ("supplies", "quadrupoles", "skew_quadrupoles", "correctors", "sextupoles", "rf")
     shown = {knob.name.casefold(): knob for knob in reversed(default_knobs(ring, every))}
     knobs = [_read(path, row, ring, shown) for row in rows]
     names = [knob.name for knob in knobs]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise MeasurementError(f"{path}: the knob '{plain(twice, 40)}' stands twice")
+        raise MeasurementError(f"{path}: the knob '{plain(twice, 40)}' occurs twice")
     return knobs
 
 
@@ -308,7 +308,7 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
         attribute = {"kick": "angle"}.get(KINDS[kind].strength, KINDS[kind].strength)
         known = _knob(name, kind, pieces, float(getattr(first, attribute, 0.0)))
     if known is None or (kind and kind != known.kind):
-        raise MeasurementError(f"{where}: the lattice shows none of this name; state its members")
+        raise MeasurementError(f"{where}: the lattice has none of this name; state its members")
     curve = given.pop("curve", ())
     unit = str(given.pop("unit", known.unit))
     try:
@@ -318,7 +318,7 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
         read = tuple(sorted((float(x), float(y)) for x, y in pairs))
     except (TypeError, ValueError):
         raise MeasurementError(
-            f"{where}: a value is no number; a curve is 'setting:strength setting:strength'"
+            f"{where}: a value is not a number; a curve is 'setting:strength setting:strength'"
         ) from None
     if unit != known.unit and "present" not in numbers:
         raise MeasurementError(f"{where}: its unit is {plain(unit, 20)}; state its present setting")
@@ -337,16 +337,16 @@ def _check(where: str, knob: Knob) -> None:
     if x is not None and y is not None:
         falls = np.diff(y) * (y[-1] - y[0])
         if len(x) < 2 or (np.diff(x) <= 0).any() or (falls <= 0).any():
-            raise MeasurementError(f"{where}: its curve has to rise, or fall, from point to point")
+            raise MeasurementError(f"{where}: its curve must rise, or fall, from point to point")
     if KINDS[knob.kind].relative and knob.strength(knob.present) == 0:
         raise MeasurementError(
-            f"{where}: its present strength is 0, of which no change is a share; state its present "
-            "setting"
+            f"{where}: its present strength is 0, of which no change is relative; state its "
+            "present setting"
         )
 
 
 def write_knobs(path: Path, knobs: Iterable[Knob]) -> None:
-    """A table of knobs as `read_knobs` reads it, .csv."""
+    """Write a table of knobs for `read_knobs`, .csv."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)

@@ -1,4 +1,4 @@
-"""A correction: settings of knobs, what they are expected to gain, and what stays.
+"""A correction: settings of knobs, their expected gain, and the remaining errors.
 
 >>> correction = correct(diagnosis)
 >>> print(correction.report())
@@ -29,14 +29,14 @@ HEAD = ("device", "present", "new", "change", "unit", "low", "high", "gain")
 
 @dataclass(frozen=True)
 class Setting:
-    """Of one device.
+    """Setting of one device.
 
     Attributes:
         knob: the device.
         amount: relative change of its strength, or the change (rad, 1/m) of one that adds.
         new: setting.
-        gain: share of the whole gain by which this device lowers the expected square after those
-            that stand before it.
+        gain: share of the whole gain by which this device lowers the expected square, after the
+            devices before it.
     """
 
     knob: Knob
@@ -46,7 +46,7 @@ class Setting:
 
     @property
     def at_limit(self) -> bool:
-        """Whether a limit holds it back."""
+        """Whether a limit is reached."""
         near = max(self.knob.step, 1e-6 * abs(self.new - self.knob.present))
         return any(
             math.isfinite(end) and abs(self.new - end) <= near
@@ -54,7 +54,7 @@ class Setting:
         )
 
     def row(self) -> list[Any]:
-        """In the order of `HEAD`."""
+        """Return the values in the order of `HEAD`."""
         knob = self.knob
         return [knob.name, knob.present, self.new, self.new - knob.present, knob.unit,
                 *(None if math.isinf(end) else end for end in (knob.low, knob.high)),
@@ -63,25 +63,25 @@ class Setting:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Correction(Speaks):
-    """Settings and what they are expected to do.
+    """Settings and their expected effect.
 
     Attributes:
         settings: of the devices that change, the one that gains most first; none where refused.
-        refused: why nothing is changed; empty where something is.
+        refused: why no setting is changed; empty if some are.
         before, after: expected rms of each target's errors, by target, (x, y).
         stays: rms of each target's errors after the correction in the estimated ring, which these
             knobs do not reach, and the median of what the data leave undetermined, (x, y) each.
         gains: of the first 1, 2, 5, 10, ... devices: their number, and the expected rms by target.
         gain, gain_error: share of the expected square, in units of the tolerances, that the
-            correction takes away, and its standard deviation.
+            correction removes, and its standard deviation.
         tunes: fractions, of the goal, now and expected.
         shown: the target that figures show: beta beating, or the trajectory.
         profile: its errors at the readings now and expected, each [reading, plane, 3] (`Interval`).
         s: of the readings, m.
         counted: the targets, with their tolerances.
-        iterations: of measurement and correction that a ring like this needs.
-        warnings: what a reader should know.
-        ring: whose settings are the present ones.
+        iterations: of measurement and correction that are needed.
+        warnings: for the reader.
+        ring: with the present settings.
         provenance: versions, options, seconds.
     """
 
@@ -108,7 +108,7 @@ class Correction(Speaks):
 
     @property
     def words(self) -> str:
-        """The result in a sentence."""
+        """Summary in one sentence."""
         if self.refused:
             return self.refused
         first = [setting.knob.name for setting in self.settings[:3]]
@@ -132,7 +132,7 @@ class Correction(Speaks):
     )
 
     def as_json(self) -> dict[str, Any]:
-        """The result in the format `tmlattice-correction`, version 1."""
+        """Return the result in the format `tmlattice-correction`, version 1."""
         from tmlattice import __version__
 
         def of(parts: Mapping[str, Any]) -> dict[str, Any]:
@@ -173,7 +173,7 @@ class Correction(Speaks):
         }  # fmt: skip
 
     def table(self) -> str:
-        """The settings as CSV."""
+        """Return the settings as CSV."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(HEAD)
@@ -185,14 +185,14 @@ class Correction(Speaks):
         return text.getvalue()
 
     def snippet(self, code: str) -> str:
-        """The settings as statements of "madx", "at" (Python) or "elegant"."""
+        """Return the settings as statements of "madx", "at" (Python) or "elegant"."""
         return snippet(self.ring, [(s.knob, s.amount) for s in self.settings], code)
 
 
 def _change(
     name: str, before: tuple[Interval, Interval], after: tuple[Interval, Interval]
 ) -> tuple[float, str] | None:
-    """By what factor a target's worse plane shrinks, and that in words; None: it does not."""
+    """Factor by which a target's worse plane shrinks, and a sentence; None: it does not."""
     p = max((0, 1), key=lambda plane: before[plane][0])
     (now, *_), (then, low, high) = before[p], after[p]
     if not then < now:
@@ -204,6 +204,6 @@ def _change(
 
 
 def with_gains(settings: list[Setting], shares: list[float]) -> tuple[Setting, ...]:
-    """The settings with their shares of the gain, the largest first."""
+    """Return the settings with their shares of the gain, the largest first."""
     rows = [replace(s, gain=share) for s, share in zip(settings, shares, strict=True)]
     return tuple(sorted(rows, key=lambda row: -row.gain))

@@ -1,6 +1,6 @@
 """New strengths of magnets as statements of MAD-X, AT and elegant.
 
-A statement is of all magnets of a name where all of them get the same; else of one occurrence. In
+A statement is for all magnets of a name if all of them get the same; else for one occurrence. In
 MAD-X an occurrence has the name that `write_ring` gives it: `qd..12` for `qd::12`.
 """
 
@@ -13,7 +13,7 @@ from tmlattice.lattice import Element, Ring
 
 
 class New(NamedTuple):
-    """Of one element: attribute (k1, k2, k1s in 1/m2 and 1/m3, kick in rad), value, length in m."""
+    """Attribute (k1, k2, k1s in 1/m2 and 1/m3, kick in rad), value and length in m."""
 
     element: Element
     attribute: str
@@ -21,10 +21,10 @@ class New(NamedTuple):
 
 
 def snippet(ring: Ring, changes: Sequence[tuple[Knob, float]], code: str) -> str:
-    """Statements, one a line.
+    """Return statements, one per line.
 
     Args:
-        ring: whose strengths are the present settings.
+        ring: with the present settings.
         changes: of knobs, with the amounts of their effects.
         code: "madx", "at" (Python, of a lattice `ring`) or "elegant".
     """

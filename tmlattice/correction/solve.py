@@ -1,13 +1,13 @@
-"""Settings that make the expected square of the target errors least.
+"""Settings of the smallest expected square of the target errors.
 
 With the errors e of the estimated ring in units of their tolerances, J their derivatives by the
 knobs and G those by its uncertain errors, the expected square after a change x is, to first order,
 
     |e + J x|^2 + sum_k (sigma_k |J_k| x_k)^2 + E |G delta|^2.
 
-The first term is what the knobs can reach. The second is a ridge that no one has to choose: a
-knob's change has a relative error sigma_k, so that large changes which cancel one another cost more
-than they gain. The third is what the data do not determine: no knob lowers it.
+The first term can be reduced by the knobs. The second is a ridge without a free parameter: a knob's
+change has a relative error sigma_k, so that large changes which cancel one another cost more than
+they gain. The third is what the data do not determine: no knob lowers it.
 """
 
 import logging
@@ -30,25 +30,25 @@ from tmlattice.errors import UnstableRingError
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Shown = Any
-"""What a ring shows, as its targets see it: `StoredOptics` or `Trajectory`."""
+"""Orbit and optics of a ring, as its targets use them: `StoredOptics` or `Trajectory`."""
 
 log = logging.getLogger(__name__)
 
 MAX_ROUNDS = 30
-"""Linearisations at most: a beam that is threaded gets further with each of them."""
+"""Linearisations at most: a threaded beam gets further with each of them."""
 MIN_FALL = 1e-3
-"""Relative fall of the expected square at which a linearisation was the last."""
+"""Relative fall of the expected square below which the iteration ends."""
 MAX_HALVINGS = 6
-"""How often a step that does not lower the expected square is halved."""
+"""Halvings, at most, of a step that does not lower the expected square."""
 MAX_EXCESS = 0.02
-"""Relative excess over the least expected square (1 % in rms) that fewer knobs may leave."""
+"""Relative excess over the smallest expected square (1 % in rms) allowed for fewer knobs."""
 AT_ONCE = 500
-"""Uncertain errors whose derivatives are held at a time."""
+"""Uncertain errors whose derivatives are in memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is corrected with what.
+    """Errors, knobs and targets of a correction.
 
     Attributes:
         estimate: the ring and its posterior.
@@ -68,10 +68,10 @@ class Problem:
 
     @cached_property
     def begin(self) -> Shown:
-        """What the estimated ring shows.
+        """Return orbit and optics of the estimated ring.
 
         Raises:
-            UnstableRingError: it stores no beam.
+            UnstableRingError: no stored beam.
         """
         return self.targets.begin(self.estimate.ring, self.estimate.energy)
 
@@ -82,21 +82,21 @@ class Problem:
 
     @cached_property
     def sizes(self) -> Array:
-        """Norm of the rows' derivatives by each knob in the estimated ring, [knob]; 1 where it
-        changes nothing."""
+        """Norm of the rows' derivatives by each knob in the estimated ring, [knob]; 1 if it has no
+        effect."""
         size = np.linalg.norm(Point(self, np.zeros(len(self.knobs)), self.begin).slopes, axis=0)
         return np.asarray(np.where(size > 0, size, 1.0))
 
     @cached_property
     def bounds(self) -> Array:
-        """Of the amounts, [2, knob]."""
+        """Limits of the amounts, [2, knob]."""
         return np.array([knob.bounds for knob in self.knobs]).reshape(-1, 2).T
 
     def at(self, amounts: Array) -> "Point":
-        """The estimated ring with changes of the knobs.
+        """Return the estimated ring with changes of the knobs.
 
         Raises:
-            UnstableRingError: it stores no beam.
+            UnstableRingError: no stored beam.
         """
         causes = [c for k, a in zip(self.knobs, amounts.tolist(), strict=True) for c in k.causes(a)]
         shift = sum(a for k, a in zip(self.knobs, amounts, strict=True) if k.kind == "rf")
@@ -105,7 +105,7 @@ class Problem:
         return Point(self, amounts, shown)
 
     def better(self, amounts: Array, least: float) -> "Point | None":
-        """The point, if it stores a beam and its expected square is below."""
+        """Return the point, if it stores a beam and its expected square is below `least`."""
         try:
             point = self.at(amounts)
         except UnstableRingError:
@@ -115,11 +115,11 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """The estimated ring with some changes of the knobs.
+    """The estimated ring with changes of the knobs.
 
     Attributes:
-        problem, amounts: what it was made from, [knob].
-        look: what the ring shows.
+        problem, amounts: arguments, [knob].
+        shown: orbit and optics of the ring.
     """
 
     problem: Problem
@@ -128,7 +128,7 @@ class Point:
 
     @cached_property
     def errors(self) -> dict[str, Array]:
-        """Of all targets, see `Targets.errors`."""
+        """Errors of all targets, see `Targets.errors`."""
         errors = self.problem.targets.errors(self.shown.values)
         if "dispersion" in errors:
             errors["dispersion"] = errors["dispersion"] + self.problem.estimate.dispersion
@@ -136,7 +136,7 @@ class Point:
 
     @cached_property
     def rows(self) -> Array:
-        """Those that count, in units of their tolerances, [row]."""
+        """Errors of the wanted targets, in units of their tolerances, [row]."""
         return self.problem.targets.rows(self.errors)
 
     @cached_property
@@ -172,7 +172,7 @@ class Point:
 
     @cached_property
     def open(self) -> dict[str, Array]:
-        """What the draws from the posterior, and the errors of the knobs' changes, add to the
+        """Contribution of the draws from the posterior, and of the knobs' errors, to the target
         errors, to first order, [draw, reading, plane] each."""
         problem, estimate = self.problem, self.problem.estimate
         noise = problem.noise * problem.sigma * self.amounts
@@ -190,26 +190,26 @@ class Point:
 
     @property
     def unsure(self) -> Array:
-        """Errors of the knobs' changes in the rows, rms of each, [knob]."""
+        """rms contribution of each knob's error to the rows, [knob]."""
         return self.problem.sigma * self.problem.sizes * self.amounts
 
     @property
     def square(self) -> float:
-        """Expected square of the rows, without what the data do not determine."""
+        """Expected square of the rows, without the undetermined part."""
         return float(self.rows @ self.rows + self.unsure @ self.unsure)
 
     @cached_property
     def _triangle(self) -> tuple[Array, Array, float]:
-        """Of the slopes in units of the knobs' sizes: the triangle R, and in its coordinates what
-        stays without any change, [knob]; and the square of what no knob moves."""
+        """Triangle R of the slopes in units of the knobs' sizes; in its coordinates the errors
+        without any change, [knob]; and the square of the part that no knob changes."""
         q, r = np.linalg.qr(self.slopes / self.problem.sizes)
         start = self.rows - self.slopes @ self.amounts
         inside = q.T @ start
         return r, inside, float(start @ start - inside @ inside)
 
     def step(self, knobs: Indices) -> tuple[Array, float]:
-        """The amounts of some knobs, the others at zero, that make the expected square least as it
-        is about here, within the limits; and that square."""
+        """Return the amounts of some knobs, the others at zero, of the smallest linearised expected
+        square within the limits; and that square."""
         r, start, fixed = self._triangle
         matrix = np.vstack([r[:, knobs], np.diag(self.problem.sigma[knobs])])
         right = np.concatenate([-start, np.zeros(len(knobs))])
@@ -225,12 +225,12 @@ class Point:
 
 
 def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
-    """The point of least expected square that some knobs reach, linearised anew as it moves.
+    """Return the point of the smallest expected square with some knobs, by repeated linearisation.
 
     Args:
-        problem: what is corrected.
-        begin: where it starts.
-        knobs: those that may change; the others are at zero.
+        problem: errors, knobs and targets.
+        begin: starting point.
+        knobs: indices of free knobs; the others are at zero.
     """
     now = begin
     for _ in range(MAX_ROUNDS):
@@ -251,8 +251,8 @@ def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
 
 
 def by_gain(point: Point) -> list[int]:
-    """The knobs in the order in which each next one lowers the expected square most, with the
-    others adjusted to it (orthogonal matching pursuit, as MICADO)."""
+    """Return the knobs in the order of the largest fall of the expected square, with those before
+    adjusted (orthogonal matching pursuit, as MICADO)."""
     r, start, _ = point._triangle
     count = len(point.amounts)
     left_over = [k for k in range(count) if r[:, k].any()]
@@ -272,15 +272,15 @@ def by_gain(point: Point) -> list[int]:
 
 
 def fewest(point: Point, order: Sequence[int], counts: Sequence[int]) -> tuple[int, Array]:
-    """How many of the first knobs leave hardly more than all, and the expected square that each
-    number leaves, linear about a point, [count]."""
+    """Return the number of first knobs that reach nearly the gain of all, and the linearised
+    expected square of each number, [count]."""
     squares = np.array([point.step(np.array(order[:n], dtype=np.int64))[1] for n in counts])
     enough = np.flatnonzero(squares <= (1 + MAX_EXCESS) * squares.min())
     return counts[int(enough[0])], squares
 
 
 def rounded(problem: Problem, point: Point) -> Point:
-    """With settings that the devices' steps allow; the errors' derivatives stay."""
+    """Return the point at settings that the devices' steps allow; derivatives stay."""
     pairs = zip(problem.knobs, point.amounts.tolist(), strict=True)
     amounts = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
     return point if np.array_equal(amounts, point.amounts) else problem.at(amounts)
@@ -289,7 +289,7 @@ def rounded(problem: Problem, point: Point) -> Point:
 def drawn(
     estimate: Estimate, knobs: Sequence[Knob], targets: Targets | Threading, count: int, seed: int
 ) -> Problem:
-    """The problem with draws from the posterior."""
+    """Return the problem with draws from the posterior."""
     random = np.random.default_rng(seed)
     scaled = [
         replace(knob, scale=estimate.calibrations.get(knob.members[0], 1.0))

@@ -1,8 +1,8 @@
-"""What a correction is judged by: errors of the stored beam's optics from a goal, and derivatives.
+"""Targets of a correction: errors of the stored beam's optics from a goal, and their derivatives.
 
-Everything comes from the stored beam at two RF frequencies, half a step above and below: orbit,
-betas, phases, tunes and coupling are their means; dispersion and chromaticity their differences,
-per the relative energy that the step makes in the design, as a control room measures them.
+They come from the stored beam at two RF frequencies, half a step above and below: orbit, betas,
+phases, tunes and coupling are their means; dispersion and chromaticity their differences, per the
+relative energy of the step in the design, as a control room measures them.
 
 >>> targets = Targets(design, {"beta_beating": 0.01})
 >>> errors = targets.errors(optics_of(model, targets.step))
@@ -29,13 +29,13 @@ ENERGY = 1e-4
 
 @dataclass(frozen=True)
 class Target:
-    """One quantity that should be as in the goal.
+    """One quantity with a goal.
 
     Attributes:
-        words: what it is, with its plane where it has two.
+        words: description, with its plane if it has two.
         unit: of its errors.
         tolerance: rms error that counts as one; of the dispersion a share of the design's rms.
-        planes: what its last axis is: of its two columns each is reported.
+        planes: labels of its last axis; each of two columns is reported.
     """
 
     words: str
@@ -56,19 +56,19 @@ TARGETS: dict[str, Target] = {
     "closed_orbit": Target("closed orbit", "m", 1e-4, ("x", "y")),
     "first_turn": Target("trajectory on the first two turns", "m", 1e-3, ("x", "y")),
 }
-"""The usual targets. One percent of beta beating comes with 1e-3 of phase advance; an amplitude of
-one percent in the other plane is an emittance ratio of 1e-4."""
+"""The usual targets. One per cent of beta beating comes with 1e-3 of phase advance; an amplitude of
+one per cent in the other plane is an emittance ratio of 1e-4."""
 
 
 OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling")
-"""Targets that every estimated ring has."""
+"""Targets of every estimated ring."""
 THREADING = "first_turn"
-"""The target of a beam that is not stored: it is corrected alone."""
+"""Target of a beam that is not stored: it is corrected alone."""
 
 
 @dataclass(frozen=True)
 class Optics:
-    """Of a stored beam at the BPMs; or its derivatives, with an axis of hypotheses before.
+    """Optics of a stored beam at the BPMs; or derivatives, with a leading axis of hypotheses.
 
     Attributes:
         orbit, beta, dispersion: m, [BPM, plane].
@@ -106,7 +106,7 @@ class StoredOptics:
         self.model, self.step = model, step
 
     def moved(self, ring: Ring, frequency: float) -> "StoredOptics":
-        """Of a ring with other elements, at an RF frequency that differs by so much, relative."""
+        """Return those of a ring with other elements, at a relative change of the RF frequency."""
         model = self.model.changed_to(ring)
         if frequency:
             model = model.at_frequency(model.frequency + frequency)
@@ -118,7 +118,7 @@ class StoredOptics:
         return 1 / float(self.model.rf_start[5])
 
     def by_frequency(self) -> Optics:
-        """Change per relative change of the RF frequency, with an axis of one hypothesis."""
+        """Return the change per relative RF frequency, with an axis of one hypothesis."""
         up, down = (
             StoredOptics(
                 self.model.at_frequency(self.model.frequency + side * self.step), self.step
@@ -132,14 +132,14 @@ class StoredOptics:
         return Optics(**{name: value[None] / self.step for name, value in change.items()})
 
     def derivatives(self, hypotheses: Sequence[Hypothesis]) -> Optics:
-        """Change per unit of effects on the ring, [hypothesis, ...]."""
+        """Return the change per unit of effects on the ring, [hypothesis, ...]."""
         return _means(
             [_shown(beam.moved(hypotheses), beam.shown, slope=True) for beam in self._beams]
         )
 
 
 def _shown(moved: Moved, about: Moved, slope: bool = False) -> dict[str, np.ndarray]:
-    """Orbit, tunes, beta, phase and coupling of modes; of their change, about modes."""
+    """Orbit, tunes, beta, phase and coupling of modes; or their change, linearised at `about`."""
     own = about.modes[:, [0, 1], [0, 1]]  # [BPM, mode]
     other = about.modes[:, [1, 0], [0, 1]]
     found = {"orbit": moved.orbit, "tunes": moved.tunes}
@@ -175,7 +175,7 @@ def _means(sides: Sequence[dict[str, np.ndarray]], value: bool = False) -> Optic
 
 
 class Weighted:
-    """Targets that count, each in units of its tolerance.
+    """Wanted targets, each in units of its tolerance.
 
     Attributes:
         names: of the targets, in the order of `TARGETS`.
@@ -188,7 +188,7 @@ class Weighted:
     s: Array
 
     def rows(self, parts: Mapping[str, Array]) -> Array:
-        """Errors or changes of the targets that count, in units of their tolerances, so that the
+        """Return errors or changes of the wanted targets in units of their tolerances, so that the
         square of all rows is the sum of mean squares, [..., row]."""
         own = []
         for name in self.names:
@@ -198,21 +198,21 @@ class Weighted:
 
 
 class Targets(Weighted):
-    """Errors of the optics from a goal, those that count in units of their tolerances.
+    """Errors of the optics from a goal, the wanted ones in units of their tolerances.
 
     Args:
-        goal: the ring whose optics are wanted.
-        wanted: names of `TARGETS`, with another tolerance where a mapping gives one.
+        goal: the ring with the wanted optics.
+        wanted: names of `TARGETS`, optionally with another tolerance.
 
     Attributes:
-        names: of the targets that count, in the order of `TARGETS`.
+        names: of the wanted targets, in the order of `TARGETS`.
         tolerance: of these, in their units.
         step: relative change of the RF frequency that changes the goal's energy by `ENERGY`.
         goal: its optics.
         s: of the BPMs, m.
 
     Raises:
-        TmlatticeError: threading beside other targets.
+        TmlatticeError: threading together with other targets.
         ChoiceError: no such target.
         UnstableRingError: the goal stores no beam.
     """
@@ -238,16 +238,16 @@ class Targets(Weighted):
         }
 
     def begin(self, ring: Ring, energy: float) -> StoredOptics:
-        """Optics of a ring whose beam has this energy beside the ring's, relative.
+        """Return the optics of a ring with this relative energy of the beam.
 
         Raises:
-            UnstableRingError: it stores no beam.
+            UnstableRingError: no stored beam.
         """
         model = ResponseModel(ring)
         return StoredOptics(model.at_energy(energy) if energy else model, self.step)
 
     def errors(self, optics: Optics) -> dict[str, Array]:
-        """Errors of all targets of a stored beam, [reading, plane] each, in their units."""
+        """Return errors of all targets of a stored beam, [reading, plane] each, in their units."""
         goal = self.goal
         change = Optics(*(getattr(optics, f.name) - getattr(goal, f.name) for f in fields(goal)))
         found = self._parts(change)
@@ -257,7 +257,7 @@ class Targets(Weighted):
         return found
 
     def changes(self, derivatives: Optics) -> dict[str, Array]:
-        """The derivatives of `errors`, [hypothesis, reading, plane] each."""
+        """Return the derivatives of `errors`, [hypothesis, reading, plane] each."""
         return self._parts(derivatives)
 
     def _parts(self, change: Optics) -> dict[str, Array]:
@@ -276,8 +276,8 @@ class Targets(Weighted):
 
 
 def rms_of(parts: Mapping[str, Array]) -> dict[str, Array]:
-    """Root mean square of each target's errors, [..., plane], in its unit; of the coupling the rms
-    of the complex amplitude."""
+    """Return the rms of each target's errors, [..., plane], in its unit; of the coupling that of
+    the complex amplitude."""
     parted = {"coupling": 2.0}
     return {
         name: np.sqrt(parted.get(name, 1.0) * np.mean(part**2, axis=-2))

@@ -33,7 +33,7 @@ from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.measurement.documents import read_document
 
-FORMAT = "tmlattice-diagnosis"
+FORMAT, VERSION = "tmlattice-diagnosis", 2
 DOCUMENT, LATTICE = "diagnosis.json", "diagnosis.lattice.json"
 """Of a folder of `save`: the result, and the lattice that it is about."""
 
@@ -66,7 +66,7 @@ def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diag
     """
     place = Path(path)
     file = place / DOCUMENT if place.is_dir() else place
-    document = read_document(file, "diagnosis", FORMAT)
+    document = read_document(file, "diagnosis", FORMAT, VERSION)
     ring = _ring(file, document) if ring is None else ring
     places = {name for e in ring.elements for name in (e.name, e.family)}
     for row in document["errors"]:
@@ -93,7 +93,8 @@ def _ring(file: Path, document: Mapping[str, Any]) -> Ring:
 
 
 def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
-    noise, gap = d["readings_noise"], d["gap"]
+    gap = d["gap"]
+    noise = gap["readings_noise"]
     causes = tuple(Cause(row["effect"], row["element"], row["amount"]) for row in d["errors"])
     made: Diagnosis = cls(
         verdict=d["verdict"],

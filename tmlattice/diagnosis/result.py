@@ -481,6 +481,11 @@ class Diagnosis(ShownDiagnosis):
         interval = None if gap is None or gap.interval is None else list(gap.interval)
         return {
             "noise": float(np.sqrt(np.mean(np.square(self.noise)))),
+            "readings_noise": {
+                "x": self.noise[0],
+                "y": self.noise[1],
+                "estimated": self.noise_estimated,
+            },
             "fit": both(self.fit_before, self.fit_after),
             "heldout": heldout,
             "explained": None
@@ -504,11 +509,6 @@ class Diagnosis(ShownDiagnosis):
             "findings": [finding.as_json() for finding in self.findings],
             "steps": [step.as_json() for step in self.steps],
             "rejected_steps": [step.as_json() for step in self.rejected_steps],
-            "readings_noise": {
-                "x": self.noise[0],
-                "y": self.noise[1],
-                "estimated": self.noise_estimated,
-            },
             "bad_monitors": list(self.bad_monitors),
             "rejected_channels": [
                 {"element": name, "plane": plane} for name, plane in self.rejected_channels

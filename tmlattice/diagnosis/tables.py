@@ -113,7 +113,7 @@ def _errors(diagnosis: Diagnosis) -> Any:
 def _of_kind(diagnosis: Diagnosis, which: str) -> Any:
     """All elements of a kind with what was fitted to them."""
     own = [e for e in diagnosis.ring.elements if e.kind in _KINDS[which]]
-    rejected = {name: plane or "xy" for name, plane in diagnosis.rejected}
+    rejected = {name: plane or "xy" for name, plane in diagnosis.rejected_channels}
     rejected |= dict.fromkeys(diagnosis.bad_monitors, "xy")
     rows = {
         e.name: {"element": e.name, "device": diagnosis.devices.get(e.name), "s": e.s,

@@ -22,7 +22,7 @@ from tmlattice.speaks import Speaks
 
 
 class Regularization(StrEnum):
-    """What is added to the loss, times its rate."""
+    """Term that is added to the loss, times its rate."""
 
     SYMPLECTIC = "symplectic"
     NONE = "none"
@@ -32,7 +32,7 @@ class Regularization(StrEnum):
 
 @dataclass(frozen=True, repr=False)
 class FitResult(Speaks):
-    """A fine-tuned network and how it came about.
+    """A fine-tuned network and the history of its fit.
 
     Attributes:
         network: with the weights of the epoch of least loss.
@@ -40,15 +40,15 @@ class FitResult(Speaks):
             shots; without the regularization.
         penalty: of every epoch, the regularization's value before its rate; zeros for "none".
         best_epoch: the epoch whose weights the network has.
-        stopped_early: True where the patience ran out before the epochs did.
+        stopped_early: whether the patience ran out before the epochs.
         seconds: of wall clock.
-        options: everything that the fit was asked for.
-        tunes: fractional tunes (x, y) that the method itself predicts, [2], or None.
-        tune_sigma: their standard error, [2]; None where the method states none (Adam).
+        options: all options of the fit.
+        tunes: fractional tunes (x, y) by the method itself, [2], or None.
+        tune_sigma: their standard error, [2]; None if the method has none (Adam).
         changes: relative changes of strengths, by magnet, with their standard errors: the causes
-            that `sparse` found, or all that `map` moved.
-        launches: as fitted with them, [shot, n]; None where they were taken as exact.
-        chi2: mean square of what is left of a reading over its noise; None if no noise is stated.
+            that `sparse` selected, or all that `map` changed.
+        launches: as fitted, [shot, n]; None if they were taken as exact.
+        chi2: mean square of the residual over the noise; None if no noise is stated.
     """
 
     network: TaylorNetwork | SymplecticNetwork
@@ -101,38 +101,37 @@ def fit_adam(
 
     - "symplectic": the squares of the coefficients of J^T S J - S (`symplectic_penalty`);
     - "l1", "l2": sum of |w - w_design| or (w - w_design)^2 over all weights (of the departure from
-      the design: pulled towards zero, a layer would lose the magnet that it stands for);
+      the design: pulled to zero, a layer would lose its magnet);
     - "none".
 
-    W0 stays as it is unless it is named in `free`: a magnet that has no field on the axis keeps
-    none, and free constant kicks, being the cheapest way to move an orbit, would take up all of a
-    gradient error and leave the tunes where they were.
+    W0 is fixed unless it is named in `free`: a magnet without field on the axis has none, and free
+    constant kicks, the cheapest way to move an orbit, would absorb all of a gradient error and not
+    change the tunes.
 
-    The given network is left as it is. The same input gives the same result: nothing is drawn.
+    The given network is not changed. The same input gives the same result: nothing is random.
 
     Args:
         network: the design, or any start.
-        measurement: at least one reading of the first turn; NaN are left out.
+        measurement: at least one reading of the first turn; NaN are ignored.
         epochs: gradient steps at most.
-        learning_rate: Adam's. A weight moves by at most about this much a step, whatever its
-            unit.
+        learning_rate: Adam's. A weight moves by at most about this per step, whatever its unit.
         regularization: see above.
         regularization_rate: lambda. The paper's 1e-10 does nothing in metres.
         relative_to_design: the symplectic penalty counts departures from the design's own defect.
-        free: names of the weights that move: some of W0, W1, W2, or of W0, generator for a
-            symplectic network, whose penalty is zero whatever they are. None: all but W0.
+        free: names of the free weights: some of W0, W1, W2, or of W0, generator for a symplectic
+            network, whose penalty is always zero. None: all but W0.
         clip: largest norm of the gradient, before Adam.
         patience: stop after this many epochs without a loss lower by 0.1 %; None: never.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
             exact; inf: unknown; None: the measurement's own. Launches that are not exact follow
-            the weights: after every epoch each goes half the way to where the design's slopes
-            have it.
-        progress: show a bar where there is a terminal.
+            the weights: after every epoch each moves half the way to its best value by the
+            design's slopes.
+        progress: show a bar on a terminal.
 
     Raises:
         MeasurementError: no reading of the first turn, or a launch off the nominal energy for a
             network of four coordinates.
-        UnknownNameError: a monitor that the network does not have.
+        UnknownNameError: a monitor that is not in the network.
         BeamLostError: the fit diverged (the learning rate is too high), or the launch is lost.
         ChoiceError: an unknown regularization; it is a ValueError too.
         ValueError: an unknown weight.
@@ -163,7 +162,7 @@ def fit_adam(
     milestone, milestone_epoch = np.inf, 0
     stopped = False
     begun = time.perf_counter()
-    # disable=None: tqdm is silent where there is no terminal
+    # disable=None: tqdm is silent without a terminal
     bar = tqdm(range(epochs), "fine-tuning", unit="epoch", disable=None if progress else True)
     try:
         for epoch in bar:
@@ -217,7 +216,7 @@ def fit_adam(
 
 @dataclass(frozen=True)
 class _Beam:
-    """The launches of a fit: where they begin, and how they follow the weights if they do."""
+    """Launches of a fit: their start, and how they follow the weights."""
 
     launches: NDArray[np.float64]
     free: FreeLaunches | None = None
@@ -248,7 +247,7 @@ def _beam(
     ordered = measurement.in_order_of(network.monitors)
     if ordered.noise is None and np.isfinite(sigma[sigma > 0]).any():
         raise MeasurementError(
-            "the launches have an error and the readings state none; give the measurement's noise"
+            "the launches have an error but the readings have none; give the measurement's noise"
         )
     noise = np.full((len(network.monitors), 2), 1.0) if ordered.noise is None else ordered.noise
     free = FreeLaunches(launches, sigma, ordered.readings[:, 0], noise)
@@ -272,7 +271,7 @@ def _target(measurement: Measurement, monitors: Sequence[str]) -> tuple[Tensor, 
 def _freed(
     network: TaylorNetwork | SymplecticNetwork, free: Sequence[str] | None
 ) -> tuple[TaylorNetwork | SymplecticNetwork, Sequence[str]]:
-    """A copy in which these weights move, and their names."""
+    """A copy in which these weights are free, and their names."""
     model = network.copy()
     if free is None:
         free = ("generator",) if isinstance(network, SymplecticNetwork) else ("W1", "W2")
@@ -288,7 +287,7 @@ def _freed(
 def _readings(
     model: TaylorNetwork | SymplecticNetwork, launch: Tensor, epoch: int, rate: float
 ) -> Tensor:
-    """Of an epoch; a beam that is lost later than in the first one was lost by the fit."""
+    """Readings in an epoch; a beam that is lost after the first epoch was lost by the fit."""
     try:
         readings: Tensor = model(launch)
         return readings
@@ -301,7 +300,7 @@ def _readings(
 
 
 def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
-    """One step of Adam with torch's defaults: its class would import torch's compiler, seconds."""
+    """One step of Adam with torch's defaults: its class imports torch's compiler, seconds."""
     from torch.optim.adam import adam
 
     mean, square = ([torch.zeros_like(p) for p in moving] for _ in range(2))
@@ -331,7 +330,7 @@ def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
 
 
 def _defect(network: TaylorNetwork | SymplecticNetwork) -> Any:
-    """How far the design is from symplectic, coefficient by coefficient; None where it is."""
+    """Symplectic defect of the design by coefficient; None if there is none."""
     if not isinstance(network, TaylorNetwork):
         return None
     return symplectic_coefficients(network.W1, network.W2)

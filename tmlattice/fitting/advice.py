@@ -1,4 +1,4 @@
-"""Which of the methods of `tune_fit` to trust, and why: sentences for a person."""
+"""Recommendation of one method of `tune_fit`, in sentences."""
 
 from collections.abc import Sequence
 
@@ -12,15 +12,15 @@ ALIKE = 3.0
 
 
 def advice(methods: Sequence[MethodFit]) -> str:
-    """A few sentences: what to trust, how the others stand to it, why the recipe cannot do it."""
+    """Return a few sentences: the recommended method, and why the others differ."""
     best = trusted(methods)
-    told = [_recommended(methods, best)]
+    sentences = [_recommended(methods, best)]
     for method in methods:
         if method.method != "adam" and method is not best and best is not None:
-            told.append(_compared(method, best))
+            sentences.append(_compared(method, best))
         elif method.method == "adam":
-            told.append(_recipe(method))
-    return " ".join(sentence for sentence in told if sentence)
+            sentences.append(_recipe(method))
+    return " ".join(one for one in sentences if one)
 
 
 def _recommended(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
@@ -31,18 +31,18 @@ def _recommended(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
         if not best.named:
             return (
                 f"Trust {best.method}: {why} without any changed magnet, so that no fault is seen; "
-                "what one too small to be seen would do to the tunes is not known."
+                "the effect of a smaller fault on the tunes is unknown."
             )
         who = f"Trust {best.method}: {why} with {changes(best)} alone"
         return f"{who}, and states the error of its tunes."
     others = [m for m in methods if m.method != "adam" and m.fit is not None]
     if not others:
-        return "Nothing here is to be trusted: add --method sparse, which names magnets."
+        return "No method here is reliable: add --method sparse, which identifies magnets."
     least = min(others, key=lambda m: m.rms)
     return (
-        f"Trust none: {least.method} leaves least, and it {_residual(least)}, so something is "
-        "there other than strengths of quadrupoles and sextupoles, or launches and noise are not "
-        "as stated; `tmlattice diagnose` looks for every effect, launches free."
+        f"Trust none: {least.method} has the smallest residual, and it {_residual(least)}, so "
+        "other errors than strengths of quadrupoles and sextupoles are present, or launches and "
+        "noise are misstated; `tmlattice diagnose` tests every effect with free launches."
     )
 
 
@@ -58,14 +58,14 @@ def _compared(method: MethodFit, best: MethodFit) -> str:
     name = method.method.capitalize()
     if same:
         return f"{name} agrees within the errors."
-    return f"{name} says otherwise by {away.max():.2g}, more than its error."
+    return f"{name} differs by {away.max():.2g}, more than its error."
 
 
 def _recipe(method: MethodFit) -> str:
     weights = free_weights(method)
     why = (
-        f"The recipe (adam) cannot do it: {method.readings} readings do not tell {weights:,} "
-        "weights, each of them free, which change is the ring's, and they state no error"
+        f"The recipe (adam) cannot do it: {method.readings} readings do not determine {weights:,} "
+        "free weights, nor which change is the ring's, and they have no error"
     )
     if method.chi2 is None or method.explains:
         return f"{why}."
@@ -73,14 +73,14 @@ def _recipe(method: MethodFit) -> str:
 
 
 def _residual(method: MethodFit) -> str:
-    """What a method leaves of the readings, against their noise."""
+    """Residual of a method compared with the noise of the readings."""
     if method.explains:
         return f"leaves the readings' noise ({1e6 * method.rms:.3g} of {1e6 * method.noise:.3g} µm)"
     return f"leaves {1e6 * method.rms:.3g} µm, more than the noise of {1e6 * method.noise:.3g} µm"
 
 
 def changes(method: MethodFit) -> str:
-    """The magnets that a method names, each with its change and its error."""
+    """Return the magnets that a method identifies, each with its change and its error."""
     return ", ".join(
         f"{name} by {100 * amount:+.2f} ± {100 * error:.2f} %"
         for name, (amount, error) in method.named.items()
@@ -88,7 +88,7 @@ def changes(method: MethodFit) -> str:
 
 
 def free_weights(method: MethodFit) -> int:
-    """Weights that the recipe moved."""
+    """Return the number of weights that the recipe changed."""
     assert method.fit is not None
     network, free = method.fit.network, set(method.fit.options["free"])
     assert isinstance(network, TaylorNetwork)

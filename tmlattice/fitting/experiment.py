@@ -1,7 +1,7 @@
 """The main experiment: one magnet is weakened, one orbit is measured, the tunes are predicted.
 
-The network knows the design ring and one noisy first-turn orbit of the perturbed one; the tunes
-that it then predicts are held against OCELOT's one-turn matrix of the perturbed ring.
+The network has the design ring and one noisy first-turn orbit of the perturbed one. The tunes that
+it predicts are compared with OCELOT's one-turn matrix of the perturbed ring.
 """
 
 import time
@@ -40,14 +40,14 @@ DEFAULT_LAUNCH = (1e-3, 0.0, 1e-3, 0.0)
 """x, px, y, py: off axis by 1 mm in both planes."""
 
 TUNE_AMPLITUDE = 1e-9
-"""Part of the launch at which the tunes are taken: tunes shift with the square of the amplitude
-(1e-4 at 1 mm), and the truth is the one-turn matrix's, at zero amplitude."""
+"""Scale of the launch for the tunes: tunes shift with the square of the amplitude (1e-4 at 1 mm),
+and the true ones are those of the one-turn matrix, at zero amplitude."""
 
 CHANGES = (-0.2, -0.1, -0.05, -0.02, -0.01, -0.005, -0.002)
-"""Relative changes that are tried where none is given: the first that leaves the ring stable."""
+"""Relative changes that are tried by default: the first one with a stable ring is used."""
 
 GROWTH_ALLOWED = 1e3
-"""How much a trajectory may grow while its tunes are taken. A network with free weights is not
+"""Largest growth of a trajectory in the turns of its tunes. A network with free weights is not
 symplectic: one plane may grow by 10 % a turn and swamp the other through the second order."""
 
 
@@ -60,7 +60,7 @@ class _Stopwatch(dict[str, float]):
 
 
 def perturbed_ring(ring: Ring, magnet: str, change: float) -> Ring:
-    """The ring with the strength of one quadrupole or sextupole changed by a relative amount.
+    """Return the ring with a relative change of one quadrupole's or sextupole's strength.
 
     Raises:
         TmlatticeError: a magnet of another kind, or one whose strength is zero.
@@ -76,14 +76,14 @@ def perturbed_ring(ring: Ring, magnet: str, change: float) -> Ring:
     strength = getattr(element, attribute)
     if strength == 0:
         raise TmlatticeError(
-            f"{element.kind} '{element.name}' has zero strength, which no relative change "
-            "changes; name a powered one"
+            f"{element.kind} '{element.name}' has zero strength, which a relative change leaves at "
+            "zero; name a powered one"
         )
     return ring.with_changed(element.name, **{attribute: strength * (1 + change)})
 
 
 def changed_ring(ring: Ring, magnet: str, change: float | None) -> tuple[Ring, Array, float]:
-    """The perturbed ring, its tunes [2] and the change: the largest usual one where none is given.
+    """Return the perturbed ring, its tunes [2] and the change: by default the largest usual one.
 
     Raises:
         UnstableRingError: the ring has no tunes with this change, or with any.
@@ -95,7 +95,7 @@ def changed_ring(ring: Ring, magnet: str, change: float | None) -> tuple[Ring, A
             return machine, matrix_tunes(ring_matrix(machine)), amount
         except UnstableRingError:
             continue
-    matrix_tunes(ring_matrix(ring))  # the design's own error, where it has no tunes either
+    matrix_tunes(ring_matrix(ring))  # raises if the design has no tunes either
     raise UnstableRingError(
         f"with '{magnet}' changed by {100 * tried[-1]:+g} % '{ring.name}' is unstable and has no "
         "tunes: give a smaller --change or another --magnet (in Python: change=, magnet=)"
@@ -198,13 +198,13 @@ def tune_fit_measurement(
 ) -> TuneFit:
     """Fine-tune the design's network on the first turns of a measurement, predict the tunes.
 
-    All shots are fitted together. Launches are fitted beside, within what the measurement says of
-    their errors (nothing said: they are not known). A launch off the nominal energy takes a
-    network of six coordinates; the tunes are those at the nominal energy.
+    All shots are fitted together. Launches are fitted too, within their stated errors (none stated:
+    unknown). A launch off the nominal energy needs a network of six coordinates; the tunes are
+    those at the nominal energy.
 
     Args:
         ring: the design.
-        measurement: of one shot or more; a noise that it does not state is estimated.
+        measurement: of one shot or more; an unstated noise is estimated.
         turns: tracked for the tunes, at a vanishing amplitude.
         methods: some of `METHODS`.
         source: where the data are from, for the report.
@@ -212,9 +212,9 @@ def tune_fit_measurement(
         recipe: options of `fitting.adam.fit_adam`.
 
     Raises:
-        MeasurementError: nothing of the first turn was read, every launch is on the axis exactly,
-            or a shot's settings are not the design's.
-        UnknownNameError: a monitor that the ring does not have.
+        MeasurementError: no reading of the first turn, every launch on the axis exactly, or shots
+            with settings other than the design's.
+        UnknownNameError: a monitor that is not in the ring.
         UnstableRingError: the design has no tune.
         BeamLostError: a launch is lost on the first turn, or the fit diverged.
     """
@@ -223,7 +223,7 @@ def tune_fit_measurement(
     sigma = launch_errors(measurement, dimension)
     if not (measurement.launches.any() or sigma.any()):
         raise MeasurementError(
-            "every launch is on the axis at the nominal energy, from where no weight is learnt; "
+            "every launch is on the axis at the nominal energy, where no weight is determined; "
             "state the launches of the shots"
         )
     changed = [s for s, set_ in zip(measurement.shots, measurement.settings, strict=False) if set_]
@@ -285,14 +285,14 @@ def _ordered(methods: Sequence[str]) -> tuple[str, ...]:
 
 def _enough(turns: int) -> int:
     if turns < MIN_TURNS:
-        raise TooFewTurnsError(f"{turns} turns are too few for a tune; {MIN_TURNS} at least do")
+        raise TooFewTurnsError(f"{turns} turns are too few for a tune; give at least {MIN_TURNS}")
     return turns
 
 
 def _fit_and_track(
     network: TaylorNetwork, measurement: Measurement, sigma: Array, work: _Work
 ) -> dict[str, Any]:
-    """The fits, and the tunes of what they made: the attributes of TuneFit that come from there."""
+    """Return the fits with their tunes: attributes of TuneFit."""
     assert measurement.noise is not None
     nominal = measurement.states(network.dimension)
     read = measurement.readings[:, 0]
@@ -329,7 +329,7 @@ def _column(
     shown: int,
     work: _Work,
 ) -> MethodFit:
-    """One method's fit, its tunes, and what it leaves."""
+    """Return one method's fit, its tunes, and its residual."""
     read, noise = measurement.readings[:, 0], measurement.noise
     assert noise is not None
     begun = time.perf_counter()
@@ -344,7 +344,7 @@ def _column(
     except (UnstableRingError, TooFewTurnsError) as error:
         problem = f"the fine-tuned network has no tune: {error}"
     if fit is not None and fit.tunes is not None:
-        tune = fit.tunes  # of its matrix: no turn was needed
+        tune = fit.tunes  # of its matrix, without turns
     readings = np.full_like(read, np.nan)
     if fit is not None:
         nominal = measurement.states(network.dimension)
@@ -370,7 +370,7 @@ def _column(
 
 
 def network_tunes(network: NetworkChain, launch: Array, turns: int) -> tuple[Array, Array, float]:
-    """Tunes of a network by tracking it, at a vanishing part of the launch [n].
+    """Return tunes of a network by tracking it, at a small share of the launch [n].
 
     Returns:
         Fractions (x, y) [2]; the states they come from, [1, turns + 1, n], fewer where the motion
@@ -383,7 +383,7 @@ def network_tunes(network: NetworkChain, launch: Array, turns: int) -> tuple[Arr
     optics = one_turn_optics(network)
     first = (optics.closed_orbit + TUNE_AMPLITUDE * launch)[None]
     states = network.track(first, turns, keep_lost=True)
-    # the transverse plane: off the nominal energy, tau drifts without end
+    # transverse coordinates: off the nominal energy tau drifts
     size = np.abs(states[0] - optics.closed_orbit)[:, :4].max(axis=1)
     grown = ~(size < GROWTH_ALLOWED * np.abs(launch).max() * TUNE_AMPLITUDE)
     signal = states[:, : int(grown.argmax()) if grown.any() else None]

@@ -1,10 +1,10 @@
-"""Launches that are known only so well: fitted beside whatever else is.
+"""Launches of limited accuracy, fitted together with other parameters.
 
 >>> free = FreeLaunches(nominal, sigma, readings, noise)
 >>> launches = free.fitted(network)                    # [shot, n]
 
-A shot's launch is linear in its readings to a few per cent, so a step or two of Gauss and Newton
-reaches its best value for any weights.
+A shot's launch is linear in its readings to a few per cent, so one or two Gauss-Newton steps reach
+its best value for any weights.
 """
 
 from collections.abc import Callable
@@ -27,17 +27,17 @@ from tmlattice.observe.noise import estimate
 Array = NDArray[np.float64]
 
 STEP = 1e-6
-"""m, rad or relative: half the way between the two launches of a slope."""
+"""m, rad or relative: half the distance of the two launches of a slope."""
 
 
 GUESSED_NOISE = 1e-4
-"""m; stands for the noise while the launches are fitted for its estimate."""
+"""m; noise of a fit of launches whose residual gives the noise."""
 
 
 def with_noise(
     ring: Ring, measurement: Measurement, dimension: int = 4
 ) -> tuple[Measurement, bool]:
-    """The first turn with a noise for every reading, and whether some of it is estimated.
+    """Return the first turn with noise for every reading, and whether some of it is estimated.
 
     Args:
         ring: the design.
@@ -60,7 +60,7 @@ def with_noise(
     found = estimate(data, start.point.view)
     if not np.isfinite(found).any():
         raise MeasurementError(
-            "the noise is not given and the readings are too few to estimate it; state the noise "
+            "the noise is not stated and the readings are too few to estimate it; state the noise "
             "of a reading in the measurement"
         )
     found = np.maximum(np.where(np.isfinite(found), found, np.nanmean(found)), NOISE_FLOOR)
@@ -70,7 +70,7 @@ def with_noise(
 
 @dataclass(frozen=True)
 class FreeLaunches:
-    """What readings and their nominal values say of launches.
+    """Readings and nominal values of launches, and their errors.
 
     Attributes:
         nominal: [shot, n].
@@ -86,13 +86,13 @@ class FreeLaunches:
 
     @cached_property
     def weight(self) -> Array:
-        """1 / noise, 0 where nothing was read, [shot, monitor, 2]."""
+        """1 / noise, 0 where missing, [shot, monitor, 2]."""
         inverse = 1 / np.where(self.noise > 0, self.noise, 1.0)
         return np.where(np.isfinite(self.readings), inverse, 0.0)
 
     def gains(self, network: NetworkChain, launches: Array) -> Callable[[Array, Array], Array]:
-        """The step that readings [shot, monitor, 2] of launches [shot, n] ask for, [shot, n], by
-        the slopes that this network has there."""
+        """Return the step from readings [shot, monitor, 2] at launches [shot, n], [shot,
+        n], by this network's slopes there."""
         shots, n = launches.shape
         slopes = launch_slopes(network, launches).reshape(shots, -1, n)
         weight = self.weight.reshape(shots, -1)
@@ -113,10 +113,10 @@ class FreeLaunches:
         return step
 
     def fitted(self, network: NetworkChain, start: Array | None = None, steps: int = 4) -> Array:
-        """The best launches for a network, [shot, n].
+        """Return the best launches for a network, [shot, n].
 
         Raises:
-            BeamLostError: they are lost in it.
+            BeamLostError: the beam is lost in it.
         """
         launches = self.nominal if start is None else start
         if not self.sigma.any():
@@ -128,7 +128,7 @@ class FreeLaunches:
 
 
 def launch_slopes(network: NetworkChain, launches: Array) -> Array:
-    """d readings / d launch, [shot, monitor, 2, n], by central differences."""
+    """Return d readings / d launch, [shot, monitor, 2, n], by central differences."""
     shots, n = launches.shape
     moved = launches[:, None, None] + STEP * np.stack([np.eye(n), -np.eye(n)])[None]
     ends = network.readings(moved.reshape(-1, n)).reshape(shots, 2, n, -1, 2)

@@ -1,8 +1,8 @@
-"""Fine-tuning by the most probable small changes: many amounts under a prior.
+"""Fine-tuning by the most probable changes: many amounts under a prior.
 
 A Gaussian prior spreads one large fault over all magnets that could share it. `Prior.FAULTS` has
-the tails of Student's t with one degree of freedom: most strengths are nearly right, a few are far
-off.
+the tails of Student's t with one degree of freedom: most strengths are nearly right, a few have
+large errors.
 """
 
 import time
@@ -33,34 +33,34 @@ Array = NDArray[np.float64]
 
 
 class Prior(StrEnum):
-    """What may change, with which rms before the scale."""
+    """Free amounts, and their rms before scaling."""
 
     FAULTS = "faults"
     """Relative changes of the powered quadrupoles and sextupoles: 1 % is the half width of a
-    distribution with long tails, scaled to 0.01 % unless told otherwise."""
+    distribution with long tails, scaled to 0.01 % by default."""
     STRENGTHS = "strengths"
-    """The same, Gaussian: 1 % rms, scaled by the evidence unless told otherwise."""
+    """The same, Gaussian: 1 % rms, scaled by the evidence by default."""
     GENERATORS = "generators"
-    """Every coefficient of every layer's generator, Gaussian, as errors of each degree act on 1 mm
+    """Every coefficient of every layer's generator, Gaussian, by the effect of each degree at 1 mm
     and 0.1 mrad; scaled by the evidence."""
 
 
 FAULT_SCALE = 0.01
 
 MAX_LAUNCH = 0.01
-"""m and rad: what is said of a launch of which nothing is said; beam pipes are no wider."""
+"""m and rad: prior rms of an unknown launch; beam pipes are no wider."""
 
 
 @dataclass(frozen=True)
 class TurnReadings:
-    """A measured first turn as a function of a space's amounts: see `inference.dual.Many`.
+    """A measured first turn as a function of a space's amounts: `inference.dual.AmountProblem`.
 
     Attributes:
-        space: moved by every question.
+        space: of the amounts; changed by every call.
         data: one turn.
-        launches: of the shots, in the network's coordinates, [shot, n]; where they are not known,
-            about which.
-        off: how far they are from the nominal ones where those have an error, [shot, n], or None.
+        launches: of the shots, in the network's coordinates, [shot, n]; of unknown ones the point
+            of linearisation.
+        offset: their difference from nominal ones with an error, [shot, n], or None.
     """
 
     space: Space
@@ -75,26 +75,26 @@ class TurnReadings:
 
     @property
     def sigma(self) -> Array:
-        """Of the readings that there are, m, [row]."""
+        """Noise of the readings, m, [row]."""
         return np.asarray(self.data.sigma[self.data.valid])
 
     @property
     def largest(self) -> float:
-        """The space's."""
+        """Largest amount of the space."""
         return self.space.largest
 
     def residual(self, amounts: Array) -> Array:
         """Measured less model, m, [row]."""
         readings = self.space.readings(amounts, self.launches)
         left = self.data.readings - readings
-        if self.offset is not None:  # as if from the nominal ones: those are what has a prior
+        if self.offset is not None:  # relative to the nominal ones, which have the prior
             left = left + np.einsum(
                 "smpi,si->smp", launch_slopes(self.space.network, self.launches), self.offset
             )
         return np.asarray(left[self.data.valid])
 
     def slopes(self, amounts: Array) -> Shifts:
-        """As shifts of the launches."""
+        """Return the slopes as shifts of the launches."""
         maps = self.space.network.maps
         pairs = [self.space.shifts(amounts, x) for x in self.launches]
         return Shifts(
@@ -105,7 +105,7 @@ class TurnReadings:
         )
 
     def nuisances(self, amounts: Array) -> Array:
-        """Errors of the launches."""
+        """Covariance of the readings by errors of the launches, m^2, [row, row]."""
         sigma = np.minimum(self.launch_sigma, MAX_LAUNCH)
         if not sigma.any():
             return np.zeros((len(self.sigma),) * 2)
@@ -130,20 +130,20 @@ def fit_map(
     Args:
         network: the design.
         measurement: at least one shot.
-        ring: that the network was made from; else the network's own `ring`.
-        prior: what may change, see `Prior`.
+        ring: of the network; None: the network's own `ring`.
+        prior: free amounts, see `Prior`.
         kinds: of magnets, for the priors on strengths.
         scale: factor on the prior's rms; None: 0.01 for faults, else that of greatest evidence.
         noise: rms of one reading, m; else the measurement's.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
             exact; inf: unknown; None: the measurement's own.
-        iterations: of Gauss-Newton at most, at each level of noise on the way to the readings' own.
-        progress: there is nothing to show; every method takes it.
+        iterations: of Gauss-Newton at most, at each level of added noise.
+        progress: ignored, as in every method.
 
     Returns:
         The fitted network (symplectic, for the prior on generators), its tunes, and their standard
-        error by the posterior covariance. It holds where the prior is true: under a Gaussian one
-        for many small changes; one magnet that is 20 % off is no draw from it.
+        error by the posterior covariance. It is valid if the prior is: a Gaussian one describes
+        many small changes, not one magnet with an error of 20 %.
 
     Raises:
         MeasurementError: no reading, or no noise stated.
@@ -173,7 +173,7 @@ def fit_map(
     student = Student(1.0 if width is None else width, 1.0 if tails else np.inf)
     start = np.zeros(len(space.layer))
     found = most_probable(problem, student, start, choose=width is None, iterations=iterations)
-    if sparse is not None:  # many maxima: another start is the few magnets that explain most
+    if sparse is not None:  # many maxima: the sparse fit is another start
         amounts = _from_sparse(space, sparse)
         other = most_probable(problem, student, amounts, wide=False, iterations=iterations)
         found = best_of(problem, (found, other)) if amounts.any() else found
@@ -210,7 +210,7 @@ def fit_map(
 
 
 def _readings(space: Space, data: Data, nominal: Array, sparse: Explanation | None) -> TurnReadings:
-    """The problem about the nominal launches, or about those that the few magnets ask for."""
+    """Return the problem at the nominal launches, or at those of the sparse fit."""
     nominal = np.ascontiguousarray(nominal)
     sigma = in_coordinates(data.launch_sigma, nominal.shape[1])
     if sparse is None or not sigma.any():
@@ -228,7 +228,7 @@ def _free(problem: TurnReadings) -> FreeLaunches:
 
 
 def _from_sparse(space: Space, found: Explanation) -> Array:
-    """Amounts of the few magnets that explain most; of the likeliest where none is asked for."""
+    """Amounts of the sparse fit; of the most probable magnet if it is empty."""
     best = found.fit if found.named or not found.beyond else found.beyond[0].fit
     start = np.zeros(len(space.layer))
     for cause in best.causes:
@@ -244,7 +244,7 @@ def _posterior(
     variance, base = 1 / found.prior.precision(found.amounts), posterior_base(problem, found)
     sizes, errors, spread = np.sqrt(variance), np.zeros(0), None
     if space.names:
-        # (1 + A^T A)^-1 by a triangle: prior less data would cancel where the noise is small.
+        # (1 + A^T A)^-1 by a triangle: prior less data would cancel for small noise
         A = solve_triangular(np.linalg.cholesky(base), slopes.matrix * sizes, lower=True)
         triangle = np.linalg.qr(np.concatenate([A, np.eye(len(sizes))]), mode="r")
         spread = sizes[:, None] * solve_triangular(triangle, np.eye(len(sizes)))

@@ -1,4 +1,4 @@
-"""One method's fit of the readings, and when it is to be trusted."""
+"""One method's fit of the readings, and the recommended method."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,28 +14,28 @@ from tmlattice.speaks import Speaks
 Array = NDArray[np.float64]
 
 METHODS = ("adam", "sparse", "map")
-"""The paper's recipe first; of the others the one that names magnets."""
+"""The paper's recipe first; then the sparse fit, which identifies magnets."""
 
 SPARSE_METHODS = ("sparse", "told")
-"""Those that name a few magnets; the second knows which might have changed."""
+"""Methods that identify magnets; the second is given the possible ones."""
 
 
 @dataclass(frozen=True, repr=False)
 class MethodFit(Speaks):
-    """One method's fit of the readings. Tunes are fractions (x, y); None where there is none.
+    """One method's fit of the readings. Tunes are fractions (x, y), or None.
 
     Attributes:
         method: its name.
-        fit: the network and its history; None where there is no fit.
+        fit: the network and its history, or None.
         tunes: of the fitted ring, [2].
-        tune_sigma: their stated standard error, [2]; None where the method states none.
-        signal: states of the tracking that a spectrum is made of, [1, turns + 1, n].
-        growth: of the fitted network's amplitude in a turn, 1 where it is symplectic.
+        tune_sigma: their standard error, [2]; None if the method has none.
+        signal: tracked states of the tunes' spectrum, [1, turns + 1, n].
+        growth: of the fitted network's amplitude per turn, 1 if it is symplectic.
         after: readings of the shot shown by the fitted network, [monitor, 2], m.
-        rms: of what it leaves of all shots' readings, m.
-        readings: that were fitted.
-        noise: their rms, m; 0 where they have none.
-        chi2: of what is left in units of the noise, a reading; None where there is none.
+        rms: of the residual of all shots, m.
+        readings: number of fitted readings.
+        noise: their rms, m; 0 without noise.
+        chi2: residual in units of the noise, per reading, or None.
         seconds: of wall clock.
         problem: why there are no tunes, or None.
     """
@@ -66,18 +66,18 @@ class MethodFit(Speaks):
 
     @property
     def named(self) -> dict[str, tuple[float, float]]:
-        """The magnets that `sparse` names, with their relative change and its error."""
+        """Magnets that `sparse` identifies, with their relative change and its error."""
         return self.fit.changes if self.fit is not None and self.method in SPARSE_METHODS else {}
 
     @property
     def explains(self) -> bool:
-        """Whether the fit leaves no more than the noise of the readings."""
+        """Whether the residual is compatible with the noise of the readings."""
         if self.chi2 is None:
             return False
         return self.chi2 <= 1 + MAX_MISFIT * float(np.sqrt(2 / self.readings))
 
     def as_json(self, true: Array | None) -> dict[str, Any]:
-        """An entry of "methods" in `tmlattice-tune-fit`."""
+        """Return an entry of "methods" in `tmlattice-tune-fit`."""
         absolute, relative = errors(self.tunes, true)
         return {
             "method": self.method,
@@ -97,14 +97,14 @@ class MethodFit(Speaks):
 
 
 def trusted(methods: Sequence[MethodFit]) -> MethodFit | None:
-    """The method whose tunes to take: one that leaves the noise alone and states its error, the
-    one of fewest magnets first; None where none does."""
+    """Return the recommended method: one with a residual of noise alone and stated errors, the one
+    of fewest magnets first; None if there is none."""
     good = [m for m in methods if m.method != "adam" and m.tunes is not None and m.explains]
     return min(good, key=lambda m: m.method not in SPARSE_METHODS, default=None)
 
 
 def errors(tunes: Array | None, true: Array | None) -> tuple[Array | None, Array | None]:
-    """Absolute, the short way round the circle, and relative to the true fraction, [2] each."""
+    """Return errors, absolute (the short way round the circle) and relative, [2] each."""
     if tunes is None or true is None:
         return None, None
     absolute = np.abs((tunes - true + 0.5) % 1.0 - 0.5)
@@ -112,5 +112,5 @@ def errors(tunes: Array | None, true: Array | None) -> tuple[Array | None, Array
 
 
 def pair(value: Array | None) -> list[float] | None:
-    """For JSON."""
+    """Return a list for JSON."""
     return None if value is None else [float(v) for v in value]

@@ -29,7 +29,7 @@ from tmlattice.observe.data import NOISE_FLOOR, first_turn
 
 
 class Method(StrEnum):
-    """How a network is fine-tuned."""
+    """Method of fine-tuning a network."""
 
     ADAM = "adam"
     MAP = "map"
@@ -64,7 +64,7 @@ def fine_tune(
     scale: float | None = None,
     iterations: int = 12,
 ) -> FitResult:
-    """Fit a network to the first turn of a measurement; the given network is left as it is.
+    """Fit a network to the first turn of a measurement; the given network is not changed.
 
     Args:
         network: the design.
@@ -141,7 +141,7 @@ def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: Method) 
 def _check_launches(
     network: TaylorNetwork | SymplecticNetwork, measurement: Measurement, sigma: ArrayLike | None
 ) -> None:
-    """Warn of launches that are not those stated; nothing is said without a ring or a noise."""
+    """Warn of launches that differ from those stated; silent without a ring or a noise."""
     ring, n = network.ring, network.dimension
     if ring is None or measurement.noise is None:
         return
@@ -152,7 +152,7 @@ def _check_launches(
 
 
 def _with_chi2(result: FitResult, measurement: Measurement) -> FitResult:
-    """The result with its chi-square."""
+    """Add chi-square to the result."""
     noise = result.options.get("noise")
     ordered = measurement.in_order_of(result.network.monitors)
     sigma = ordered.noise if noise is None else np.full((len(ordered.monitors), 2), noise)

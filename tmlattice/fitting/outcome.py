@@ -1,4 +1,4 @@
-"""What `tune_fit` found: a column for each method, and which of them to trust."""
+"""The result of `tune_fit`: one column per method, and the recommended method."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,31 +18,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, repr=False)
 class TuneFit(Speaks):
-    """What `tune_fit` found. Tunes are fractions (x, y); None where there is no tune.
+    """The result of `tune_fit`. Tunes are fractions (x, y), or None.
 
     `fit`, `network_tunes`, `tune_signal`, `growth`, `after`, `orbit_rms` and `problem` are those of
-    the first of the methods: the paper's recipe where it was asked for.
+    the first of the methods: the paper's recipe, if it was used.
 
     Attributes:
         ring: the design.
-        magnet: name of the perturbed magnet; None for data from elsewhere.
-        change: relative change of its strength; None for data from elsewhere.
+        magnet: name of the perturbed magnet; None for other data.
+        change: relative change of its strength; None for other data.
         launch: state at the start of the ring, [n], of the shot shown, as stated.
-        noise: rms of a reading, m, over monitors and planes; None where there is none.
-        design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2]; no
-            truth is known of data from elsewhere.
+        noise: rms of a reading, m, over monitors and planes, or None.
+        design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2]; other
+            data have no true tunes.
         s: of the monitors, m, [monitor].
         measured, before: readings of one shot, and the design network's, [monitor, 2], m; NaN where
-            nothing was read.
-        rms_before: of what the design leaves of all shots' first turns, m; launches that are not
-            known are fitted, to the design here, by each method beside its weights there.
-        methods: what each method made of it.
+            missing.
+        rms_before: of the design's residual on all shots' first turns, m; unknown launches are
+            fitted, here to the design, by each method together with its weights.
+        methods: fit of each method.
         seconds: of wall clock, by stage; "fit" and "tunes" are of all methods.
         seed: of the noise.
         turns: tracked for the tunes.
         shots: number of shots fitted together.
-        source: where the data are from; None for the experiment's own.
-        noise_estimated: the readings state no noise; it is theirs, from what neighbours leave.
+        source: origin of the data; None for the experiment's own.
+        noise_estimated: whether the noise is estimated from neighbouring monitors.
     """
 
     ring: Ring
@@ -67,7 +67,7 @@ class TuneFit(Speaks):
     plot = Method(
         "tmlattice.plots.orbit",
         "plot_orbit_fit",
-        "Draw the readings and what each method leaves of them: a matplotlib Figure.",
+        "Draw the readings and each method's residual: a matplotlib Figure.",
     )
 
     def _told(self) -> tuple[str, dict[str, str]]:
@@ -86,23 +86,23 @@ class TuneFit(Speaks):
 
     @property
     def fit(self) -> FitResult:
-        """Of the first method: the network and its history."""
+        """First method's network and its history."""
         assert self._first.fit is not None
         return self._first.fit
 
     @property
     def network_tunes(self) -> Array | None:
-        """Of the first method, [2]."""
+        """First method's tunes, [2]."""
         return self._first.tunes
 
     @property
     def tune_signal(self) -> Array | None:
-        """States of the first method's tracking, [1, turns + 1, n]; fewer where motion grew."""
+        """States of the first method's tracking, [1, turns + 1, n]; fewer if the motion grew."""
         return self._first.signal
 
     @property
     def growth(self) -> float | None:
-        """Of the amplitude in a turn of the first method's network, 1 where it is symplectic."""
+        """Growth per turn of the first method's network, 1 if it is symplectic."""
         return self._first.growth
 
     @property
@@ -112,7 +112,7 @@ class TuneFit(Speaks):
 
     @property
     def orbit_rms(self) -> tuple[float, float]:
-        """Of the first turn's residual, before and after the first method, over all shots, m."""
+        """rms of the first turn's residual, before and after the first method, all shots, m."""
         return self.rms_before, self._first.rms
 
     @property
@@ -122,7 +122,7 @@ class TuneFit(Speaks):
 
     @property
     def turns_alive(self) -> int:
-        """Turns that the tunes come from: fewer than asked for where the motion grew."""
+        """Number of turns of the tunes: fewer than requested if the motion grew."""
         return 0 if self.tune_signal is None else self.tune_signal.shape[1] - 1
 
     @property
@@ -136,32 +136,32 @@ class TuneFit(Speaks):
         return errors(self.network_tunes, self.true_tunes)[1]
 
     def method(self, name: str) -> MethodFit:
-        """What one method made of it.
+        """Return the fit of one method.
 
         Raises:
-            KeyError: it was not asked for.
+            KeyError: the method was not used.
         """
         return {m.method: m for m in self.methods}[name]
 
     @property
     def trusted(self) -> MethodFit | None:
-        """The method whose tunes to take; None where none explains the readings."""
+        """Recommended method; None if none explains the readings."""
         return trusted(self.methods)
 
     @property
     def best(self) -> MethodFit:
-        """The one that is trusted; else of those with tunes the one that leaves least, a method
-        that keeps a ring a ring before one that does not."""
+        """Recommended method; else the one with tunes and the smallest residual, a symplectic
+        method before one that is not."""
         with_tunes = [m for m in self.methods if m.fit is not None]
         return self.trusted or min(with_tunes, key=lambda m: (m.method == "adam", m.rms))
 
     @property
     def advice(self) -> str:
-        """In a few sentences: what to trust, and why."""
+        """Recommendation in a few sentences."""
         return advice(self.methods)
 
     def as_json(self) -> dict[str, Any]:
-        """The result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""
+        """Return the result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""
         from tmlattice import __version__
 
         before, after = self.orbit_rms

@@ -1,8 +1,8 @@
-"""Fine-tuning by few causes: which magnets changed, by how much, and what the tunes then are.
+"""Fine-tuning by a sparse set of causes: changed magnets, their changes, and the tunes.
 
-Every powered quadrupole and sextupole is a candidate. It is the search of the diagnosis, with these
-hypotheses alone and evidence alone to stop it; magnets that explain the readings about as well
-widen the stated error of the tunes.
+Every powered quadrupole and sextupole is a candidate. It is the search of the diagnosis with these
+hypotheses alone and the marginal likelihood alone as criterion. Magnets that explain the readings
+about as well increase the stated error of the tunes.
 """
 
 import time
@@ -35,23 +35,23 @@ Array = NDArray[np.float64]
 EFFECTS = {"quadrupole": "quadrupole_gradient", "sextupole": "sextupole_strength"}
 
 FAULT = 0.3
-"""Prior rms of the relative change of a strength that has changed."""
+"""Prior rms of the relative change of a changed strength."""
 
 LARGEST_NUMBER, REFINED = 5, 12
-"""Of causes, and of candidates that are refined after each scan."""
+"""Number of causes, and of candidates that are refitted after each scan."""
 
 MAX_MISFIT = 5.0
-"""Standard errors by which a misfit may exceed the noise before it is more than noise."""
+"""Standard errors of a misfit above the noise that are still compatible with it."""
 
 FALSE_ALARM_ODDS = 1e6
-"""False alarms of `warn_of_launches` are that rare."""
+"""Odds against a false alarm of `warn_of_launches`."""
 
 RARER = 10.0
-"""Each cause beyond the first is so many times less likely than the one before: faults are rare,
-and with hundreds of candidates a false second one would else come in one case of a hundred."""
+"""Prior odds against each cause beyond the first: faults are rare, and with hundreds of candidates
+a false second one would come in one case of a hundred."""
 
 NEGLIGIBLE = 1e-6
-"""Weight of an explanation, against the best one's, below which it is left out of the spread."""
+"""Weight of an explanation, relative to the best one's, below which it is ignored."""
 
 
 def fit_sparse(
@@ -68,27 +68,27 @@ def fit_sparse(
     candidates: Sequence[str] | None = None,
     progress: bool = True,
 ) -> FitResult:
-    """Fit a measurement's first turn by as few changed magnets as the evidence asks for.
+    """Fit a measurement's first turn by the set of changed magnets with the largest evidence.
 
     Args:
         network: the design.
         measurement: at least one shot.
-        ring: that the network was made from; else the network's own `ring`.
-        kinds: of magnets whose strength may have changed.
+        ring: of the network; None: the network's own `ring`.
+        kinds: of magnets that may have changed.
         noise: rms of one reading, m; else the measurement's.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
             exact; inf: unknown; None: the measurement's own.
         fault: prior rms of a relative change.
         largest_number: of causes.
-        refined: candidates that are refined after each scan.
+        refined: candidates that are refitted after each scan.
         candidates: names of the only magnets that may have changed; None: all of the kinds.
-        progress: there is nothing to show; every method takes it.
+        progress: ignored, as in every method.
 
     Returns:
-        The network of the refined ring, its tunes from its own matrix, and their standard error:
+        The network of the refitted ring, its tunes from its own matrix, and their standard error:
         that of the changes, and the spread over other magnets that explain the readings nearly as
-        well, weighted by their evidence. No error is stated where no cause was found: what a
-        fault too small to be seen does to the tunes is not known from these readings.
+        well, weighted by their evidence. Without a cause there is no error: the effect of a
+        smaller fault on the tunes is unknown.
 
     Raises:
         MeasurementError: no reading, or no noise stated.
@@ -144,13 +144,13 @@ def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation)
     """Warn if the readings contradict the stated launches.
 
     The same search with free launches must explain the readings, and lower chi-square by more than
-    four free numbers a shot do by chance, once in `ONCE_IN` times.
+    four free numbers per shot do by chance, at odds of `FALSE_ALARM_ODDS`.
 
     Args:
         ring: the design.
-        data: with the launches as stated; unknown ones cannot be contradicted.
+        data: with the stated launches; unknown ones cannot be contradicted.
         dimension: 4 or 6.
-        found: the search with the launches as stated.
+        found: the search with the stated launches.
     """
     stated = np.isfinite(data.launch_sigma[:, :4])
     if not stated.any():
@@ -176,7 +176,7 @@ def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation)
 
 
 def in_coordinates(launches: Array, dimension: int) -> Array:
-    """Launches (x, px, y, py, delta), [shot, 5], in the coordinates of a network, [shot, n]."""
+    """Return launches (x, px, y, py, delta), [shot, 5], in a network's coordinates, [shot, n]."""
     states = np.zeros((len(launches), dimension))
     states[:, :4] = launches[:, :4]
     if dimension == 6:
@@ -194,7 +194,7 @@ def sparse_causes(
     refined: int = REFINED,
     candidates: Sequence[str] | None = None,
 ) -> Explanation:
-    """The changed strengths that the evidence asks for; see `fit_sparse` for the arguments.
+    """Return the changed strengths by their evidence; see `fit_sparse` for the arguments.
 
     Raises:
         TmlatticeError: no such magnet.
@@ -215,7 +215,7 @@ def sparse_causes(
     problem = FirstTurns(
         model=model,
         data=data,
-        places=dict.fromkeys(effects, len(hypotheses) / len(effects)),  # all magnets are alike
+        places=dict.fromkeys(effects, len(hypotheses) / len(effects)),  # all magnets equal
         amounts=AmountPrior(Student(fault, np.inf), bound=LARGEST),
         judgement=Judgement(unknown=0.0, alternatives=refined, rarer=RARER),
     )
@@ -229,17 +229,17 @@ def sparse_causes(
 
 
 def _refined(found: Explanation) -> Fit:
-    """The amounts to rounding: the search stops at a share of their error."""
+    """Amounts to rounding: the search stops at a share of their error."""
     fresh = replace(found.problem, judgement=replace(found.problem.judgement, same=0.0))
     now = found.fit
     return fit(fresh, now.causes, now.nuisances, steps=20, tolerance=1e-9) if now.causes else now
 
 
 def _spread(turn: RingTunes, best: Fit, tunes: Array, found: Explanation) -> Array:
-    """Standard error of the tunes [2] about the best ones, over all explanations refined last."""
-    others = [rival.fit for named in found.named for rival in named.alternatives[1:]]
+    """Standard error of the tunes [2] over all explanations refitted last."""
+    others = [one.fit for named in found.named for one in named.alternatives[1:]]
     total, weights = np.zeros((2, 2)), 0.0
-    for one in [best, *others, *(rival.fit for rival in found.beyond)]:
+    for one in [best, *others, *(one.fit for one in found.beyond)]:
         weight = float(np.exp(one.log_evidence - best.log_evidence))
         if not weight > NEGLIGIBLE:
             continue
@@ -247,7 +247,7 @@ def _spread(turn: RingTunes, best: Fit, tunes: Array, found: Explanation) -> Arr
             away = short_way(turn.of(one.causes) - tunes)
             slopes = _tune_slopes(turn, one)
         except UnstableRingError:
-            continue  # the ring stores a beam, or nobody would ask for its tunes
+            continue  # no tunes
         total += weight * (slopes @ one.covariance @ slopes.T + np.outer(away, away))
         weights += weight
     return np.asarray(np.sqrt(np.diag(total / weights)))

@@ -1,4 +1,4 @@
-"""The experiment of `tune_fit` over the whole ring: one chosen magnet says little about a method.
+"""The experiment of `tune_fit` over the whole ring: one magnet is not representative.
 
 Cases run on local processes or on a Dask cluster (`tmlattice.batch`); each is written to a
 folder as it ends, so a study that was stopped goes on where it was.
@@ -37,15 +37,15 @@ Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 METHODS = ("adam", "adam-none", "adam-l1", "adam-l2", "map", "sparse", "told")
-"""Adam with the symplectic penalty, without, with l1, with l2; `map`; `sparse`; and `sparse` that
-is told which magnets changed: nothing else can be better."""
+"""Adam with the symplectic penalty, without, with l1, with l2; `map`; `sparse`; and `sparse` given
+the changed magnets, the best possible."""
 
 UNSTABLE = "the perturbed ring is unstable"
 
 _LATTICE = ("lattice", "sequence", "energy", "monitors", "correctors", "particle")
 
 NEW_AMPLITUDE = 5.0
-"""New launches, for the prediction, have this many times the fitted launch's amplitude."""
+"""Amplitude of the new launches of the prediction over that of the fitted launch."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,15 @@ class Case:
         s: of its middle, m; of the first of a pair.
         method: one of `METHODS`.
         seed: of the noise.
-        true_tunes: of the perturbed ring, or None where it is unstable.
-        absolute_error, relative_error: of the tunes, or None where there is no prediction.
-        tune_sigma: stated standard error of the tunes, or None where the method states none.
+        true_tunes: of the perturbed ring, or None if it is unstable.
+        absolute_error, relative_error: of the tunes, or None without a prediction.
+        tune_sigma: stated standard error of the tunes, or None if the method has none.
         orbit_rms: residual before and after, m.
         prediction_rms: error of the fitted network on new launches of five times the amplitude,
             against readings without noise, m.
-        found: the magnets that the method names, or None where it names none.
+        found: magnets that the method identifies, or None if it identifies none.
         seconds: of the fit.
-        problem: what went wrong, or None.
+        problem: error message, or None.
     """
 
     magnet: str
@@ -84,14 +84,14 @@ class Case:
 
     @property
     def right(self) -> bool | None:
-        """Whether the magnets named are those that were changed, no more and no fewer."""
+        """Whether the identified magnets are exactly the changed ones."""
         return None if self.found is None else set(self.found) == set(self.magnet.split("+"))
 
 
 def spread_magnets(
     ring: Ring, number: int | None = None, kind: str = "quadrupole"
 ) -> list[Element]:
-    """`number` powered magnets of a kind, evenly spread in beam order; None, or more: all.
+    """Return `number` powered magnets of a kind, evenly in beam order; None, or more: all.
 
     Raises:
         TmlatticeError: the ring has none.
@@ -105,8 +105,8 @@ def spread_magnets(
 
 
 def faults(ring: Ring, number: int | None, kind: str) -> list[str]:
-    """The names of the cases: quadrupoles, sextupoles, or pairs of quadrupoles a third of the ring
-    apart, as name+name."""
+    """Return the names of the cases: quadrupoles, sextupoles, or pairs of quadrupoles a third of
+    the ring apart, as name+name."""
     if kind != "pair":
         return [e.name for e in spread_magnets(ring, number, kind)]
     powered = [e.name for e in spread_magnets(ring)]
@@ -116,7 +116,7 @@ def faults(ring: Ring, number: int | None, kind: str) -> list[str]:
 
 
 def turned_launches(optics: Optics, launch: Array, phases: Array) -> Array:
-    """The launch [n] turned by phases [shot, 2], in rad, on its own ellipses: [shot, n]."""
+    """Return the launch [n] turned by phases [shot, 2], in rad, on its ellipses, [shot, n]."""
     launches = np.tile(launch, (len(phases), 1))
     for plane in range(2):
         alpha, beta = optics.alpha[plane], optics.beta[plane]
@@ -140,7 +140,7 @@ def run_case(
     seed: int = 0,
     **recipe: Any,
 ) -> Case:
-    """One case; a fit that fails says why in the case.
+    """Return one case; a failed fit has its error message in the case.
 
     Args:
         ring: the design.
@@ -170,7 +170,7 @@ def run_case(
     start = np.asarray(launch, dtype=float)
     phases = np.pi * np.arange(shots)[:, None] / shots * np.ones(2)
     launches = turned_launches(optics, start, phases)
-    # Each magnet has noise of its own: cases that share one would err together.
+    # independent noise for each magnet, so that the cases are independent
     generator = np.random.default_rng([seed, zlib.crc32(empty.magnet.encode())])
     clean = truth.readings(launches)
     readings = clean + noise * generator.standard_normal(clean.shape)
@@ -201,7 +201,7 @@ def run_case(
         miss = truth.readings(new) - fit.network.readings(new)
         prediction = float(np.sqrt(np.mean(miss**2)))
     except TmlatticeError:
-        prediction = None  # five times the amplitude is lost in one of them
+        prediction = None  # lost at five times the amplitude in one of them
     rms = [
         float(np.sqrt(np.mean((readings - n.readings(launches)) ** 2)))
         for n in (design, fit.network)
@@ -242,7 +242,7 @@ def _work(task: tuple[tuple[Any, ...], tuple[str, str, int], dict[str, Any]]) ->
 
 
 def _name_of(job: tuple[str, str, int]) -> str:
-    """Of its file: magnets' names may hold what a file's may not."""
+    """File name of a case, without characters of magnets' names that files may not have."""
     return hashlib.sha256("\0".join(map(str, job)).encode()).hexdigest()[:16]
 
 
@@ -250,7 +250,7 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
     """Make the folder of a study, or check that it is this study's.
 
     Raises:
-        TmlatticeError: it holds the cases of another study, or cannot be written.
+        TmlatticeError: it contains the cases of another study, or cannot be written.
     """
     stated = folder / "options.json"
     text = json.loads(json.dumps(identity))
@@ -263,7 +263,7 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
             ) from error
         if there != text:
             raise TmlatticeError(
-                f"'{folder}' holds a study with other options; name another folder with --out"
+                f"'{folder}' contains a study with other options; name another folder with --out"
             )
         return
     try:
@@ -277,7 +277,7 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
 
 
 def _case(job: tuple[str, str, int], values: dict[str, Any]) -> Case:
-    if "error" in values:  # not one of ours: the code, or the worker, broke
+    if "error" in values:  # the code, or the worker, failed
         return Case(job[0], float("nan"), job[1], job[2], problem=values["error"])
     plain: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != MADE_BY
@@ -304,12 +304,12 @@ def study_tune_fit(
     progress: bool = True,
     **options: Any,
 ) -> list[Case]:
-    """Change magnet after magnet, measure, fine-tune by each method, and hold against the truth.
+    """Change magnet after magnet, measure, fine-tune by each method, and compare with the truth.
 
     Args:
-        lattice: name or path; every worker loads it for itself.
+        lattice: name or path; every worker loads it.
         methods: some of `METHODS`.
-        magnets: how many, evenly spread; None: all.
+        magnets: number of magnets, evenly spread; None: all.
         kind: quadrupole, sextupole, or pair (of quadrupoles).
         seeds: noises for each magnet and method, seed, seed + 1, ...
         seed: the first.
@@ -317,12 +317,12 @@ def study_tune_fit(
         jobs: local processes; 1: this one; else one a core.
         folder: where every case is written as it ends, and read from when the study goes on.
         sequence, energy, monitors, correctors, particle: see `load_ring`.
-        progress: show a bar where there is a terminal.
+        progress: show a bar on a terminal.
         options: of `run_case`.
 
     Returns:
-        The cases. One that fails says why and does not stop the rest; one that broke is tried again
-        when the study is.
+        The cases. A failed one has its error message; one whose worker failed is tried again when
+        the study is resumed.
 
     Raises:
         TmlatticeError: an unknown method, another study's folder, or no scheduler.
@@ -355,14 +355,14 @@ def study_tune_fit(
 
 
 def summarise(cases: Sequence[Case]) -> dict[str, Any]:
-    """Median, 95th percentile and worst tune error of each method, and what else counts.
+    """Return median, 95th percentile and worst tune error of each method, and other metrics.
 
     Returns:
         {"methods": {name: {"abs_dq": {"x": {"median", "p95", "worst"}, "y"}, "rel_dq", "orbit_rms"
         (median after, m), "prediction_rms" {"median", "p95", "worst"} (m), "right" (fraction of
         cases with exactly the right magnets, or null), "coverage" ({"x", "y"}: fraction of cases
         within the stated 95 % error, or null), "stated" (standard errors of the tunes, as "abs_dq";
-        those of "told" are the Cramer-Rao bound, what the readings hold of a known magnet),
+        those of "told" are the Cramer-Rao bound, the readings' information on a known magnet),
         "seconds" (median), "predicted", "failed"}},
         "cases", "unstable"}; "unstable" counts magnets whose perturbed ring has no tune.
     """

@@ -1,6 +1,6 @@
-"""The parts of a layer's change: what effects do, what else is symplectic, and the rest.
+"""Parts of a layer's change: effects, other symplectic changes, and the rest.
 
-See `fitting.weights`, which says what they are for.
+See `fitting.weights` for their use.
 """
 
 from collections.abc import Sequence
@@ -28,17 +28,17 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 PARTS = ("physical", "symplectic", "non-symplectic")
-"""Of a change: effects of the catalogue, other symplectic changes, the rest."""
+"""Parts of a change: effects of the catalogue, other symplectic changes, the rest."""
 
 ALIKE = 1e-6
-"""Effects of which others leave less than this share are no directions of their own."""
+"""Share of an effect independent of the others below which it is no direction of its own."""
 
 DEPENDENT = 1e-3
-"""The same for symplectic changes beside effects: an offset of a thick sextupole, in second-order
-maps, is symplectic but for its third order, which is cut."""
+"""The same for symplectic changes given the effects: an offset of a thick sextupole, in
+second-order maps, is symplectic but for its third order, which is cut."""
 
 UNSEEN = 1e-10
-"""A kick of which launches leave less than this share of information is not seen."""
+"""Share of information independent of the launches below which a kick is invisible."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class LayerEffects:
     """The catalogue as directions in the weights of single layers.
 
     Attributes:
-        ring, dimension: whose.
+        ring, dimension: of the weights.
         hypotheses: (effect, element).
         layer: of each, [hypothesis].
         D0, D1, D2: d weights / d amount, [hypothesis, n], [hypothesis, n, n],
@@ -65,7 +65,7 @@ class LayerEffects:
 def layer_effects(
     ring: Ring, dimension: int = 4, effects: Sequence[str] | None = None
 ) -> LayerEffects:
-    """Directions of all effects that act through one layer and move no read-out.
+    """Return directions of all effects that act through one layer and change no read-out.
 
     Args:
         ring: the design.
@@ -96,13 +96,13 @@ def layer_effects(
 
 @dataclass(frozen=True)
 class Split:
-    """A change of every layer taken apart, over many trajectories of the measured size.
+    """Parts of every layer's change, over many trajectories of the measured size.
 
     Attributes:
         amount, sigma: of every effect, all effects of its layer at once, in its unit; the smallest
-            ones where effects are alike, [hypothesis].
+            ones for dependent effects, [hypothesis].
         parts: norms of the parts, see `PARTS`, in sigma, [layer, 3].
-        freedom: number of directions that each part has, [layer, 3].
+        freedom: number of directions of each part, [layer, 3].
     """
 
     amount: Array
@@ -112,7 +112,7 @@ class Split:
 
     @property
     def shares(self) -> Array:
-        """Of the parts in the squared norm of a layer's change, [layer, 3]; 0 without a change."""
+        """Shares of the parts in the squared norm of a layer's change, [layer, 3]; 0 if none."""
         squares = self.parts**2
         whole = squares.sum(axis=1, keepdims=True)
         return np.asarray(squares / np.where(whole > 0, whole, 1.0))
@@ -124,7 +124,7 @@ def stacked(weights: Sequence[Array]) -> Array:
 
 
 class Trajectories:
-    """The measured trajectories through the design, and what readings know of kicks on them.
+    """The measured trajectories through the design, and the readings' information on kicks.
 
     Attributes:
         states: at every exit, [shot, layer + 2, n].
@@ -147,7 +147,7 @@ class Trajectories:
             noise = estimate(data, first.point.view)
             if not (noise > 0).all():
                 raise MeasurementError(
-                    "the noise of the readings is not given and cannot be estimated from so few; "
+                    "the noise of the readings is not stated and they are too few to estimate it; "
                     "give it"
                 )
             data = data.with_sigma(noise)
@@ -164,7 +164,7 @@ class Trajectories:
         Q = found.projection.Q[:, :-5].reshape(shots, count, 2, -1)
         clean = found.projection.out(found.residual).reshape(shots, -1)[:, :-5]
         clean = clean.reshape(shots, count, 2)
-        # of a change of the launch that only the monitors from each one on see
+        # by a change of the launch before the monitors from each one on
         H = behind(np.einsum("smpi,smpj->smij", G, G))
         K = behind(np.einsum("smpi,smpq->smiq", G, Q))
         g = behind(np.einsum("smpi,smp->smi", G, clean))
@@ -178,14 +178,14 @@ class Trajectories:
         self.pull = np.einsum("skij,skj->ski", forth, g)
 
     def kicks(self, layer: Indices, weights: Sequence[Array]) -> Array:
-        """At the exits of layers, by weights' rows, along the trajectories, [shot, row, n]."""
+        """Kicks by weights' rows at the exits of layers, along the trajectories, [shot, row, n]."""
         out = np.empty((len(self.states), 1, len(layer), self.states.shape[2]))
         D0, D1, D2 = (np.ascontiguousarray(w) for w in weights)
         kernels.kicks(layer, D0, D1, D2, self.states, self.states.shape[1] - 1, out)
         return out[:, 0]
 
     def gradient(self) -> tuple[Array, Array, Array]:
-        """d (chi-square / 2) / d weights of every layer, launch fitted."""
+        """Return d (chi-square / 2) / d weights of every layer, launch fitted."""
         x = self.states[:, : self.pull.shape[1]]
         i, j = np.triu_indices(x.shape[2])
         return (
@@ -195,7 +195,7 @@ class Trajectories:
         )
 
     def ensemble(self) -> Array:
-        """A root of the second moments of (1, x, x^[2]), [P, P]: root root^T."""
+        """Root of the second moments of (1, x, x^[2]), [P, P]: root root^T."""
         n = self.states.shape[2]
         rms = np.sqrt((self.states**2).mean(axis=(0, 1)))
         i, j = np.triu_indices(n)
@@ -213,8 +213,8 @@ class Trajectories:
         return np.asarray(scale[:, None] * np.linalg.cholesky(moments))
 
     def roots(self) -> Array:
-        """A root of the information on a kick at each exit, all shots, [layer, n, n]: root root^T;
-        zero along what is not seen."""
+        """Root of the information on a kick at each exit, all shots, [layer, n, n]: root root^T;
+        zero in invisible directions."""
         whole, information = self.whole.sum(axis=0), self.information.sum(axis=0)
         size = np.sqrt(np.einsum("kii->ki", whole))
         safe = np.where(size > 0, size, 1.0)
@@ -224,7 +224,7 @@ class Trajectories:
 
 
 def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
-    """Changes of a layer that keep it symplectic to second order.
+    """Return changes of a layer that keep it symplectic to second order.
 
     The layer is followed by the flow of a polynomial H of degree 1, 2 or 3: d image = S grad H at
     the image, truncated at second order.
@@ -267,7 +267,7 @@ def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
 
 
 def split(seen: Trajectories, effects: LayerEffects, weights: Array, gradient: bool) -> Split:
-    """Effects, other symplectic changes, the rest.
+    """Return the parts: effects, other symplectic changes, the rest.
 
     Args:
         weights: change, or gradient, [layer, n, P].

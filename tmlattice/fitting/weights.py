@@ -1,4 +1,4 @@
-"""What a network says of its ring: every layer's weight change, or gradient, taken apart.
+"""Physics of a network's weights: every layer's weight change, or gradient, in parts.
 
 >>> reading = read_network(ring, fine_tune(network, measurement).network, measurement)
 >>> ring.magnets[reading.places("score")[0]].name         # the layer that changed most, in sigma
@@ -9,19 +9,19 @@ exit, (dW0 + dW1 x + dW2 x^[2]) at the state x at its entrance. The information 
 that kick, launch projected out, is M [n, n], a sum over monitors downstream. So a change d has
 
 - along the measured trajectories the information sum_s kick_s(d)^T M_s kick_s(d). Amounts, their
-  errors and scores are in this metric. A few shots cannot tell most weights of one layer apart:
-  four coordinates have 60 weights, and a shot sees four combinations of them at most;
+  errors and scores are in this metric. A few shots do not determine most weights of one layer:
+  four coordinates have 60 weights, and a shot determines four combinations of them at most;
 - over many trajectories of the same size the information <kick^T M kick>, M summed over the shots,
-  x Gaussian with the rms coordinates that the shots have over the whole ring. It has full rank
-  where monitors see all of a kick. The split of a change is orthogonal in this metric.
+  x Gaussian with the rms coordinates of the shots over the whole ring. It has full rank where
+  monitors see all of a kick. The parts of a change are orthogonal in this metric.
 
-Three parts: what the catalogue's effects at that layer do; what else leaves the layer symplectic to
-second order (x -> M(x) + S grad H (M(x)), H of degree 1 to 3, truncated); the rest. The square of
-their norms sum to that of the whole. A norm is the number of sigma by which so many shots would see
-that part of that layer's change.
+The parts are effects of the catalogue at that layer; other changes that leave the layer symplectic
+to second order (x -> M(x) + S grad H (M(x)), H of degree 1 to 3, truncated); and the rest. The
+squares of their norms sum to that of the whole. A norm is the significance of that part, in sigma,
+for as many shots.
 
-An effect is taken where it acts through one layer and moves no read-out; not those of families, of
-all magnets, of monitors or of the beam.
+An effect is used if it acts through one layer and changes no read-out: none of families, of all
+magnets, of monitors or of the beam.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,7 +54,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class WeightReading:
-    """Weight changes, or gradients, of all layers, read as physics.
+    """Weight changes, or gradients, of all layers, as physical effects.
 
     Attributes:
         kind: "change" of a network's weights, or "gradient" at the design.
@@ -65,8 +65,8 @@ class WeightReading:
         layer: of each, [hypothesis].
         amount: each effect alone, in its unit, along the measured trajectories, [hypothesis]; of a
             gradient: the best amount of the linear model.
-        sigma: its standard deviation, launch projected out; inf for what is not seen.
-        score: amount / sigma, signed; 0 for what is not seen.
+        sigma: its standard deviation, launch projected out; inf if invisible.
+        score: amount / sigma, signed; 0 if invisible.
         launches: fitted to the design, (x, px, y, py, delta), [shot, 5].
         chi2, readings: of the design with these launches; number of readings.
     """
@@ -86,20 +86,20 @@ class WeightReading:
 
     @cached_property
     def split(self) -> Split:
-        """The parts of the change; of a gradient: those of the steepest step, -information^-1
-        gradient, whose shares mean something and whose norms are no sigma. Made when it is first
-        asked for: some seconds on a large ring."""
+        """Parts of the change; of a gradient those of the steepest step, -information^-1 gradient,
+        whose shares are meaningful but whose norms are not in sigma. Computed at the first call, in
+        some seconds on a large ring."""
         return self._take_apart()
 
     @property
     def best(self) -> Array:
-        """The largest |score| of the effects of each layer, [layer]; 0 where there is none."""
+        """Largest |score| of the effects of each layer, [layer]; 0 without effects."""
         best = np.zeros(len(self.raw))
         np.maximum.at(best, self.layer, np.abs(self.score))
         return best
 
     def places(self, by: str = "score") -> Indices:
-        """Layers, the most suspicious first, [layer].
+        """Layers, the most significant first, [layer].
 
         Args:
             by: "raw" for the norm of the change in weights, "score" for the largest score.
@@ -112,7 +112,7 @@ class WeightReading:
         return np.argsort(-(self.raw if by == "raw" else self.best), kind="stable")
 
     def as_json(self, first: int = 20) -> dict[str, Any]:
-        """The `first` layers by score and by raw norm, with what was read of them."""
+        """Return the `first` layers by score and by raw norm, with their effects."""
         magnets = self.ring.magnets
         split, best = self.split, self.best
 
@@ -152,7 +152,7 @@ class WeightReading:
 def read_gradient(
     ring: Ring, measurement: Measurement, dimension: int = 4, effects: LayerEffects | None = None
 ) -> WeightReading:
-    """The gradient of the loss at the design, layer by layer: no fine-tuning is needed.
+    """Return the gradient of the loss at the design, layer by layer, without fine-tuning.
 
     An effect's score is -g^T d / sqrt(d^T F d), g the gradient of chi-square / 2 by the weights, d
     the effect's direction, F the information: the signed root of the linear scan's statistic.
@@ -161,7 +161,7 @@ def read_gradient(
         ring: the design.
         measurement: its first turn is used; launches are fitted.
         dimension: 4, or 6 where the energy matters.
-        effects: of `layer_effects`, where many measurements are read.
+        effects: of `layer_effects`, to be shared by many measurements.
 
     Raises:
         MeasurementError: data that cannot be used: settings that differ from the design's.
@@ -175,13 +175,13 @@ def read_network(
     measurement: Measurement,
     effects: LayerEffects | None = None,
 ) -> WeightReading:
-    """The change of a network's weights from the design, layer by layer.
+    """Return the change of a network's weights from the design, layer by layer.
 
     Args:
         ring: the design.
         network: fine-tuned, of this ring.
-        measurement: whose trajectories and noise say what a change is worth; its first turn.
-        effects: of `layer_effects`, where many networks are read.
+        measurement: its first turn's trajectories and noise give the significance of a change.
+        effects: of `layer_effects`, to be shared by many networks.
 
     Raises:
         LatticeError: a network of another ring.
@@ -206,7 +206,7 @@ def _read(
         effects = layer_effects(ring, n)
     if effects.ring is not ring or effects.dimension != n:
         raise ValueError("these effects are of another ring or of other coordinates")
-    measurement.states(n)  # says where four coordinates do not do
+    measurement.states(n)  # raises if four coordinates are too few
     seen = Trajectories(ring, measurement.select(turns=[0]), n)
     if network is not None:
         change = _change(seen.model, network)

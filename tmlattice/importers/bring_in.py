@@ -11,7 +11,16 @@ import numpy as np
 
 from tmlattice.by_name import is_frame
 from tmlattice.errors import MeasurementError, TmlatticeError, plain, unknown_name
-from tmlattice.importers.columns import CSV, HDF5, SDDS, SHEETS, as_frame, read_columns, text_of
+from tmlattice.importers.columns import (
+    CSV,
+    HDF5,
+    SDDS,
+    SHEETS,
+    as_frame,
+    label,
+    read_columns,
+    text_of,
+)
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported, counted
@@ -104,7 +113,7 @@ def bring_in(
         if isinstance(error, TmlatticeError):
             raise
         log.info("not imported", exc_info=True)
-        shown = ", ".join(f"'{path}'" for path in files)
+        shown = ", ".join(f"'{path}'" for path in files) or label(frames[0])
         said = plain(f"{type(error).__name__}: {error}", 200)
         raise MeasurementError(
             f"{shown}: fields have other types or sizes than a reader knows ({said}); save it again"
@@ -232,11 +241,14 @@ def _bring(
     )
 
 
-def _table(path: Path, ring: Ring | None, options: Options) -> Imported:
+def _table(source: Path | Any, ring: Ring | None, options: Options) -> Imported:
     """A response by its columns, else readings as they come."""
-    if path.suffix.lower() in CSV and is_response_table(read_columns(path)):
-        return bring_table(path, ring, options.told)
-    return bring_readings(path, ring, with_unit(options.told, options.unit, options.noise))
+    name, columns = label(source), read_columns(source)
+    plain_text = not isinstance(source, Path) or source.suffix.lower() in CSV
+    if plain_text and is_response_table(columns):
+        return bring_table(name, columns, ring, options.told)
+    told = with_unit(options.told, options.unit, options.noise)
+    return bring_readings(name, columns, ring, told)
 
 
 def _framed(frame: Any, options: Options) -> Imported:
@@ -245,9 +257,7 @@ def _framed(frame: Any, options: Options) -> Imported:
     stated = of_document(as_frame(frame))
     if stated is not None:
         return Imported(stated, ring, ("everything is as `to_dataframe` wrote it",))
-    if is_response_table(read_columns(frame)):
-        return bring_table(frame, ring)
-    return bring_readings(frame, ring, with_unit(options.told, options.unit, options.noise))
+    return _table(frame, ring, options)
 
 
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
@@ -260,7 +270,7 @@ def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
         if options.turns or ring is None or path.suffix.lower() not in SDDS:
             raise
         told = with_unit(options.told, options.unit, options.noise)
-        return bring_readings(path, ring, told)
+        return bring_readings(label(path), read_columns(path), ring, told)
 
 
 def _with_conventions(brought: Imported, ring: Ring | None, options: Options) -> Imported:

@@ -119,6 +119,11 @@ def as_frame(table: Any) -> Any:
 def _of_frame(table: Any) -> list[Column]:
     frame = as_frame(table)
     units = frame.attrs.get("units") or {}
+    if not isinstance(units, dict):
+        raise MeasurementError(
+            f"{label(table)}: attrs['units'] is {units!r}; give the unit of each column, such as "
+            "{'x': 'mm', 'y': 'mm'}"
+        )
     found = []
     for place, text in enumerate(map(str, frame.columns)):
         name, unit = named(text)

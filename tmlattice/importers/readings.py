@@ -10,14 +10,12 @@ BPMs had a beam.
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
-from tmlattice.importers.columns import Column, label, read_columns
+from tmlattice.importers.columns import Column
 from tmlattice.importers.imported import Imported, counted, device_names
 from tmlattice.importers.told import METRES, Told
 from tmlattice.lattice import Ring
@@ -61,15 +59,17 @@ class Place:
 
 
 def bring_readings(
-    source: Path | Any,
+    path: str,
+    columns: Sequence[Column],
     ring: Ring | None,
     told: Told | None = None,
     monitors: Sequence[str] | None = None,
 ) -> Imported:
-    """The measurement of a file whose columns are not known.
+    """The measurement of a table whose columns are not known.
 
     Args:
-        source: CSV of any separator, HDF5 or SDDS; or a frame.
+        path: what messages call it, see `columns.label`.
+        columns: of `read_columns`.
         ring: the lattice, whose monitors are looked for; None: names are as the file has them.
         told: names, unit, noise, bad monitors.
         monitors: names to look for, instead of the lattice's.
@@ -79,7 +79,6 @@ def bring_readings(
         UnknownNameError: `told` names a monitor that the ring does not have.
     """
     told = told or Told()
-    columns, path = read_columns(source), label(source)
     found = _long(path, columns, told) or _wide(path, columns, told)
     shots, turns, places, values, units = found
     position = np.array([place.plane != SUM for place in places])

@@ -52,12 +52,12 @@ def read_measurement(
     place = Path(path)
     if turn_by_turn is not None or not place.is_file() or place.name == "measurement.json":
         return folder.read_measurement(place, monitors, turn_by_turn, unit or "m")
-    suffix = place.suffix.lower()
-    response = suffix in CSV and is_response_table(read_columns(place))
-    if monitors is not None and suffix in (*CSV, *HDF5, *SDDS) and not response:
-        brought = bring_readings(place, None, with_unit(None, unit, None), monitors)
-    else:
-        brought = bring_in([place], Options(ring=ring, unit=unit))
+    if monitors is not None and place.suffix.lower() in (*CSV, *HDF5, *SDDS):
+        columns = read_columns(place)
+        if place.suffix.lower() not in CSV or not is_response_table(columns):
+            told = with_unit(None, unit, None)
+            return _logged(bring_readings(str(place), columns, None, told, monitors), str(place))
+    brought = bring_in([place], Options(ring=ring, unit=unit))
     return _logged(brought, str(place))
 
 

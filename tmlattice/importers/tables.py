@@ -9,13 +9,12 @@ header, in brackets; without one they are m, rad and m/rad. Names are the lattic
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
-from tmlattice.importers.columns import SDDS, Column, label, read_columns
+from tmlattice.importers.columns import SDDS, Column
 from tmlattice.importers.imported import Imported, counted, device_names
 from tmlattice.importers.middle_layer import METRES, RADIANS
 from tmlattice.importers.told import Told
@@ -48,11 +47,14 @@ def is_response_table(columns: Sequence[Column]) -> bool:
     return "corrector" in names or (names[:2] == ["monitor", "plane"] and "value" not in names)
 
 
-def bring_table(source: Path | Any, ring: Ring | None, told: Told | None = None) -> Imported:
-    """An orbit response of a CSV table or a frame.
+def bring_table(
+    path: str, columns: Sequence[Column], ring: Ring | None, told: Told | None = None
+) -> Imported:
+    """An orbit response of a table.
 
     Args:
-        source: the file or frame.
+        path: what messages call it, see `columns.label`.
+        columns: of `read_columns`.
         ring: the lattice, which knows the correctors' planes.
         told: names of monitors and correctors, bad monitors.
 
@@ -60,7 +62,6 @@ def bring_table(source: Path | Any, ring: Ring | None, told: Told | None = None)
         MeasurementError: a header that is not known, or a field that is no number: with its line.
         UnknownNameError: a name that the lattice does not have.
     """
-    columns, path = read_columns(source), label(source)
     header = [(column.name, column.unit) for column in columns]
     rows = list(zip(*(column.values for column in columns), strict=True))
     names = [name.lower() for name, _ in header]

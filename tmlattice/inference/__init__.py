@@ -1,1 +1,1 @@
-"""From rows to an explanation: it knows rows, not rings."""
+"""Inference from rows to an explanation, independent of rings."""

@@ -63,12 +63,12 @@ def alternatives(
         hypotheses: all candidates.
         count: refitted at most; None: `Judgement.alternatives`.
     """
-    judge = problem.judgement
+    thresholds = problem.judgement
     linear = linear_evidence(problem, found)
     have = {(c.effect, c.element) for c in others.causes}
-    order = np.argsort(-linear)[: judge.alternatives if count is None else count]
+    order = np.argsort(-linear)[: thresholds.alternatives if count is None else count]
     # the linear scan errs by a share of the statistic itself where an effect is strong
-    window = judge.window + judge.drift * float(found.statistic.max(initial=0.0))
+    window = thresholds.window + thresholds.drift * float(found.statistic.max(initial=0.0))
     best = -np.inf
     chosen: list[Alternative] = []
     for index in order:
@@ -85,14 +85,14 @@ def alternatives(
             best = max(best, tried.log_evidence)
             chosen.append(Alternative(found.hypotheses[index], tried))
     if chosen:
-        leader = max(chosen, key=lambda rival: rival.fit.log_evidence).hypothesis
-        have |= {rival.hypothesis for rival in chosen}
+        leader = max(chosen, key=lambda one: one.fit.log_evidence).hypothesis
+        have |= {one.hypothesis for one in chosen}
         curved = [h for h in hypotheses if find(h[0]).curved and h not in have]
         for hypothesis in problem.neighbours(leader, curved):  # a linear scan misjudges them
             cause = best_start(problem, others, hypothesis)
             chosen.append(Alternative(hypothesis, _with(problem, others, cause, best)))
     chosen = [r for r in chosen if others.chi2 - r.fit.chi2 > MIN_FALL and _possible(r.cause)]
-    return tuple(sorted(chosen, key=lambda rival: -rival.fit.log_evidence))
+    return tuple(sorted(chosen, key=lambda one: -one.fit.log_evidence))
 
 
 def _possible(cause: Cause) -> bool:

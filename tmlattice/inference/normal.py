@@ -8,16 +8,17 @@ ring. Only the last make the normal equations dense. See `inference.priors.Group
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.blas import dtrmm
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 from scipy.sparse import csr_array
 
 from tmlattice.inference.priors import Group
 from tmlattice.inference.slopes import Slopes, weighed_sums
-from tmlattice.inference.triangles import inverse_of_lower, lower_factor
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -195,3 +196,34 @@ def solve(
             parts = np.split(found**2, edges), np.split(left, edges)
             groups = tuple(g.learn(own, left) for g, own, left in zip(groups, *parts, strict=True))
     return Posterior(basis @ found, groups, basis, prior, factor)
+
+
+# --- triangular factors by LAPACK, without copies and checks, which dominate for small matrices ---
+MAX_LAPACK = 96
+"""Largest number of rows for which LAPACK's inversion is as fast as products of blocks."""
+
+
+def lower_factor(matrix: Array) -> Array:
+    """L of L L^T, [n, n]; the symmetric matrix is overwritten.
+
+    Raises:
+        LinAlgError: the matrix is not positive definite.
+    """
+    factor, wrong = dpotrf(matrix.T, lower=1, overwrite_a=1)
+    if wrong:
+        raise np.linalg.LinAlgError("a matrix of normal equations is not positive definite")
+    return np.asarray(factor)
+
+
+def inverse_of_lower(factor: Array) -> Array:
+    """L^-1, [n, n], mostly by products of blocks, twice as fast as LAPACK's inversion."""
+    n = len(factor)
+    if n <= MAX_LAPACK:
+        return np.asarray(dtrtri(factor, lower=1)[0])
+    half = n // 2
+    first, second = inverse_of_lower(factor[:half, :half]), inverse_of_lower(factor[half:, half:])
+    between: Any = dtrmm(1.0, first, factor[half:, :half], side=1, lower=1)
+    out = np.zeros_like(factor, order="F")
+    out[:half, :half], out[half:, half:] = first, second
+    out[half:, :half] = dtrmm(-1.0, second, between, lower=1)
+    return out

@@ -68,17 +68,17 @@ def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
         point: the model of the fit.
         already: number of rejected readings.
     """
-    judge = problem.judgement
+    thresholds = problem.judgement
     if int(problem.valid.sum()) < READINGS_PER_OUTLIER * (already + 1):
         return []
     clean, size = problem.left(point)
     statistic = np.where(size > 1e-3, clean**2 / np.maximum(size, 1e-3), 0.0)
     worst = tuple(int(i) for i in np.unravel_index(int(statistic.argmax()), statistic.shape))
     value, count = float(statistic[worst]), float(problem.valid.sum())
-    rate = judge.rate("reading")
+    rate = thresholds.rate("reading")
     seen = Detection(value, free_threshold(rate, 1, count), look_elsewhere(value, 1, count))
     if not seen.p_value < rate:
         return []
     # a log-uniform amount, as for every other cause
-    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + judge.outlier_prior
+    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + thresholds.outlier_prior
     return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]

@@ -119,11 +119,13 @@ def posterior(
         visible = np.flatnonzero(np.diag(spread) > 0)
         spread = spread[np.ix_(visible, visible)]
         pull = known.correlated(known.rms * (sums.inner + sums.gram @ beyond))
-        likeliest = np.zeros(len(pull))
+        most_probable = np.zeros(len(pull))
         factor = cho_factor(spread + np.eye(len(visible)), overwrite_a=True, check_finite=False)
-        likeliest[visible] = cho_solve(factor, pull[visible], check_finite=False)
+        most_probable[visible] = cho_solve(factor, pull[visible], check_finite=False)
         own = zip(
-            known.hypotheses, known.amounts + known.rms * known.correlated(likeliest), strict=True
+            known.hypotheses,
+            known.amounts + known.rms * known.correlated(most_probable),
+            strict=True,
         )
         amounts = np.array([find(name).floored(amount) for (name, _), amount in own])
     return Posterior(known, amounts, visible, spread, errors)

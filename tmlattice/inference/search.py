@@ -186,8 +186,8 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         options = [] if over else _options(search, state, scans)
         beyond = next((option.alternatives for option in options if option.kind == "named"), ())
         # the false-alarm rate decides on a first finding, the evidence on further ones
-        told = () if seen or search.by_marginal_likelihood else ("named",)
-        options = [option for option in options if option.gain > 0 or option.kind in told]
+        accepted = () if seen or search.by_marginal_likelihood else ("named",)
+        options = [option for option in options if option.gain > 0 or option.kind in accepted]
         seen.add(state.names)
         visited.add(state.choices)
         if not options and not pending:
@@ -262,10 +262,10 @@ def _scan_all(search: Search, state: State) -> tuple[State, Scans]:
 def _options(search: Search, state: State, scans: Scans) -> list[Option]:
     """Possible next steps."""
     problem = state.problem
-    judge = problem.judgement
+    thresholds = problem.judgement
     options = []
     statistic = float(scans.named.statistic.max(initial=0.0))
-    rate = judge.rate("named")
+    rate = thresholds.rate("named")
     detection = Detection(statistic, scans.named.threshold(rate), scans.named.p_value(statistic))
     top = scans.named.hypotheses[int(scans.named.statistic.argmax())] if statistic > 0 else None
     if top is not None and top not in search.established and detection.p_value < rate:
@@ -434,10 +434,10 @@ def _cause_revised(
         if leader == hypothesis:
             return state
     tried = alternatives(state.problem, alone, about, search.hypotheses, 12)
-    if hypothesis not in [rival.hypothesis for rival in tried]:
+    if hypothesis not in [one.hypothesis for one in tried]:
         order = (*rest, now.causes[k])
         kept = fit(state.problem, order, now.nuisances, now.kicks, slopes=now.slopes)
         found = [*tried, Alternative(hypothesis, kept)]
-        tried = tuple(sorted(found, key=lambda rival: -rival.fit.log_evidence))
+        tried = tuple(sorted(found, key=lambda one: -one.fit.log_evidence))
     named = (*named, Identified(state.named[k].detection, tried))
     return replace(without, fit=tried[0].fit, named=named)

@@ -223,7 +223,12 @@ def ring_of_madx(madx: Any, sequence: str | None = None, energy: float | None = 
     energy = beam.energy if energy is None else energy
     made: dict[Any, Part] = {}
     parts = []
-    for node in active.expanded_elements:
+    nodes = list(active.expanded_elements)
+    # of a LINE every place is that of a centre, and no way between is implied
+    reader._in_line = all(
+        abs(node["at"] - node.position - node.length / 2) < ROUNDING for node in nodes
+    )
+    for node in nodes:
         align, field = node.align_errors, node.field_errors
         keyword, length = node.base_type.name, float(node.length)
         kicks = float(node.chkick), float(node.cvkick)

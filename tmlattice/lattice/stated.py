@@ -111,9 +111,8 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
         own = [q if np.sin(2 * np.pi * s) >= 0 else 1 - q
                for q, s in zip(tunes, stated.tunes, strict=True)]  # fmt: skip
         return f"its tunes are {_two(own)} (fractions), the header states {_two(stated.tunes)}"
-    dispersion = np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 5])
+    dispersion, late = _off_energy(matrix, ring.length)
     if stated.compaction is not None:
-        late = (matrix[4, :4] @ dispersion + matrix[4, 5]) / ring.length
         compaction = ring.beta**2 * late + ring.gamma**-2
         if abs(compaction - stated.compaction) > COMPACTION * abs(stated.compaction) + 1e-7:
             return (
@@ -144,9 +143,14 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
 def slip(ring: Ring) -> float:
     """How much later a particle of more energy comes round, per turn's length: above transition it
     is positive."""
-    matrix = _turn(_maps(ring), np.zeros(6))
-    dispersion = np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 5])
-    return float(matrix[4, :4] @ dispersion + matrix[4, 5]) / ring.length
+    return _off_energy(_turn(_maps(ring), np.zeros(6)), ring.length)[1]
+
+
+def _off_energy(matrix: Array, length: float) -> tuple[Array, float]:
+    """Of a turn's matrix the dispersion [4], and how much later more energy comes round, over the
+    turn's length."""
+    dispersion = np.asarray(np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 5]), dtype=float)
+    return dispersion, float(matrix[4, :4] @ dispersion + matrix[4, 5]) / length
 
 
 def curvatures(ring: Ring, stated: Stated) -> list[float]:

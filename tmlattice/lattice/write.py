@@ -5,7 +5,7 @@
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
@@ -128,15 +128,19 @@ def to_xtrack(ring: Ring) -> Any:
     return xtrack.Line.from_dict(content, with_progress=False)
 
 
-def to_madx(ring: Ring) -> str:
+def to_madx(ring: Ring, calibration: Iterable[Any] = ()) -> str:
     """Return the text of a MAD-X file with the ring as its sequence `ring`, for `madx.input(...)`.
+
+    Args:
+        ring: with its errors.
+        calibration: errors of monitors, `Diagnosis.calibration`: offsets and gains as EALIGN.
 
     Warns:
         Once, of all that MAD-X does not hold.
     """
     from tmlattice.lattice.write_madx import holds, madx_text
 
-    return str(_object(ring, "MAD-X", holds, madx_text))
+    return str(_object(ring, "MAD-X", holds, lambda bare: madx_text(bare, calibration)))
 
 
 def to_dataframe(ring: Ring) -> Any:

@@ -5,6 +5,7 @@ AT's saver of this language leaves out tilts, gaps and matrices, so this is one 
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,9 @@ KEYWORDS = (
 
 
 SHIFTS = ("dx", "dy", "ds")
+READING = {"monitor_offset_x": "MREX", "monitor_offset_y": "MREY", "monitor_gain_x": "MSCALX",
+           "monitor_gain_y": "MSCALY"}  # fmt: skip
+"""Effects on monitors that EALIGN has: what is read too much, m, and relative."""
 ROUNDING = 1e-6
 """m; MAD-X takes overlaps of this size for the rounding of positions, but no element of negative
 length."""
@@ -46,11 +50,13 @@ def write_madx(ring: Ring, path: Path) -> tuple[str, ...]:
     return told
 
 
-def madx_text(ring: Ring) -> tuple[str, tuple[str, ...]]:
+def madx_text(ring: Ring, calibration: Iterable[Any] = ()) -> tuple[str, tuple[str, ...]]:
     """A sequence of plain elements, and what it lacks.
 
     Args:
         ring: of `plain`, with the errors that MAD-X `holds`.
+        calibration: causes in monitors, as `Diagnosis.calibration` has them; their offsets and
+            gains become reading errors of EALIGN, which act in MAD-X's CORRECT.
     """
     left_out: Counter[str] = Counter()
     elements = [e for e in ring.elements if not (e.kind == "drift" and e.length <= 0)]
@@ -74,9 +80,23 @@ def madx_text(ring: Ring) -> tuple[str, tuple[str, ...]]:
         ),
         "ENDSEQUENCE;",
         "USE, SEQUENCE=ring;",
-        "",
     ]
-    return "\n".join(content), (*told, *names)
+    seen: Counter[str] = Counter()
+    places: dict[str, str] = {}
+    for name, element in zip(line, elements, strict=True):
+        seen[name] += 1
+        places[element.name] = f"{name}[{seen[name]}]"
+    read: dict[str, list[str]] = {}  # a second EALIGN of an element undoes the first
+    for cause in calibration:
+        if cause.effect in READING:
+            given = f"{READING[cause.effect]}={_number(cause.amount)}"
+            read.setdefault(places[cause.element], []).append(given)
+        else:
+            told.append(f"{cause.effect} of {cause.element} cannot be written")
+    for place, errors in read.items():
+        content += ["SELECT, FLAG=ERROR, CLEAR;", f"SELECT, FLAG=ERROR, RANGE={place};",
+                    f"EALIGN, {', '.join(errors)};"]  # fmt: skip
+    return "\n".join([*content, ""]), (*told, *names)
 
 
 def _misaligned(element: Element) -> str:

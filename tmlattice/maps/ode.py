@@ -232,6 +232,7 @@ def _integrated(
 
 def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Array]:
     """Return the polynomial equation dX/dt, of the map's own order, whose map over `time` this is.
+
     It is the logarithm of the map's action on monomials (Koopman's matrix, Carleman's in the
     other reading), found degree by degree: the linear part is log(W1) / time, and each higher
     degree is then a linear equation.

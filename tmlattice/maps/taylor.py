@@ -125,7 +125,7 @@ class TaylorMap:
         order: p.
 
     Raises:
-        ValueError: a coefficient array of another shape (the message says which it should be).
+        ValueError: a coefficient array of another shape (the message states the right one).
 
     Source: A. Ivanov, S. Golovkina, U. Iben, physics-based polynomial neural networks.
     """

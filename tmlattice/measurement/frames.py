@@ -102,7 +102,10 @@ def of_document(frame: Any) -> AnyMeasurement | None:
     """
     document = frame.attrs.get(ATTRIBUTE)
     if isinstance(document, str):
-        document = json.loads(document)
+        try:
+            document = json.loads(document)
+        except ValueError as error:
+            raise MeasurementError(f"attrs['{ATTRIBUTE}'] is no JSON ({error})") from error
     if not isinstance(document, dict) or document.get("kind") not in _COLUMNS:
         return None
     columns = list(_COLUMNS[document["kind"]])

@@ -14,7 +14,7 @@ try:
     from tmlattice.network.stored import load_network, save_network
     from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
     from tmlattice.network.symplectic_network import SymplecticNetwork
-except ModuleNotFoundError as error:  # torch, of which a diagnosis needs nothing
+except ModuleNotFoundError as error:  # torch, which a diagnosis does not need
     raise missing_package(error, "networks, and fits of their weights, need", "network") from error
 
 __all__ = [

@@ -16,7 +16,7 @@ Tensors = tuple[Tensor, ...]
 
 
 class BackEnd(Protocol):
-    """What runs the sweeps.
+    """Implementation of the sweeps on a device.
 
     Attributes:
         r: read-outs [monitor, 2, 1 + n + n (n + 1) / 2], see `plain_pass`.
@@ -27,14 +27,14 @@ class BackEnd(Protocol):
     start: Tensor
 
     def forward(self, launch: Tensor, weights: Tensors) -> tuple[Tensor, Tensor, Tensor]:
-        """Readings [batch, monitor, 2], states behind the last layer [batch, n], and what
-        `backward` needs besides."""
+        """Return readings [batch, monitor, 2], states behind the last layer [batch, n], and data
+        for `backward`."""
 
     def backward(
         self, launch: Tensor, weights: Tensors, kept: Tensor, pulls: Tensors, wanted: bool
     ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
-        """Gradients by the launch and, if wanted, by the weights, from those by the readings and
-        by the last states."""
+        """Return gradients by the launch and, if wanted, by the weights, from those by the readings
+        and by the last states."""
 
 
 class Sweep(torch.autograd.Function):
@@ -50,7 +50,7 @@ class Sweep(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        """What the gradient needs."""
+        """Store the data for the gradient."""
         *tensors, ctx.back_end = inputs
         ctx.mark_non_differentiable(output[2])
         ctx.save_for_backward(*tensors, output[2])
@@ -66,7 +66,7 @@ class Sweep(torch.autograd.Function):
 
     @staticmethod
     def vmap(*_: Any) -> Any:
-        """Refused: a launch is a batch already."""
+        """Raise: a launch is a batch already."""
         raise NotImplementedError(
             "torch.func.vmap cannot batch a network: give it all launches at once, [batch, n], or "
             "use tmlattice.network.plain_readings, which is made of torch's own operations"
@@ -74,7 +74,7 @@ class Sweep(torch.autograd.Function):
 
     @staticmethod
     def jvp(*_: Any) -> Any:
-        """Refused: the sweeps carry gradients back, not forward."""
+        """Raise: the sweeps carry gradients backwards only."""
         raise NotImplementedError(
             "a network has no forward-mode derivative (jvp, jacfwd, hessian): use torch.func.vjp "
             "or torch.autograd, network.one_turn_map for matrices, or "

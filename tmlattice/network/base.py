@@ -1,4 +1,4 @@
-"""What every network has: launches as tensors or arrays, states and turns of its chain."""
+"""Common part of networks: launches as tensors or arrays, states and turns of the chain."""
 
 from collections.abc import Callable
 from typing import Self
@@ -14,19 +14,19 @@ Array = NDArray[np.float64]
 
 
 class NetworkChain(torch.nn.Module, LayerChain):
-    """What every network has: launches as tensors or arrays; states and turns of its chain."""
+    """Common part of networks: launches as tensors or arrays; states and turns of the chain."""
 
     W0: torch.nn.Parameter
     DEVICES: tuple[str, ...] = ("cpu",)
 
     def extra_repr(self) -> str:
-        """For print(network)."""
+        """Return the text for print(network)."""
         return (
             f"layers={len(self.layers)}, monitors={len(self.monitors)}, dimension={self.dimension}"
         )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """What `.to`, `.float`, `.cuda`, ... do with every tensor.
+        """Apply `.to`, `.float`, `.cuda`, ... to every tensor.
 
         Raises:
             TypeError: another type than float64, or a device without sweeps.
@@ -60,7 +60,7 @@ class NetworkChain(torch.nn.Module, LayerChain):
         return np.asarray(self._launch(launch).detach().cpu().numpy())
 
     def readings(self, launch: ArrayLike | Tensor) -> Array:
-        """(x, y) of every monitor on one pass as an array, [batch, monitor, 2], m.
+        """Return (x, y) at every monitor on one pass as an array, [batch, monitor, 2], m.
 
         Raises:
             BeamLostError: names the layer where a trajectory was lost.

@@ -26,7 +26,7 @@ Measured on one H100, docs/results/gpu.json."""
 
 
 def _curved(w: Tensor) -> Tensor:
-    """Which polynomials [layer, row, coefficient] have a second order, [layer]."""
+    """Whether the polynomials [layer, row, coefficient] have a second order, [layer]."""
     n = (round((8 * w.shape[-1] + 1) ** 0.5) - 3) // 2
     return (w[..., 1 + n :] != 0).flatten(1).any(dim=1).to(torch.int32)
 
@@ -36,13 +36,13 @@ def _ceil(count: int, size: int) -> int:
 
 
 def _on(tensor: Tensor) -> AbstractContextManager[Any]:
-    """Triton starts kernels on the current device."""
+    """Set the current device, on which Triton starts kernels."""
     return torch.cuda.device_of(tensor)  # type: ignore[no-untyped-call]
 
 
 def _programs(states: Tensor, kernel: str) -> tuple[tuple[int], dict[str, int]]:
-    """The grid, and the constants, for states [..., batch]: few trajectories to a program where
-    there are few for the card's schedulers, four on each multiprocessor."""
+    """The grid and the constants for states [..., batch]: small programs if there are too few
+    trajectories for the card's schedulers, four on each multiprocessor."""
     options = dict(CONFIGURATION[kernel])
     batch = states.shape[-1]
     while options["BLOCK"] > 32 and batch < 4 * _multiprocessors(states) * options["BLOCK"]:
@@ -55,7 +55,7 @@ def _multiprocessors(tensor: Tensor) -> int:
 
 
 def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
-    """States [batch, turns + 1, n] at the start of every turn, from launch [batch, n].
+    """Return states [batch, turns + 1, n] at the start of every turn, from launch [batch, n].
 
     Args:
         launch: on the card.
@@ -69,7 +69,7 @@ def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
     options.setdefault("UNROLL", max(options["BLOCK"] // 64, 1))  # layers in a row, as measured
     if missing := -len(w) % options["UNROLL"]:
         still = torch.eye(n, w.shape[2] - 1, dtype=w.dtype, device=w.device)
-        still = torch.nn.functional.pad(still, (1, 0))  # a layer that changes nothing
+        still = torch.nn.functional.pad(still, (1, 0))  # an identity layer
         w = torch.cat([w, still.expand(missing, -1, -1)])
     curved = _curved(w)
     skip = bool(curved.sum() < 0.9 * len(w))
@@ -79,9 +79,9 @@ def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
 
 
 class TritonSweep:
-    """See `autograd.BackEnd`. Nothing is kept from the forward sweep: the states are found once
-    more, a part of the trajectories at a time, so that a quarter of the card's memory is enough for
-    any batch."""
+    """See `autograd.BackEnd`. The forward sweep stores nothing: the states are computed again, a
+    part of the trajectories at a time, so that a quarter of the card's memory is enough for any
+    batch."""
 
     def __init__(self, r: Tensor, start: Tensor) -> None:
         self.r, self.start = r, start
@@ -156,9 +156,9 @@ def _parts(launch: Tensor, layers: int) -> Iterator[slice]:
 
 
 def sums(states: Tensor, adjoint: Tensor) -> Tensor:
-    """The gradient by the weights, [layer, n, 1 + n + n (n + 1) / 2]."""
+    """Return the gradient by the weights, [layer, n, 1 + n + n (n + 1) / 2]."""
     steps, n, batch = states.shape
-    rows = 4 if n == 4 else 2  # as many sums as registers hold
+    rows = 4 if n == 4 else 2  # as many sums as fit into registers
     parts = _ceil(batch, CONFIGURATION["sums"]["PART"])
     partial = states.new_empty(parts, steps - 1, n, (n + 1) * (n + 2) // 2)
     with _on(states):

@@ -1,4 +1,4 @@
-"""A network of which only some layers may move, in named groups for an optimiser."""
+"""A network with some free layers, in named groups for an optimiser."""
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -12,7 +12,7 @@ from tmlattice.network.network import TaylorNetwork
 
 
 class FreeLayers(torch.nn.Module):
-    """A network whose parameters are the weights of chosen layers; all others stay as they are.
+    """A network whose parameters are the weights of chosen layers; all others are fixed.
 
     >>> part = FreeLayers(network, {"defocusing": "qd*", "sextupoles": "sextupole"})
     >>> optimiser = torch.optim.Adam([
@@ -21,11 +21,11 @@ class FreeLayers(torch.nn.Module):
     ... ])
 
     Args:
-        network: where they start; it is left as it is.
+        network: initial weights; it is not changed.
         groups: for every name of a group a kind of magnet ("quadrupole"), a pattern of names
             ("qd*"), or names.
-        weights: which of W0, W1, W2 move. A magnet without a field on the axis has no W0, and free
-            kicks explain any orbit: by default they stay.
+        weights: free ones of W0, W1, W2. A magnet without a field on the axis has no W0, and free
+            kicks explain any orbit: by default they are fixed.
 
     Attributes:
         groups: parameters by group, then by weight, [layer of the group, ...].
@@ -63,7 +63,7 @@ class FreeLayers(torch.nn.Module):
             )
 
     def merged(self) -> TaylorNetwork:
-        """A network of its own with the weights as they are now."""
+        """Return a copy of the network with the present weights."""
         new = self.network.copy()
         with torch.no_grad():
             for name, weight in self._weights().items():
@@ -73,7 +73,7 @@ class FreeLayers(torch.nn.Module):
     def forward(
         self, launch: ArrayLike | Tensor, turns: int | None = None, *, on_lost: str = "raise"
     ) -> Tensor:
-        """Readings, see `TaylorNetwork.forward`."""
+        """Return readings, see `TaylorNetwork.forward`."""
         options = {"turns": turns, "on_lost": on_lost}
         readings: Tensor = torch.func.functional_call(
             self.network, self._weights(), (launch,), options

@@ -1,4 +1,4 @@
-"""Hamiltonian polynomials as layer parameters: their order, their flow's field, their physics.
+"""Hamiltonian polynomials as layer parameters: their order, their field, their multipoles.
 
 A generator is H(x) = sum g_i x_i + sum g_ij x_i x_j + sum g_ijk x_i x_j x_k (i <= j <= k), without
 the constant, as one row g in the reduced Kronecker order, degree by degree: 34 numbers for four
@@ -31,7 +31,7 @@ def exponents(n: int) -> tuple[tuple[int, ...], ...]:
 
 @functools.cache
 def field_matrix(n: int) -> Array:
-    """[n, 1 + n + n (n + 1) / 2, coefficient]: the field's Taylor coefficients from g."""
+    """Return [n, 1 + n + n (n + 1) / 2, coefficient]: the field's Taylor coefficients from g."""
     lower = [row for degree in range(DEGREE) for row in kronecker_exponents(n, degree)]
     place = {row: i for i, row in enumerate(lower)}
     gradient = np.zeros((n, len(lower), len(exponents(n))))
@@ -47,8 +47,8 @@ def field_matrix(n: int) -> Array:
 
 @functools.cache
 def _by_degree(n: int) -> list[tuple[slice, Array]]:
-    """For c, A, Q: the coefficients that they come from, of one degree each, and `field_matrix`
-    between them, [coefficient, n * column]."""
+    """Coefficients of one degree for each of c, A, Q, and `field_matrix` between them,
+    [coefficient, n * column]."""
     parts, column, first = [], 0, 0
     for degree in range(1, DEGREE + 1):
         width = len(kronecker_exponents(n, degree - 1))
@@ -61,7 +61,7 @@ def _by_degree(n: int) -> list[tuple[slice, Array]]:
 
 
 def field(generator: Array) -> tuple[Array, Array, Array]:
-    """c [layer, n], A [layer, n, n], Q [layer, n, n (n + 1) / 2] of S grad H, for each layer.
+    """Return c [layer, n], A [layer, n, n], Q [layer, n, n (n + 1) / 2] of S grad H by layer.
 
     Args:
         generator: [layer, coefficient].
@@ -74,7 +74,7 @@ def field(generator: Array) -> tuple[Array, Array, Array]:
 
 
 def pull_field(c: Array, A: Array, Q: Array) -> Array:
-    """The transpose of `field`: gradients with respect to c, A, Q as one to g."""
+    """Return the transpose of `field`: gradients by c, A, Q as one by g."""
     n = c.shape[1]
     parts = zip((c, A, Q), _by_degree(n), strict=True)
     rows = [part.reshape(len(c), -1) @ matrix.T for part, (_, matrix) in parts]
@@ -82,10 +82,10 @@ def pull_field(c: Array, A: Array, Q: Array) -> Array:
 
 
 def dimension_of(coefficients: int) -> int:
-    """Coordinates of a generator with this many coefficients.
+    """Return the number of coordinates of a generator with this many coefficients.
 
     Raises:
-        ValueError: no generator of degree three has so many.
+        ValueError: no generator of degree three has this number.
     """
     for n in (4, 6):
         if len(exponents(n)) == coefficients:
@@ -94,7 +94,7 @@ def dimension_of(coefficients: int) -> int:
 
 
 def nearest_symplectic(W1: Array) -> Array:
-    """Symplectic matrices near W1 [layer, n, n], by Newton's iteration for the polar part.
+    """Return symplectic matrices near W1 [layer, n, n], by Newton's iteration for the polar part.
 
     Raises:
         ValueError: a matrix too far from symplectic (names the layer).
@@ -120,10 +120,10 @@ def nearest_symplectic(W1: Array) -> Array:
 
 
 def cubic_generator(W1: Array, W2: Array) -> Array:
-    """Generators [layer, coefficient] of the second-order parts of layers, at the layers' exits.
+    """Return generators [layer, coefficient] of layers' second-order parts, at the layers' exits.
 
     A layer W1 x + W2 x^[2] is u + Q u^[2] with u = W1 x. Where the layer is symplectic to second
-    order, Q u^[2] is a Hamiltonian field; what is not (2e-6 of OCELOT's T) is left out.
+    order, Q u^[2] is a Hamiltonian field; the rest (2e-6 of OCELOT's T) is ignored.
 
     Args:
         W1: [layer, n, n], symplectic.
@@ -144,30 +144,16 @@ def cubic_generator(W1: Array, W2: Array) -> Array:
     return generator
 
 
-def quadratic_generator(matrix: Array) -> Array:
-    """Generator [coefficient] whose linear field is a Hamiltonian `matrix` [n, n] (S-symmetric
-    part taken)."""
-    n = len(matrix)
-    hessian = symplectic_form(n).T @ matrix
-    hessian = 0.5 * (hessian + hessian.T)
-    generator = np.zeros(len(exponents(n)))
-    for k, row in enumerate(exponents(n)):
-        if sum(row) == 2:
-            i, j = (v for v, e in enumerate(row) for _ in range(e))
-            generator[k] = hessian[i, j] * (0.5 if i == j else 1.0)
-    return generator
-
-
 def multipoles(generator: Array) -> dict[str, Array]:
-    """Integrated multipoles of generators, from their terms in x and y alone.
+    """Return integrated multipoles of generators, from their terms in x and y alone.
 
     Args:
         generator: [layer, coefficient].
 
     Returns:
         {"kick_x", "kick_y" (rad), "gradient", "skew_gradient" (k1 L, 1/m), "sextupole",
-        "skew_sextupole" (k2 L, 1/m2)}, each [layer]. What no multipole has (an x^2 + y^2 part) is
-        left out.
+        "skew_sextupole" (k2 L, 1/m2)}, each [layer]. Parts that no multipole has (x^2 + y^2) are
+        ignored.
     """
     n = dimension_of(generator.shape[-1])
     place = {row: i for i, row in enumerate(exponents(n))}

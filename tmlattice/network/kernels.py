@@ -17,14 +17,14 @@ import triton.language as tl
 
 @triton.constexpr_function
 def _pair(i: int, j: int, n: int) -> int:
-    """Place of x_i x_j in the reduced Kronecker order."""
+    """Index of x_i x_j in the reduced Kronecker order."""
     i, j = min(i, j), max(i, j)
     return i * n - i * (i - 1) // 2 + j - i
 
 
 @triton.jit
 def _load(at, stride, n: tl.constexpr, inside):
-    """n rows as a tuple; zeros outside. They stay out of the first cache: it is for weights."""
+    """Load n rows as a tuple; zeros outside. They bypass the first cache, which is for weights."""
     x = ()
     for i in tl.static_range(n):
         x = x + (tl.load(at + i * stride, mask=inside, other=0.0, cache_modifier=".cg"),)
@@ -39,7 +39,7 @@ def _store(at, stride, x, n: tl.constexpr, inside):
 
 @triton.jit
 def _ahead(w, n: tl.constexpr):
-    """One number of every cache line of the layer at w: all warps would wait for each line."""
+    """Load one number of every cache line of the layer at w: all warps would wait for each."""
     place = 8 * tl.arange(0, 32)
     return tl.load(w + place, mask=place < n * (n + 1) * (n + 2) // 2, other=0.0)
 
@@ -111,7 +111,7 @@ def track(
     UNROLL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Fill history[1:] [turn, n, batch] from history[0]; the layers are a multiple of UNROLL, and
-    `curved` is looked at only with SKIP."""
+    `curved` is read only with SKIP."""
     width: tl.constexpr = (n + 1) * (n + 2) // 2
     own = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = own < batch
@@ -134,7 +134,7 @@ def track(
 
 @triton.jit
 def _read(r, bent, first, last, x, readings, batch, own, inside, n: tl.constexpr):
-    """Readings of the monitors first to last - 1, that hang on one exit."""
+    """Return readings of the monitors first to last - 1, at one exit."""
     width: tl.constexpr = (n + 1) * (n + 2) // 2
     for m in range(first, last):
         y = _image(r + m * 2 * width, tl.load(bent + m), x, 2, n)
@@ -175,7 +175,7 @@ def forward(
 
 @triton.jit
 def _sense(r, bent, first, last, x, below, pulls, by_monitor, by_plane, inside, n: tl.constexpr):
-    """Add to d loss / d x what the monitors of one exit contribute."""
+    """Add the contribution of the monitors at one exit to d loss / d x."""
     width: tl.constexpr = (n + 1) * (n + 2) // 2
     for m in range(first, last):
         up = _load(pulls + m * by_monitor.to(tl.int64), by_plane, 2, inside)
@@ -221,7 +221,7 @@ def reverse(
         entrance = _load(x_at, batch, n, inside)
         up = _pull(w + k * n * width, tl.load(curved + k), x, up, n, n)
         first = tl.load(start + k)
-        last = tl.load(start + k + 1)  # not carried from the step before: Triton 3.6 loses it
+        last = tl.load(start + k + 1)  # not carried from the previous step: Triton 3.6 loses it
         up = _sense(r, bent, first, last, x, up, pulls, by_monitor, by_plane, inside, n)
         if KEEP:
             at -= n * batch

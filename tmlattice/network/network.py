@@ -9,13 +9,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from tmlattice.beam import sweeps
 from tmlattice.beam.aperture import APERTURE, lost_beam
 from tmlattice.beam.chain import Chain
+from tmlattice.beam.sweeps import curved
 from tmlattice.errors import missing_package, unknown_choice
 from tmlattice.maps import RingMaps
-from tmlattice.network.autograd import BackEnd, Sweep
+from tmlattice.network.autograd import BackEnd, Sweep, Tensors
 from tmlattice.network.base import NetworkChain
-from tmlattice.network.compiled_sweep import CompiledSweep
 from tmlattice.network.reference import monomials, packed, plain_pass
 from tmlattice.network.symplectic_network import SymplecticNetwork
 
@@ -23,10 +24,58 @@ Array = NDArray[np.float64]
 
 
 class OnLost(StrEnum):
-    """What a lost trajectory does."""
+    """Treatment of a lost trajectory."""
 
     RAISE = "raise"
     INF = "inf"
+
+
+class CompiledSweep:
+    """See `autograd.BackEnd`; the forward sweep stores the states of all exits."""
+
+    def __init__(self, maps: RingMaps, r: Tensor, start: Tensor) -> None:
+        self.maps, self.r, self.start = maps, r, start
+
+    def forward(self, launch: Tensor, weights: Tensors) -> tuple[Tensor, Tensor, Tensor]:
+        """One pass through all layers."""
+        batch, n = launch.shape
+        W0, W1, W2 = (w.detach().numpy() for w in weights)
+        size = sweeps.size_of(n, batch)
+        packed = sweeps.pack(launch.detach().numpy(), len(size[1]))
+        states = np.empty((len(packed), len(W0) + 1, *packed.shape[1:]))
+        states[:, 0] = packed
+        sweeps.run(sweeps.forward, len(packed), size, W0, W1, W2, curved(W2), states)
+        maps = self.maps
+        readings = np.empty((len(packed), len(maps.at), 2, len(size[1])))
+        out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
+        sweeps.run(sweeps.read, len(packed), size, *out, states, readings)
+        end = sweeps.unpack(states[:, -1], batch)
+        return (
+            torch.from_numpy(sweeps.unpack(readings, batch)),
+            torch.from_numpy(end),
+            torch.from_numpy(states),
+        )
+
+    def backward(
+        self, launch: Tensor, weights: Tensors, kept: Tensor, pulls: Tensors, wanted: bool
+    ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
+        """The adjoint sweep, then sums over trajectories."""
+        batch, n = launch.shape
+        _, W1, W2 = (w.detach().numpy() for w in weights)
+        states, size, maps = kept.numpy(), sweeps.size_of(n, batch), self.maps
+        packed, end = (sweeps.pack(p.contiguous().numpy(), len(size[1])) for p in pulls)
+        adjoint = np.empty_like(states)
+        adjoint[:, -1] = end
+        sweeps.run(
+            sweeps.reverse, len(states), size, W1, W2, curved(W2), maps.R1, maps.R2,
+            curved(maps.R2), maps.start, states, packed, adjoint,
+        )  # fmt: skip
+        gradients: tuple[Tensor | None, ...] = (None, None, None)
+        if wanted:
+            sums = np.zeros(W1.shape[:2]), np.zeros_like(W1), np.zeros_like(W2)
+            sweeps.run(sweeps.weights, len(W1), size, states, adjoint, *sums)
+            gradients = tuple(torch.from_numpy(g) for g in sums)
+        return torch.from_numpy(sweeps.unpack(adjoint[:, 0], batch)), gradients
 
 
 class TaylorNetwork(NetworkChain, Chain):
@@ -36,7 +85,7 @@ class TaylorNetwork(NetworkChain, Chain):
     exit of magnet k. States are OCELOT's (x, px, y, py), or (x, px, y, py, tau, p), in m and
     units of the reference momentum. All weights are float64 and of their layer alone.
 
-    `network.to("cuda")` moves it to a graphics card, and everything that it does runs there.
+    `network.to("cuda")` moves it, and all its computations, to a graphics card.
 
     Args:
         maps: weights and read-outs of a ring.
@@ -45,7 +94,7 @@ class TaylorNetwork(NetworkChain, Chain):
         W0: [layer, n], parameter.
         W1: [layer, n, n], parameter.
         W2: [layer, n, n (n + 1) / 2], parameter, in the order x1^2, x1 x2, ..., xn^2.
-        maps, ring: what it was made from; names and places of layers and monitors.
+        maps, ring: arguments; names and places of layers and monitors.
 
     Source: A. Ivanov, I. Agapov, Phys. Rev. Accel. Beams 23 (2020) 074601, for the architecture.
     """
@@ -63,7 +112,7 @@ class TaylorNetwork(NetworkChain, Chain):
         self.W2 = torch.nn.Parameter(torch.from_numpy(maps.W2.copy()))
         read_outs = (torch.from_numpy(r) for r in (maps.R0, maps.R1, maps.R2))
         closing = (torch.from_numpy(c) for c in maps.closing.coefficients)
-        for name, fixed in (  # these follow `.to`, and are no part of `state_dict`
+        for name, fixed in (  # moved by `.to`, and no part of `state_dict`
             ("_read_outs", packed(*read_outs)),
             ("_closing", packed(*closing)),
             ("_first_monitor", torch.from_numpy(maps.start)),
@@ -71,27 +120,26 @@ class TaylorNetwork(NetworkChain, Chain):
             self.register_buffer(name, fixed, persistent=False)
 
     def symplectic(self) -> SymplecticNetwork:
-        """The same ring in layers that are symplectic exactly, and stay so whatever is fitted.
+        """Return the same ring in layers that are symplectic for any parameters.
 
         See `SymplecticNetwork`.
         """
         return SymplecticNetwork.from_network(self)
 
     def weights(self) -> tuple[Array, Array, Array]:
-        """W0, W1, W2 as numpy arrays; on the CPU they share the parameters' memory: do not change
-        them."""
+        """W0, W1, W2 as numpy arrays; on the CPU they share the parameters' memory: read-only."""
         W0, W1, W2 = (w.detach().cpu().numpy() for w in (self.W0, self.W1, self.W2))
         return W0, W1, W2
 
     def copy(self) -> "TaylorNetwork":
-        """A network of its own with the same weights."""
+        """Return a copy with the same weights."""
         new = TaylorNetwork(self.maps).to(self.W0.device)
         new.ring = self.ring
         new.load_state_dict(self.state_dict())
         return new
 
     def sweep(self) -> BackEnd:
-        """What runs the sweeps on the device of the weights."""
+        """Back end for the device of the weights."""
         if self.W0.is_cuda:
             on_card: BackEnd = _cuda().TritonSweep(self._read_outs, self._first_monitor)
             return on_card
@@ -104,15 +152,15 @@ class TaylorNetwork(NetworkChain, Chain):
         *,
         on_lost: OnLost | str = "raise",
     ) -> Tensor:
-        """Readings of every monitor, differentiable by launch and weights.
+        """Return readings of every monitor, differentiable by launch and weights.
 
         First derivatives are fast. Second ones (`create_graph=True`) are exact and take seconds:
         they come from a loop of torch operations (`plain_readings`). Of `torch.func`, `grad` and
-        `vjp` work; `vmap` and `jvp` are refused.
+        `vjp` work; `vmap` and `jvp` raise errors.
 
         Args:
             launch: states at the start of the ring, [batch, n].
-            turns: how many turns are read; None: the first one, without an axis for it.
+            turns: number of turns; None: the first one, without an axis for it.
             on_lost: "raise" an error for a lost trajectory, or let its readings be "inf" from that
                 turn on: it then adds nothing to a gradient.
 
@@ -121,13 +169,13 @@ class TaylorNetwork(NetworkChain, Chain):
 
         Raises:
             BeamLostError: names the layer where a trajectory was lost.
-            ChoiceError: another word for `on_lost`.
+            ChoiceError: another value of `on_lost`.
             ValueError: a launch of another shape, or no turn.
         """
         if on_lost not in (known := [choice.value for choice in OnLost]):
             raise unknown_choice("on_lost", on_lost, known)
         if turns is not None and turns < 1:
-            raise ValueError(f"{turns} turns have no reading; read one at least")
+            raise ValueError(f"{turns} turns have no reading; read at least one")
         x = self._launch(launch)
         every = x.new_full((len(x), len(self.monitors), 2), torch.inf)
         rows = torch.arange(len(x), device=x.device)
@@ -171,7 +219,7 @@ def _cuda() -> Any:
 
 
 def plain_readings(network: TaylorNetwork, launch: Tensor) -> Tensor:
-    """Readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
+    """Return readings [batch, monitor, 2] of launch [batch, n] by a loop of torch operations.
 
     The same mathematics as `network(launch)`, differentiated by torch alone: any order, any
     `torch.func` transform.

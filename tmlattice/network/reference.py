@@ -1,6 +1,6 @@
-"""The network and its penalty in torch's own operations: obvious, differentiable to any order, and
-the referee of the compiled sweeps. The loop over layers is slow; the penalty, which has no loop, is
-what a graphics card uses."""
+"""The network and its penalty in torch's own operations, differentiable to any order: the reference
+of the compiled sweeps. The loop over layers is slow; the penalty has no loop and is also used on a
+graphics card."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,12 @@ from torch import Tensor
 
 
 def packed(W0: Tensor, W1: Tensor, W2: Tensor) -> Tensor:
-    """Coefficients of polynomials side by side, [..., row, 1 + n + n (n + 1) / 2]."""
+    """Return coefficients of polynomials side by side, [..., row, 1 + n + n (n + 1) / 2]."""
     return torch.cat([W0[..., None], W1, W2], dim=-1)
 
 
 def monomials(x: Tensor) -> Tensor:
-    """1, x_i, x_i x_j (i <= j) of states [batch, n], [batch, 1 + n + n (n + 1) / 2]."""
+    """Return 1, x_i, x_i x_j (i <= j) of states [batch, n], [batch, 1 + n + n (n + 1) / 2]."""
     i, j = torch.triu_indices(x.shape[1], x.shape[1], device=x.device)
     return torch.cat([torch.ones_like(x[:, :1]), x, x[:, i] * x[:, j]], dim=1)
 
@@ -22,7 +22,7 @@ def monomials(x: Tensor) -> Tensor:
 def plain_pass(
     launch: Tensor, weights: Sequence[Tensor], r: Tensor, start: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Readings [batch, monitor, 2] and the states behind the last layer [batch, n].
+    """Return readings [batch, monitor, 2] and the states behind the last layer [batch, n].
 
     Args:
         launch: [batch, n].
@@ -42,7 +42,7 @@ def plain_pass(
 
 
 def plain_coefficients(W1: Tensor, W2: Tensor, form: Tensor) -> Tensor:
-    """`symplectic_coefficients` [layer, pair, entry], differentiable; form: S [n, n]."""
+    """Return `symplectic_coefficients` [layer, pair, entry], differentiable; form: S [n, n]."""
     layers, n, _ = W1.shape
     i, j = torch.triu_indices(n, n, device=W1.device)
     second = W2.new_zeros(layers, n, n, n)
@@ -63,7 +63,7 @@ def plain_coefficients(W1: Tensor, W2: Tensor, form: Tensor) -> Tensor:
 def plain_penalty_parts(
     W1: Tensor, W2: Tensor, form: Tensor, design: Tensor | None = None
 ) -> Tensor:
-    """`penalty_parts` [layer, 3]; form: S [n, n]."""
+    """Return `penalty_parts` [layer, 3]; form: S [n, n]."""
     n = W1.shape[1]
     M = plain_coefficients(W1, W2, form)
     squares = (M if design is None else M - design).square().sum(dim=2)

@@ -1,8 +1,8 @@
-"""What may change in a network, as many amounts at once: strengths of magnets, or generators.
+"""Spaces of changes of a network: strengths of magnets, or generators.
 
-A space moves its network's weights (`put`) and says what a unit of each amount does: the shift of
-the launch that would do the same (`shifts`), and the Hessian that it adds to the quadratic
-Hamiltonian (`hessians`).
+A space changes its network's weights (`put`) and gives the effect of a unit of each amount: the
+equivalent shift of the launch (`shifts`), and the Hessian that it adds to the quadratic Hamiltonian
+(`hessians`).
 """
 
 from collections.abc import Sequence
@@ -24,21 +24,21 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STRENGTH_RMS = 0.01
-"""A unit of a strength's amount, relative."""
+"""Unit of a strength's amount, relative."""
 
 GENERATOR_RMS = {1: 1e-7, 2: 1e-4, 3: 1e-3}
-"""A unit of a generator's coefficient by degree: a kick in rad, a gradient in 1/m, a sextupole in
+"""Unit of a generator's coefficient by degree: a kick in rad, a gradient in 1/m, a sextupole in
 1/m2."""
 
 
 class Space:
-    """Amounts that move a network.
+    """Amounts that change a network.
 
     Attributes:
-        network: of its own, moved.
+        network: a copy, which is changed.
         layer: of each amount, rising, [amount].
-        names: of the magnets where amounts are their strengths; else empty.
-        largest: no amount is larger.
+        names: of the magnets, if amounts are their strengths; else empty.
+        largest: largest amount.
     """
 
     network: TaylorNetwork | SymplecticNetwork
@@ -47,21 +47,21 @@ class Space:
     largest: float = np.inf
 
     def put(self, amounts: Array) -> None:
-        """Move the network to these amounts, [amount]."""
+        """Set the network to these amounts, [amount]."""
         raise NotImplementedError
 
     def shifts(self, amounts: Array, x: Array) -> tuple[Array, Array]:
-        """About these amounts and the launch x [n]: Jacobians of the exits M [layer + 1, n, n], and
-        the shift of the launch for a unit of each amount, [amount, n]."""
+        """Return Jacobians of the exits M [layer + 1, n, n] at these amounts and the launch x [n],
+        and the shift of the launch for a unit of each amount, [amount, n]."""
         raise NotImplementedError
 
     def hessians(self, amounts: Array) -> Array:
-        """Of the quadratic Hamiltonian, at the layer's exit, that a unit of each amount adds,
-        [amount, 4, 4]."""
+        """Return Hessians of the quadratic Hamiltonian, at the layer's exit, for a unit of each
+        amount, [amount, 4, 4]."""
         raise NotImplementedError
 
     def readings(self, amounts: Array, launches: Array) -> Array:
-        """Of the network with these amounts, [shot, monitor, 2], m.
+        """Return readings of the network with these amounts, [shot, monitor, 2], m.
 
         Raises:
             BeamLostError: names the layer.
@@ -82,13 +82,13 @@ class Strengths(Space):
         self.largest = 0.98 * LARGEST / STRENGTH_RMS
 
     def put(self, amounts: Array) -> None:
-        """OCELOT's layers of the magnets as changed."""
+        """Set OCELOT's layers of the changed magnets."""
         weights = self.known.weights(STRENGTH_RMS * amounts)
         for parameter, weight in zip(self.network.parameters(), weights, strict=True):
             parameter[self.layer] = torch.from_numpy(weight)
 
     def shifts(self, amounts: Array, x: Array) -> tuple[Array, Array]:
-        """By the exact derivatives of the layers."""
+        """Return the shifts from exact derivatives of the layers."""
         self.put(amounts)
         path, M, back = tangents(self.network, x)
         entrance = path[self.layer]
@@ -99,7 +99,7 @@ class Strengths(Space):
         return M, STRENGTH_RMS * np.einsum("jab,jb->ja", back[self.layer + 1], kick)
 
     def hessians(self, amounts: Array) -> Array:
-        """Of the change of each layer's matrix."""
+        """Return the Hessians of the change of each layer's matrix."""
         changes = STRENGTH_RMS * amounts
         rate = self.known.slopes(changes)[1] @ np.linalg.inv(self.known.weights(changes)[1])
         return np.asarray(STRENGTH_RMS * symplectic_form(4).T @ rate[:, :4, :4])
@@ -119,28 +119,28 @@ class Generators(Space):
         self.layer = np.repeat(np.arange(len(self.start)), len(rows))
 
     def put(self, amounts: Array) -> None:
-        """Symplectic whatever they are."""
+        """Set the generators; layers stay symplectic."""
         change = amounts.reshape(self.start.shape) * self.sizes
         self.network.generator.copy_(torch.from_numpy(self.start + change))
 
     def shifts(self, amounts: Array, x: Array) -> tuple[Array, Array]:
-        """By the flow's own derivatives."""
+        """Return the shifts from derivatives of the flow."""
         self.put(amounts)
         _, M, D = self.network.signatures(x)
         return M, np.ascontiguousarray((D * self.sizes).swapaxes(1, 2)).reshape(-1, len(x))
 
     def hessians(self, amounts: Array) -> Array:
-        """The same whatever the amounts."""
+        """Return the Hessians, which do not depend on the amounts."""
         n = self.network.dimension
         slope = np.moveaxis(field_matrix(n)[:, 1 : n + 1], 2, 0) * self.sizes[:, None, None]
         return np.tile(symplectic_form(4).T @ slope[:, :4, :4], (len(self.start), 1, 1))
 
 
 def tune_slopes(space: Space, amounts: Array) -> Array:
-    """d (tunes) / d (amounts) [2, amount], on the closed orbit, linear part.
+    """Return d (tunes) / d (amounts) [2, amount], on the closed orbit, linear part.
 
     A Hamiltonian with the Hessian h in a layer turns mode v by v^H h v / 2, in rad (v^H S v = 2 i);
-    a pure gradient k gives beta k / 2. What kicks do through sextupoles is left out.
+    a pure gradient k gives beta k / 2. The effect of kicks through sextupoles is ignored.
 
     Raises:
         UnstableRingError: no tune exists.

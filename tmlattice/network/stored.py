@@ -12,14 +12,14 @@ from tmlattice.network.network import TaylorNetwork
 
 
 def save_network(network: torch.nn.Module, path: Path) -> None:
-    """Write the parameters (W0, W1, W2) with torch; the lattice is not among them."""
+    """Write the parameters (W0, W1, W2) with torch, without the lattice."""
     content = BytesIO()
-    torch.save(network.state_dict(), content)  # into a file, torch ends a full disk in its own way
+    torch.save(network.state_dict(), content)  # to memory: torch's error for a full disk is unclear
     path.write_bytes(content.getvalue())
 
 
 def load_network(ring: Ring, path: Path) -> TaylorNetwork:
-    """The network of a ring with the weights of a file (tensors alone: nothing in it is run).
+    """Return the network of a ring with the weights of a file (tensors alone: no code is run).
 
     Raises:
         TmlatticeError: no such file, no network's, or one of a ring of other magnets.
@@ -35,5 +35,5 @@ def load_network(ring: Ring, path: Path) -> TaylorNetwork:
         network = TaylorNetwork.from_ring(ring, dimension)
         network.load_state_dict(weights)
     except Exception as error:
-        raise TmlatticeError(f"'{path}' does not hold {wanted}") from error
+        raise TmlatticeError(f"'{path}' does not contain {wanted}") from error
     return network

@@ -1,9 +1,9 @@
-"""How far layers are from symplectic, as a differentiable penalty.
+"""Symplectic defect of layers, as a differentiable penalty.
 
 The Jacobian of a second-order layer is linear in the state, J(x) = G_0 + sum_i x_i G_i with
 G_0 = W1 and G_i = d2 (image) / dx dx_i. So J(x)^T S J(x) - S is a quadratic polynomial in x, its
 coefficients M_uv (u <= v in 0, ..., n) come from pairs of these matrices, and it is antisymmetric:
-the strictly upper triangle holds all of it. The penalty is the sum of the squares of these
+its strictly upper triangle is sufficient. The penalty is the sum of the squares of these
 coefficients. In one plane they are the five equations of the paper and a sixth, the coefficient
 of x^2, which the paper omits; the factors are 1, 1, 1, 2, 4, 2.
 
@@ -48,8 +48,8 @@ def _gather(size, first, count, W1, W2, G):  # type: ignore[no-untyped-def]
 
 @jit
 def _coefficient(size, signs, G, u, v, first, count, design, M):  # type: ignore[no-untyped-def]
-    """M [b, c, lane], b < c: the coefficient of x_u x_v (x_0 = 1) in J^T S J - S, less the design's
-    where one is given (an array with layers)."""
+    """M [b, c, lane], b < c: the coefficient of x_u x_v (x_0 = 1) in J^T S J - S, less that of a
+    design, if given (an array with layers)."""
     n = len(size)
     entry = 0
     pair = u * (n + 1) - u * (u - 1) // 2 + v - u
@@ -148,7 +148,7 @@ def _pull(first_tile, last_tile, size, signs, W1, W2, design, pulls, g1, g2):  #
             for v in range(u, n + 1):
                 _coefficient(size, signs, G, u, v, first, count, design, M)
                 scale = twice[(u > 0) + (v > 0)]
-                for b in range(n):  # M is antisymmetric: filled up, its adjoint is one product
+                for b in range(n):  # M is antisymmetric: its adjoint is one product
                     for c in range(b + 1, n):
                         upper, lower = M[b, c], M[c, b]
                         for lane in range(_LANES):
@@ -214,7 +214,7 @@ class _Squares(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, pulls: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
-        """Its gradient; finding the coefficients once more is cheaper than keeping them."""
+        """Return its gradient; computing the coefficients again is cheaper than storing."""
         w1, w2 = (w.detach().contiguous().numpy() for w in ctx.saved_tensors)
         n = w1.shape[1]
         g1, g2 = np.zeros_like(w1), np.zeros_like(w2)
@@ -226,7 +226,7 @@ class _Squares(torch.autograd.Function):
 
 
 def symplectic_coefficients(W1: Tensor, W2: Tensor) -> Array:
-    """Coefficients of J(x)^T S J(x) - S as a polynomial in x, for each layer.
+    """Return coefficients of J(x)^T S J(x) - S as a polynomial in x, for each layer.
 
     Args:
         W1: [layer, n, n], float64.
@@ -247,11 +247,10 @@ def symplectic_coefficients(W1: Tensor, W2: Tensor) -> Array:
 
 
 def penalty_parts(W1: Tensor, W2: Tensor, design: Array | None = None) -> Tensor:
-    """Sums of squares of the constant, linear and quadratic coefficients, [layer, 3].
+    """Return sums of squares of the constant, linear and quadratic coefficients, [layer, 3].
 
-    A truncated map of a thick magnet meets the constant and the linear conditions (to about
-    2e-6), not the quadratic one: it is truncated. With `design` every part counts only what
-    departs from it.
+    A truncated map of a thick magnet fulfils the constant and the linear conditions (to about
+    2e-6), not the quadratic one. With `design` every part counts only the difference from it.
 
     Args:
         W1, W2: see `symplectic_coefficients`; differentiable.
@@ -269,5 +268,5 @@ def penalty_parts(W1: Tensor, W2: Tensor, design: Array | None = None) -> Tensor
 
 
 def symplectic_penalty(W1: Tensor, W2: Tensor, design: Array | None = None) -> Tensor:
-    """The penalty of each layer, [layer]: the sum of its `penalty_parts`; differentiable."""
+    """Return the penalty of each layer, [layer]: the sum of its `penalty_parts`; differentiable."""
     return penalty_parts(W1, W2, design).sum(dim=1)

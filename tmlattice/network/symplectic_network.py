@@ -83,13 +83,13 @@ def _moves(c: Array, A: Array, Q: Array) -> Flags:
 
 
 _SKEW = np.ones((4, 10), dtype=bool)
-"""Where Q of a generator that is even in (y, py) is zero."""
+"""Zeros of Q for a generator that is even in (y, py)."""
 _SKEW[:2, [0, 1, 4, 7, 8, 9]] = False
 _SKEW[2:, [2, 3, 5, 6]] = False
 
 
 def _flat(c: Array, A: Array, Q: Array) -> Flags:
-    """Where the field is purely of the second degree and keeps the mid-plane; four coordinates."""
+    """Whether the field is of pure second degree and keeps the mid-plane; four coordinates."""
     if c.shape[1] != 4:
         return np.zeros(len(c), dtype=bool)
     return np.asarray(~(c.any(axis=1) | A.any(axis=(1, 2)) | Q[:, _SKEW].any(axis=1)))
@@ -101,7 +101,7 @@ class SymplecticNetwork(NetworkChain):
     Layer k sends x to W0[k] + the flow, by one implicit-midpoint step, of generator[k] from
     W1[k] x. Any values of the parameters give a symplectic layer. The design's generators are
     cubic; they agree with the second-order layers to second order, and every long-term tracking
-    keeps its action. What is added to a generator reads as the magnet's error (`multipoles`).
+    keeps its action. A change of a generator is the magnet's error (`multipoles`).
 
     Args:
         maps: names, places and read-outs.
@@ -111,8 +111,8 @@ class SymplecticNetwork(NetworkChain):
 
     Attributes:
         W0, generator: parameters.
-        W1: a tensor that is not fitted: a generator's quadratic part does what a change of it does.
-        design: the generators as they were given, [layer, coefficient].
+        W1: a fixed tensor: a generator's quadratic part is equivalent to a change of it.
+        design: the given generators, [layer, coefficient].
     """
 
     W1: Tensor
@@ -128,12 +128,12 @@ class SymplecticNetwork(NetworkChain):
 
     @classmethod
     def from_network(cls, network: Chain) -> "SymplecticNetwork":
-        """Layers that agree with a network's to second order.
+        """Return layers that agree with a network's to second order.
 
         Args:
-            network: a design, or one that was fitted; its W1 are moved to the nearest symplectic
-                matrices (OCELOT's are symplectic to rounding), and of its W2 the part stays that a
-                generator can make.
+            network: a design, or a fitted one; its W1 are replaced by the nearest symplectic
+                matrices (OCELOT's are symplectic to rounding), and its W2 by their Hamiltonian
+                part.
 
         Raises:
             ValueError: a layer too far from symplectic.
@@ -145,7 +145,7 @@ class SymplecticNetwork(NetworkChain):
         return made
 
     def copy(self) -> "SymplecticNetwork":
-        """A network of its own with the same parameters and the same design."""
+        """Return a copy with the same parameters and the same design."""
         W1 = self.W1.numpy()
         new = SymplecticNetwork(self.maps, self.W0.detach().numpy(), W1, self.design.numpy())
         new.load_state_dict(self.state_dict())
@@ -153,19 +153,19 @@ class SymplecticNetwork(NetworkChain):
         return new
 
     def symplectic(self) -> "SymplecticNetwork":
-        """Itself."""
+        """Return itself."""
         return self
 
     def correction(self) -> Array:
-        """What was added to the design's generators, [layer, coefficient]."""
+        """Change of the design's generators, [layer, coefficient]."""
         return np.asarray((self.generator - self.design).detach().numpy())
 
     def multipoles(self) -> dict[str, Array]:
-        """The correction of each layer as multipoles, see `network.generators.multipoles`."""
+        """Return the correction of each layer as multipoles, see `generators.multipoles`."""
         return multipoles(self.correction())
 
     def forward(self, launch: ArrayLike | Tensor) -> Tensor:
-        """Readings of every monitor on one pass, [batch, monitor, 2], m; differentiable.
+        """Return readings of every monitor on one pass, [batch, monitor, 2], m; differentiable.
 
         Raises:
             BeamLostError: names the layer where a trajectory was lost, or whose generator is so
@@ -185,7 +185,7 @@ class SymplecticNetwork(NetworkChain):
         sweeps.run(flows.forward, len(states), size, *self._fields(), states, middles)
 
     def _one_turn_fields(self) -> tuple[Array, Array, Array, Array, Array, Flags, Flags]:
-        """The fields of all layers, and of the way to the ring's end as a last one."""
+        """The fields of all layers, and of the drift to the ring's end as a last one."""
         closing = [w[None] for w in self.maps.closing.coefficients]
         W1 = nearest_symplectic(closing[1])
         c, A, Q = field(cubic_generator(W1, closing[2]))
@@ -196,20 +196,20 @@ class SymplecticNetwork(NetworkChain):
 
     def _track(self, size: sweeps.Size, history: Array) -> None:
         W0, W1, *fields, moves, flat = self._one_turn_fields()
-        # Inside a turn nobody looks: matrices that follow each other are multiplied.
+        # Inside a turn consecutive matrices are multiplied.
         ends = np.flatnonzero(moves | W0.any(axis=1))
         ends = np.unique([*ends, len(W1) - 1])
         rest = (w[ends] for w in (*fields, moves, flat))
         sweeps.run(flows.track, len(history), size, W0[ends], merged(W1, ends), *rest, history)
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and the matrices
-        from the start to there, d state / d launch, [layer + 2, n, n]."""
+        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state / d
+        launch there, [layer + 2, n, n]."""
         path, steps = self.jacobians(x)
         return path, products(steps)
 
     def jacobians(self, x: Array) -> tuple[Array, Array]:
-        """The same states, and the Jacobian of every layer alone and of the closing way."""
+        """Return the same states, and the Jacobian of every layer and of the closing drift."""
         path, _, slopes, W1 = self._slopes(x)
         half, one = 0.5 * slopes, np.eye(self.dimension)
         return path, np.asarray(np.linalg.solve(one - half, (one + half) @ W1), dtype=float)
@@ -227,13 +227,13 @@ class SymplecticNetwork(NetworkChain):
         return path, middle, slopes, W1
 
     def signatures(self, x: Array) -> tuple[Array, Array, Array]:
-        """What a small change of every generator does on the trajectory from x [n].
+        """Return the effect of a small change of every generator on the trajectory from x [n].
 
         Returns:
             The exits' states [layer + 1, n]; M [layer + 1, n, n], the Jacobian of every exit by
-            the launch; D [layer, n, coefficient], the shift of the launch that does the same as
-            a change of the layer's generator. A reading R at exit a moves with layer k < a by
-            R M[a] D[k]: carried back by the symplectic inverse of M, forward by M.
+            the launch; D [layer, n, coefficient], the shift of the launch equivalent to a change of
+            the layer's generator. A reading R at exit a changes by layer k < a by R M[a] D[k]:
+            carried back by the symplectic inverse of M, forward by M.
         """
         path, middle, slopes, W1 = self._slopes(x)
         layers = len(self.layers)

@@ -1,1 +1,1 @@
-"""What a measurement of each kind says of beam and effects: from files to rows."""
+"""Measurements of each kind as inference problems: residuals, Jacobians, noise, nuisances."""

@@ -73,7 +73,7 @@ def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
         if element.kind != "monitor" and element.kind not in CORRECTORS:
             wrong = f"is a {element.kind}, and has no place there"
         elif element.name in found:
-            wrong = "stands twice"
+            wrong = "occurs twice"
         elif not np.isfinite(both).all():
             wrong = "is no number"
         else:
@@ -256,5 +256,5 @@ def _once(causes: Iterable[Cause]) -> None:
     for cause in causes:
         place = cause.element or "the beam"
         if (key := (cause.effect, place.casefold())) in seen:
-            raise EffectError(f"the effect {cause.effect} of '{place}' stands twice; keep one")
+            raise EffectError(f"the effect {cause.effect} of '{place}' occurs twice; keep one")
         seen.add(key)

@@ -261,7 +261,7 @@ class FirstTurns(Problem):
             return self
         return replace(self, data=self.data.without(dropped), white=None)
 
-    # --- beside the search ----------------------------------------------------------------------
+    # --- outside the search ---------------------------------------------------------------------
     def _residual(self, readings: Array, launches: Array) -> Array:
         difference = np.where(self.data.valid, self.data.readings - readings, 0.0)
         return self.whitening.residual(difference, launches)

@@ -305,10 +305,10 @@ class GlobalErrors:
     def verdicts(self, most: int = 3) -> list[Verdict]:
         """Return global errors one after another, each with those before it corrected."""
         found: list[Verdict] = []
-        judge = self
-        while len(found) < most and (own := judge.verdict()) is not None:
+        search = self
+        while len(found) < most and (own := search.verdict()) is not None:
             found.append(own)
-            judge = judge.corrected(own.names)
+            search = search.corrected(own.names)
         return found
 
     def corrected(self, names: Names) -> "GlobalErrors":

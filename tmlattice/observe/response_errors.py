@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
-from tmlattice.observe.predict import predict
 from tmlattice.observe.response_rf import read
 
 Array = NDArray[np.float64]
@@ -175,10 +175,10 @@ class ResponseGlobalErrors:
     def verdicts(self, most: int = 4) -> list[ResponseVerdict]:
         """Return global errors one after another, each with those before it corrected."""
         found: list[ResponseVerdict] = []
-        judge = self
-        while len(found) < most and (own := judge.verdict()) is not None:
+        search = self
+        while len(found) < most and (own := search.verdict()) is not None:
             found.append(own)
-            judge = judge.corrected(own.names)
+            search = search.corrected(own.names)
         return found
 
     def corrected(self, names: Names) -> "ResponseGlobalErrors":
@@ -191,3 +191,32 @@ class ResponseGlobalErrors:
 
 TINY = 1e-6
 """Relative RF step used in place of a step of 1."""
+
+
+def predict(model: ResponseModel, measured: OrbitResponse) -> OrbitResponse:
+    """Return the model's orbit changes for the same correctors, kicks, monitors and RF step.
+
+    It is linear in kicks and step, and has no missing readings.
+
+    Args:
+        model: with six coordinates if the RF was stepped.
+        measured: for its names, kicks and RF step.
+
+    Raises:
+        UnknownNameError: a corrector or a monitor that is not in the ring.
+        MeasurementError: a corrector of another plane, or an element that is not a corrector.
+    """
+    columns = model.columns(measured.correctors)
+    for name, plane, own in zip(measured.correctors, measured.planes, columns.planes, strict=True):
+        if plane != own:
+            raise MeasurementError(
+                f"corrector '{name}' is stated to kick in {plane}; the ring's kicks in {own}"
+            )
+    order = {name: i for i, name in enumerate(model.monitors)}
+    ring = model.ring
+    at = [order[ring[name].name] for name in measured.monitors]
+    response = model.response(measured.correctors)[:, at]
+    rf = measured.rf
+    if rf is not None and model.dimension == 6:
+        rf = replace(rf, orbit=model.rf_change(rf.step / rf.frequency)[at])
+    return replace(measured, response=np.asarray(measured.kicks)[:, None, None] * response, rf=rf)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
-from tmlattice.beam.response_squares import squares
+from tmlattice.compiled import jit_sums
 from tmlattice.effects import ReadingEffect, RingEffect, find
 from tmlattice.inference.metric import Hypothesis, Indices, Products
 from tmlattice.observe.orbit_response import Predicted
@@ -211,7 +211,7 @@ class _Here:
         slopes, n = self.slopes, self.readings.shape[2]
         seen = some.seen.reshape(len(some.seen), -1, n)
         return np.asarray(
-            squares(
+            _squares(
                 np.ascontiguousarray(np.moveaxis(seen, 2, 1)),
                 np.ascontiguousarray(self.readings.reshape(-1, n).T),
                 np.stack([slopes.start, slopes.start + slopes.launch_kick]),
@@ -220,3 +220,40 @@ class _Here:
                 self.used.reshape(len(self.scale), -1) * self.scale[:, None] ** 2,
             )
         )
+
+
+# `reassoc`: the sum may follow the vector unit's order.
+@jit_sums
+def _squares(seen, readings, start, change, first, weight):  # type: ignore[no-untyped-def]
+    """Weighted sum over all readings of (seen . start + readings . change)^2, [error].
+
+    Args:
+        seen: change of the readings of a launch by an error, [error, n, reading]; n is even.
+        readings: readings of a launch, [n, reading].
+        start: launches of the columns, for the readings before and behind each column's kick,
+            [2, column, n].
+        change: of these by an error, [2, error, column, n].
+        first: the first reading behind each column's kick, [column].
+        weight: of each reading, [column, reading].
+    """
+    errors, n, count = seen.shape
+    out = np.zeros(errors)
+    left = np.empty(count)
+    for h in range(errors):
+        total = 0.0
+        for c in range(len(first)):
+            for side in range(2):
+                low, high = (0, first[c]) if side == 0 else (first[c], count)
+                left[low:high] = 0.0
+                for i in range(0, n, 2):
+                    u, v = start[side, c, i], start[side, c, i + 1]
+                    a, b = change[side, h, c, i], change[side, h, c, i + 1]
+                    for r in range(low, high):
+                        left[r] += (
+                            u * seen[h, i, r] + v * seen[h, i + 1, r]
+                            + a * readings[i, r] + b * readings[i + 1, r]
+                        )  # fmt: skip
+            for r in range(count):
+                total += weight[c, r] * left[r] * left[r]
+        out[h] = total
+    return out

@@ -79,22 +79,22 @@ class TurnsMetric(StoredMetric):
         """Squares, and products with vectors; shots of the same beam together."""
         problem, view = self.problem, self.point.view
         weight = problem.used / problem.sigma**2
-        told = np.zeros((len(vectors), *problem.used.shape))
-        told[:, problem.used] = (
-            vectors / np.broadcast_to(problem.sigma, told.shape[1:])[problem.used]
+        weighted = np.zeros((len(vectors), *problem.used.shape))
+        weighted[:, problem.used] = (
+            vectors / np.broadcast_to(problem.sigma, weighted.shape[1:])[problem.used]
         )
         amplitude = self._amplitudes()  # [shot, mode's entry]
         whole, along = np.zeros(len(hypotheses)), np.zeros((len(hypotheses), len(vectors)))
         for beam in {id(own): own for own in view.beams}.values():
             shots = [i for i, own in enumerate(view.beams) if own is beam]
             a, b = amplitude[shots].real, amplitude[shots].imag
-            re, im = told[:, shots, :LINES:2], told[:, shots, 1:LINES:2]
+            re, im = weighted[:, shots, :LINES:2], weighted[:, shots, 1:LINES:2]
             sums = np.stack([(a * re + b * im).sum(1), (a * im - b * re).sum(1)], axis=-1)
             u, v = weight[shots, :LINES:2], weight[shots, 1:LINES:2]
             squares = [
                 (own).sum(0) for own in (a**2 * u + b**2 * v, b**2 * u + a**2 * v, a * b * (v - u))
             ]
-            tunes, of_tunes = told[:, shots, -2:].sum(1), weight[shots, -2:].sum(0)
+            tunes, of_tunes = weighted[:, shots, -2:].sum(1), weight[shots, -2:].sum(0)
             for start in range(0, len(hypotheses), AT_ONCE):
                 part = slice(start, start + AT_ONCE)
                 moved = seen_by(beam.moved(hypotheses[part]), view.monitors.matrix())

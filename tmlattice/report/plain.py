@@ -3,6 +3,9 @@
 >>> print(report_text(diagnosis))
 """
 
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
 from tmlattice.report.next_shot import next_text
@@ -40,54 +43,91 @@ MOST = 8
 """Tunes that are listed; the page has all."""
 
 
-def report_text(diagnosis: Diagnosis, width: int = WIDTH) -> str:
-    """The whole report as plain text.
+def report_text(diagnosis: Diagnosis, width: int = WIDTH, most: int | None = None) -> str:
+    """Return the report as plain text.
 
     Args:
         diagnosis: of `diagnose`.
         width: columns.
+        most: lines at most, as on a terminal: the least important parts are left out, and the last
+            line names them. None: the whole report.
     """
-    lines = [*wrapped(f"{diagnosis.verdict.upper()}: {verdict_sentence(diagnosis)}", "", width)]
+    parts = [part for part in _parts(diagnosis, width) if part.lines]
+    kept, left = set(range(len(parts))), []
+    if most is not None:
+        room = most - 3  # the line on what is left out, wrapped
+        for i in sorted(kept, key=lambda i: (parts[i].rank, i)):
+            room -= len(parts[i].lines) + 1
+            if room < 0 and parts[i].rank:
+                kept.discard(i)
+                room += len(parts[i].lines) + 1
+        left = list(dict.fromkeys(p.name for i, p in enumerate(parts) if i not in kept))
+    lines = [line for i in sorted(kept) for line in ("", *parts[i].lines)][1:]
+    if left:
+        lines += ["", *wrapped(f"More in report.txt of --out DIR: {', '.join(left)}.", "", width)]
+    return "\n".join(lines)
+
+
+class _Part(NamedTuple):
+    """A paragraph; parts of a higher rank are left out first, those of rank 0 never."""
+
+    rank: int
+    name: str
+    lines: Sequence[str]
+
+
+def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
+    """Yield the paragraphs of a report in their order."""
+    sentence = f"{diagnosis.verdict.upper()}: {verdict_sentence(diagnosis)}"
+    yield _Part(0, "verdict", wrapped(sentence, "", width))
     for number, finding in enumerate(diagnosis.findings, 1):
-        lines += ["", *wrapped(title(finding), f"{number}. ", width)]
+        lines = [*wrapped(title(finding), f"{number}. ", width)]
         for name, text in finding_rows(finding):
             for i, part in enumerate(text.split("\n")):
                 label = f"   {name if i == 0 else '':<13}"
                 lines += wrapped(part, label, width)
+        yield _Part(1 + number, f"finding {number}", lines)
     if diagnosis.suspects:
-        lines += ["", *wrapped(SUSPECTS, "", width)]
+        lines = [*wrapped(SUSPECTS, "", width)]
         for kind, place, what in suspect_rows(diagnosis):
             lines += wrapped(f"{place}: {what}", f"   {kind:<13}", width)
+        yield _Part(4, "suspects", lines)
     if diagnosis.correlations:
-        lines += ["", *wrapped(CORRELATED, "", width)]
+        lines = [*wrapped(CORRELATED, "", width)]
         for one, other, correlation in correlation_rows(diagnosis):
             lines += wrapped(f"{one}; {other}: {correlation}", "   ", width)
-    more = next_text(diagnosis) or advice(diagnosis)
-    if more:
-        lines += ["", *wrapped(more, "Next: ", width)]
-    lines += ["", *_gap_table(diagnosis)]
+        yield _Part(9, "correlations", lines)
+    if more := next_text(diagnosis) or advice(diagnosis):
+        yield _Part(1, "next", wrapped(more, "Next: ", width))
+    lines = _gap_table(diagnosis)
     for topic in ("gap", "remainder"):
         lines += wrapped(diagnosis.assessment.sentence(topic), "", width)
-    small = small_rows(diagnosis)
-    if small:
-        lines += ["", "Distributed errors:"]
+    yield _Part(1, "validation", lines)
+    if small := small_rows(diagnosis):
+        lines = ["Distributed errors:"]
         size = max(len(name) for name, _ in small)
         for name, text in small:
             lines += wrapped(text, f"   {name:<{size}}   ", width)
+        yield _Part(6, "distributed errors", lines)
     if diagnosis.steps:
         if optics := optics_rows(diagnosis):
-            lines += ["", *columns([optics_head(diagnosis), *optics])]
-        lines += ["", *steps_text(diagnosis, width)]
+            yield _Part(5, "optics", columns([optics_head(diagnosis), *optics]))
+        paragraph: list[str] = []
+        for line in [*steps_text(diagnosis, width), ""]:
+            if line:
+                paragraph.append(line)
+                continue
+            yield _Part(7, "errors of the fit", paragraph)
+            paragraph = []
     if diagnosis.verdict == "none":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
         if rows:
-            lines += ["", "Detection limits, at half of the places of each effect:"]
-            lines += columns(rows, "   ")
+            seen = "Detection limits, at half of the places of each effect:"
+            yield _Part(2, "sensitivity", [seen, *columns(rows, "   ")])
     if large := large_text(diagnosis):
-        lines += ["", *wrapped(f"{LARGE_TITLE}: {large}", "Note: ", width)]
+        yield _Part(3, "notes", wrapped(f"{LARGE_TITLE}: {large}", "Note: ", width))
     for warning in diagnosis.warnings:
-        lines += ["", *wrapped(warning, "Note: ", width)]
-    return "\n".join(lines)
+        yield _Part(8, "notes", wrapped(warning, "Note: ", width))
 
 
 def _gap_table(diagnosis: Diagnosis) -> list[str]:

@@ -251,7 +251,7 @@ def finding_rows(finding: Finding) -> list[tuple[str, str]]:
     recommended_action = finding.recommended_action
     if recommended_action is not None:
         rows += [
-            ("recommended action", recommended_action.action),
+            ("action", recommended_action.action),
             ("check", find(recommended_action.effect).to_check),
         ]
     elif finding.to_check:

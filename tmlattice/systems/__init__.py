@@ -1,4 +1,4 @@
-"""The paper's other systems: what was made for rings, on systems that fit on a page.
+"""The paper's other systems: the methods for rings, on systems that fit on a page.
 
 Each module holds its equation, its map, what is learned from one solution, and `comparisons`, the
 paper's figures beside ours. `tmlattice dev reproduce` runs them all.

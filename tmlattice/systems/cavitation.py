@@ -64,12 +64,12 @@ class Bubble:
 
     @property
     def period(self) -> float:
-        """Of the wave, in units of `time`."""
+        """Period of the wave, in units of `time`."""
         return 1 / (self.frequency * self.time)
 
     @property
     def start(self) -> Array:
-        """At rest as the wave begins, as the distance from `REST`."""
+        """State at rest as the wave begins, as the distance from `REST`."""
         return np.array([0.0, 0.0, 0.0, 0.0, 1.0])
 
     @property
@@ -101,7 +101,7 @@ class Bubble:
         return recentred(terms, REST)
 
     def solution(self, times: ArrayLike) -> Array:
-        """True distances from `REST` at the scaled times, [time, 5], by the equation in R alone."""
+        """Return true distances from `REST` at scaled times, [time, 5], by the equation in R."""
         surface = 2 * self.tension / (self.radius * self.pressure)
         vapour = self.vapour / self.pressure
         omega = 2 * np.pi / self.period
@@ -137,10 +137,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Ladder:
-    """Maps over a step, half of it, a quarter, ...; each state takes the longest that holds.
+    """Maps over a step, half of it, a quarter, ...; each state uses the longest valid one.
 
-    A step holds where the terms of the highest degree, the last that the truncation kept, add
-    less than `tolerance` times the step.
+    A step is valid if the terms of the highest degree, the last of the truncation, add less than
+    `tolerance` times the step.
 
     Attributes:
         longest: the first step, in units of time.
@@ -153,10 +153,10 @@ class Ladder:
     tolerance: float
 
     def follow(self, start: ArrayLike, duration: float) -> Run:
-        """States after each step from `start` [5] until `duration`, a multiple of the longest.
+        """Return states after each step from `start` [5] until `duration`, a multiple of longest.
 
         Raises:
-            OdeError: even the shortest step does not hold.
+            OdeError: even the shortest step is not valid.
         """
         x = np.asarray(start, dtype=float)
         order = self.maps[0].order
@@ -190,14 +190,14 @@ class Ladder:
 def ladder(
     bubble: Bubble, order: int = 6, steps: int = 100, halvings: int = 14, tolerance: float = 1e-6
 ) -> Ladder:
-    """Maps of a bubble for a period of the wave in `steps` steps, and each halved so many times."""
+    """Return maps of a bubble for a period of the wave in `steps` steps, and repeated halvings."""
     longest = bubble.period / steps
     maps = tuple(taylor_map_of_ode(bubble.terms, order, longest / 2**k) for k in range(halvings))
     return Ladder(longest, maps, tolerance)
 
 
-GENTLE = Bubble(drive=0.4)  # learned from: its collapse needs no halved steps
-WRONG = 0.5  # of the true viscosity, the model that learning begins with
+GENTLE = Bubble(drive=0.4)  # for learning: its collapse needs no halved steps
+WRONG = 0.5  # of the true viscosity, in the initial model
 STEPS = 400  # a period
 ORDER = 5
 OBSERVED = 1.5  # periods: one growth, collapse and rebound of the bubble
@@ -205,7 +205,7 @@ READING = 1e-3  # rms of one radius, in units of the radius at rest
 
 
 def damping_of(taylor_map: TaylorMap, time: float) -> float:
-    """4 nu in scaled units from a map over `time`: how the linear equation damps u."""
+    """Return 4 nu in scaled units from a map over `time`: the linear damping of u."""
     return -float(ode_of_taylor_map(taylor_map.truncated(1), time)[0, 1, 0, 0, 0][1])
 
 
@@ -215,7 +215,7 @@ class LearnedBubble:
 
     Attributes:
         fit: the map over a period / `STEPS`, and its covariance.
-        bubble: the model that it began with, of the wrong viscosity.
+        bubble: the initial model, of the wrong viscosity.
     """
 
     fit: MapFit
@@ -223,14 +223,14 @@ class LearnedBubble:
 
     @property
     def viscosity(self) -> tuple[float, float]:
-        """Recovered through map -> equation, and its standard error, m^2/s."""
+        """Viscosity recovered through map -> equation, and its standard error, m^2/s."""
         step = self.bubble.period / STEPS
         unit = 4 * self.bubble.time / self.bubble.radius**2
         value = damping_of(self.fit.taylor_map, step) / unit
         return value, self.fit.error_of(lambda m: damping_of(m, step)) / unit
 
     def radii(self, periods: float = 1.0, drive: float | None = None) -> Array:
-        """R / R0 at every step from rest; another drive is another size of the wave (s, c)."""
+        """Return R / R0 at every step from rest; a drive sets the size of the wave (s, c)."""
         start = self.bubble.start * (1.0 if drive is None else drive / self.bubble.drive)
         return follow(self.fit.taylor_map, start, round(periods * STEPS))[:, 0] + 1.0
 
@@ -238,8 +238,8 @@ class LearnedBubble:
 def learn(radii: ArrayLike, model: Bubble) -> LearnedBubble:
     """Fine-tune the map of a model on the radius over one oscillation.
 
-    Of the weights those of the velocity move that multiply products of (u, z) up to the third
-    degree: what gas, surface and viscosity can do. The wave and what R and z are stay.
+    The free weights are those of the velocity by products of (u, z) up to the third degree: gas,
+    surface and viscosity. The wave and the definitions of R and z are fixed.
 
     Args:
         radii: R / R0 from rest on, `STEPS` times a period of the wave, [step].
@@ -253,7 +253,7 @@ def learn(radii: ArrayLike, model: Bubble) -> LearnedBubble:
     free = np.zeros((5, len(degree)), dtype=bool)
     free[1, inside] = True
     y = np.asarray(radii, dtype=float)[:, None] - 1.0
-    # a prior of a tenth of the unit of force: it decides what the solution does not
+    # a prior of a tenth of the unit of force, for what the solution does not determine
     return LearnedBubble(
         fit_map(first, y, (0,), model.start, READING, free, prior=0.1 * step), model
     )
@@ -299,7 +299,7 @@ def study(
 
 
 def comparisons(done: CavitationStudy) -> list[Comparison]:
-    """What the paper shows in figures, in numbers of ours."""
+    """Return comparisons of the paper's figures with our numbers."""
     run, truth = done.run, done.truth[:, 0] + 1
     taken = np.diff(run.times)
     viscosity, error = done.learned.viscosity

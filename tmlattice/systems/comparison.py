@@ -1,4 +1,4 @@
-"""A figure of the paper beside ours, and why they differ."""
+"""A figure of the paper compared with ours, and the reason of a difference."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +9,10 @@ class Comparison:
     """One row of the table "paper / here / why they differ".
 
     Attributes:
-        quantity: what it is, with its unit.
-        paper: as printed there, or None where it prints none.
+        quantity: its description and unit.
+        paper: as printed there, or None.
         here: as computed here.
-        why: they differ, or what `here` was made with.
+        why: they differ, or how `here` was computed.
     """
 
     quantity: str
@@ -21,7 +21,7 @@ class Comparison:
     why: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """The row for `reproduction.schema.json`."""
+        """Return the row for `reproduction.schema.json`."""
         return {
             "quantity": self.quantity,
             "paper": self.paper,

@@ -66,7 +66,7 @@ class StepErrors:
 def step_errors(
     steps: ArrayLike, orders: Sequence[int] = (2, 4, 8), mass: float = 100.0
 ) -> StepErrors:
-    """How far Euler, the truncated maps and Runge-Kutta stray in 15 s, for each step [s]."""
+    """Return errors of Euler, the truncated maps and Runge-Kutta in 15 s, for each step [s]."""
     steps = np.asarray(steps, dtype=float)
     errors = []
     for step in steps:
@@ -85,10 +85,10 @@ def step_errors(
 def masses_map(
     masses: Sequence[float] = LEARNED_FROM, step: float = 0.5, order: int = 3
 ) -> TaylorMap:
-    """A map of (v, 100 kg / m) fitted to one fall from rest for each mass, 15 s, every 0.5 s.
+    """Return a map of (v, 100 kg / m) fitted to one fall from rest per mass, 15 s, every 0.5 s.
 
-    Two masses can tell no more than a straight line in 1 / m apart, so of the monomials those
-    with the first power of it at most are fitted; the map knows nothing else of the physics.
+    Two masses determine no more than a straight line in 1 / m, so only monomials with at most its
+    first power are fitted; the map has no other physics.
 
     Args:
         masses: kg, two or more.
@@ -125,11 +125,11 @@ class MassErrors:
 
 
 def predicted_masses(masses: Sequence[float], forest: bool = True, seed: int = 0) -> MassErrors:
-    """Falls of other masses by the fitted map and by a random forest on the same two falls.
+    """Return falls of other masses by the fitted map and by a random forest on the same two falls.
 
     Args:
         masses: kg.
-        forest: whether to train one; needs scikit-learn, and is left out where that is missing.
+        forest: whether to train one; it needs scikit-learn, and is skipped without it.
         seed: of the forest.
     """
     step, count = 0.5, 30
@@ -169,7 +169,7 @@ def _forest_falls(starts: Array, step: float, count: int, seed: int) -> Array | 
 
 
 def comparisons(errors: StepErrors, masses: MassErrors) -> list[Comparison]:
-    """The paper's figures beside ours."""
+    """Return comparisons of the paper's figures with ours."""
     W0, W1, W2 = (w.item() for w in taylor_map_of_ode(equation(), 2, 0.1).coefficients)
     kutta = runge_kutta_map(0.1)
     true16 = taylor_map_of_ode(equation(), 16, 0.1)

@@ -20,7 +20,7 @@ from tmlattice.maps import TaylorMap
 from tmlattice.maps.taylor import Array
 
 Bools = NDArray[np.bool_]
-LOST = 1e3  # times the largest observation: a state this far out carries no information
+LOST = 1e3  # times the largest observation: a state beyond carries no information
 
 
 class DivergedError(TmlatticeError):
@@ -63,18 +63,18 @@ class MapFit:
 
 
 def weights_of(taylor_map: TaylorMap) -> Array:
-    """All weights of a map in one array [n, monomial], degree by degree from W0 on."""
+    """Return all weights of a map in one array [n, monomial], degree by degree from W0 on."""
     W = taylor_map.coefficients
     return np.concatenate([W[0][:, None], *W[1:]], axis=1)
 
 
 def map_of_weights(rows: Array, order: int) -> TaylorMap:
-    """The map whose `weights_of` are rows [n, monomial]."""
+    """Return the map whose `weights_of` are rows [n, monomial]."""
     return TaylorMap._of_rows(np.array(rows, dtype=float), order)
 
 
 def follow(taylor_map: TaylorMap, start: ArrayLike, steps: int) -> Array:
-    """The states x, M(x), M(M(x)), ..., [steps + 1, ..., n]; not finite after they ran away."""
+    """Return the states x, M(x), M(M(x)), ..., [steps + 1, ..., n]; not finite once diverged."""
     states = [np.asarray(start, dtype=float)]
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(steps):
@@ -83,15 +83,15 @@ def follow(taylor_map: TaylorMap, start: ArrayLike, steps: int) -> Array:
 
 
 def fit_step_by_step(solution: ArrayLike, order: int, ridge: float = 0.0) -> TaylorMap:
-    """The map that sends each observed state to the next, by linear least squares.
+    """Return the map from each observed state to the next, by linear least squares.
 
-    Needs all coordinates; columns are scaled to unit length, and where the solution cannot tell
-    monomials apart the smallest weights in that scale are taken.
+    It needs all coordinates. Columns are scaled to unit length; of equivalent solutions the one
+    with the smallest weights in that scale is taken.
 
     Args:
         solution: [step, n], or several solutions of one length [solution, step, n].
         order: of the map.
-        ridge: relative size of singular values to leave out; 0 for rounding alone.
+        ridge: relative size of singular values to ignore; 0 for rounding alone.
     """
     solution = np.asarray(solution, dtype=float)
     n = solution.shape[-1]
@@ -125,15 +125,15 @@ def fit_map(
         noise: rms of one observation, one or [observed], in its unit.
         free: weights that may move, [n, monomial] as in `weights_of`; else all.
         free_start: coordinates of the start to fit.
-        prior: how far weights may move from `first`, rms, one or [n, monomial]; keeps what the
-            solution does not determine near the model. None: not held.
+        prior: rms of the weights' changes from `first`, one or [n, monomial]; it determines what
+            the solution does not. None: no prior.
         evaluations: at most.
 
     Returns:
         The map, with covariance for the noise given.
 
     Raises:
-        DivergedError: the first map's own solution runs away from the observations' range.
+        DivergedError: the first map's own solution diverges.
     """
     y = np.asarray(observations, dtype=float)
     x0 = np.asarray(start, dtype=float)
@@ -177,7 +177,7 @@ def fit_map(
     if not (np.abs(first_states) < limit).all():
         step = int(np.argmin((np.abs(first_states) < limit).all(axis=1)))
         raise DivergedError(
-            f"the map to start from runs away at step {step} of {len(y) - 1}; start from another, "
+            f"the map to start from diverges at step {step} of {len(y) - 1}; start from another, "
             "or fit a shorter solution first"
         )
     found = least_squares(

@@ -52,7 +52,7 @@ def solutions(starts: ArrayLike, steps: int = STEPS) -> Array:
 
 
 def learn(order: int = 3) -> TaylorMap:
-    """The map fitted to the one solution from (0.5, 0.5); it is not told the equation."""
+    """Return the map fitted to the one solution from (0.5, 0.5), without the equation."""
     return fit_step_by_step(solutions([LEARNED_FROM])[0], order)
 
 
@@ -61,10 +61,10 @@ class Cell:
     """One network of the table.
 
     Attributes:
-        name, regularization, epochs: what it is.
+        name, regularization, epochs: its kind and training.
         learned: rms error of its free run on the solution that it learned from.
         unseen: the same for the other starts, in the order of `UNSEEN`.
-        parameters: how many numbers were learned.
+        parameters: number of learned parameters.
     """
 
     name: str
@@ -227,7 +227,7 @@ def _free_run(network: "torch.nn.Module", truth: Array) -> Array:
 
 
 def comparisons(done: Race) -> list[Comparison]:
-    """One row for each network: our verdict with the rms errors that it rests on."""
+    """Return one row for each network: our verdict with its rms errors."""
     model, learned = taylor_map_of_ode(EQUATION, 3, STEP), learn()
     difference = np.abs(weights_of(model) - weights_of(learned))
     closed = _period()
@@ -255,7 +255,7 @@ def comparisons(done: Race) -> list[Comparison]:
 
 
 def _period() -> float:
-    """How long the learned solution takes to come back to its start, s."""
+    """Period of the learned solution, s."""
     times = np.linspace(3.0, 6.0, 30_001)
     done = solve_ivp(
         right_hand_side(EQUATION), (0.0, 6.0), np.array(LEARNED_FROM), method="DOP853",

@@ -1,13 +1,13 @@
-"""Magnets from their equation of motion, a second way to the maps that OCELOT gives.
+"""Magnets from their equation of motion, independent of OCELOT's maps.
 
 Hamilton's function of a magnet's body by the path length s, at the nominal energy, in OCELOT's
 canonical coordinates (x, px, y, py), px = Px / p0:
 
     H = -(1 + h x) sqrt(1 - px^2 - py^2) + h x + h^2 x^2 / 2 + k1 V1 + k2 V2
 
-with h the curvature, V1 = (x^2 - y^2) / 2 and V2 = (x^3 - 3 x y^2) / 6 and what a curved magnet
-adds to keep the field free of sources (it follows from Laplace's equation). The root is expanded,
-so that the map of the body is right to the order asked for, up to the third.
+with h the curvature, V1 = (x^2 - y^2) / 2 and V2 = (x^3 - 3 x y^2) / 6 and the terms of a curved
+magnet that keep the field free of sources (from Laplace's equation). The root is expanded, so that
+the map of the body is exact up to the given order, at most the third.
 
 >>> magnet_map(ring["qd::4"], order=3)
 >>> third_order_turn(ring, [3e-3, 0, 3e-3, 0]).rms()     # what third order adds to a turn, m
@@ -78,7 +78,7 @@ def _tilted(element: "Element") -> bool:
 
 
 def magnet_map(element: "Element", order: int = 3) -> TaylorMap:
-    """The map of a magnet's body from its equation of motion, in (x, px, y, py).
+    """Return the map of a magnet's body from its equation of motion, in (x, px, y, py).
 
     Args:
         element: a drift, quadrupole, bend or sextupole that has a length and no tilt.
@@ -96,7 +96,7 @@ def magnet_map(element: "Element", order: int = 3) -> TaylorMap:
 
 
 def henon_map(tune: float, strength: float = 1.0) -> TaylorMap:
-    """Henon's map: a sextupole kick px -= strength x^2, then a turn of 2 pi tune; exact."""
+    """Return Henon's map: a sextupole kick px -= strength x^2, then a turn of 2 pi tune; exact."""
     angle = 2 * np.pi * tune
     c, s = np.cos(angle), np.sin(angle)
     kick = TaylorMap([np.zeros(2), np.eye(2), np.array([[0, 0, 0], [-strength, 0, 0]])])
@@ -105,7 +105,7 @@ def henon_map(tune: float, strength: float = 1.0) -> TaylorMap:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far OCELOT's body maps of one kind are from those of the equation of motion.
+    """Difference of OCELOT's body maps of one kind from those of the equation of motion.
 
     Attributes:
         kind: of element.
@@ -124,7 +124,7 @@ class Agreement:
 
 
 def agreements(ring: "Ring") -> list[Agreement]:
-    """All distinct upright drifts, quadrupoles, bends and sextupoles of a ring against OCELOT."""
+    """Compare all distinct upright drifts, quadrupoles, bends and sextupoles with OCELOT."""
     found = []
     for kind in KINDS:
         seen: set[tuple[float, ...]] = set()
@@ -170,7 +170,7 @@ class ThirdOrderTurn:
 
 
 def turn_maps(ring: "Ring", order: int) -> Iterator[tuple["Element", list[TaylorMap]]]:
-    """Every element with its maps in beam order, bodies from the equation of motion.
+    """Yield every element with its maps in beam order, bodies from the equation of motion.
 
     Bends' edges and elements that are no drift, quadrupole, bend or sextupole are OCELOT's, of
     second order. A corrector, monitor or tilted magnet of zero strength is a drift of its length.
@@ -202,7 +202,7 @@ def _maps_of(element: "Element", energy: float, order: int) -> list[TaylorMap]:
 
 
 def third_order_turn(ring: "Ring", launch: ArrayLike) -> ThirdOrderTurn:
-    """One turn of a launch (x, px, y, py) by maps of second and third order.
+    """Return one turn of a launch (x, px, y, py) by maps of second and third order.
 
     Args:
         ring: with monitors.
@@ -242,7 +242,7 @@ class MagnetStudy:
 
 
 def study(ring: "Ring", launches: tuple[float, ...] = LAUNCHES) -> MagnetStudy:
-    """Maps against OCELOT's, and turns launched at x = y = each of `launches` [m]."""
+    """Compare maps with OCELOT's, and turns launched at x = y = each of `launches` [m]."""
     turns = [third_order_turn(ring, [a, 0.0, a, 0.0]) for a in launches]
     return MagnetStudy(agreements(ring), turns, henon_map(0.2114))
 
@@ -256,7 +256,7 @@ WHY: dict[str, str] = {
 
 
 def comparisons(done: MagnetStudy) -> list[Comparison]:
-    """OCELOT's maps beside those of the equation of motion, and what third order adds."""
+    """Return comparisons of OCELOT's maps with the equation of motion, and of third order."""
     rows = [
         Comparison(f"{a.count} {a.kind}s: largest difference to OCELOT in W1 / W2", None,
                    f"{a.first:.1e} / {a.second:.1e}",

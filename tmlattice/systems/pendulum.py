@@ -70,7 +70,7 @@ def filmed(
 
 
 def film(name: str) -> Array | None:
-    """Angles [frame] of a real swing, "a" or "b", from $TMLATTICE_DATA; None where it is absent."""
+    """Return angles [frame] of a real swing, "a" or "b", from $TMLATTICE_DATA, or None."""
     folder = os.environ.get("TMLATTICE_DATA")
     path = Path(folder or "") / "pendulum" / f"swing_{name}.csv"
     if not folder or not path.exists():
@@ -85,12 +85,12 @@ def _linear(taylor_map: TaylorMap) -> Array:
 
 
 def length_of(taylor_map: TaylorMap) -> float:
-    """g over the determinant of the linear equation, m: no choice of latent velocity moves it."""
+    """Return g over the determinant of the linear equation, m, independent of latent velocity."""
     return float(GRAVITY / np.linalg.det(_linear(taylor_map)))
 
 
 def damping_of(taylor_map: TaylorMap) -> float:
-    """Minus the trace of the linear equation, 1/s."""
+    """Return minus the trace of the linear equation, 1/s."""
     return float(-np.trace(_linear(taylor_map)))
 
 
@@ -117,7 +117,7 @@ class LearnedPendulum:
         return damping_of(self.fit.taylor_map), self.fit.error_of(damping_of)
 
     def swing(self, angle: float, velocity: float = 0.0, frames: int = LAYERS) -> Array:
-        """Angles [frames + 1] from a start, rad and rad/s.
+        """Return angles [frames + 1] from a start, rad and rad/s.
 
         The latent coordinate is only nearly the velocity: here it is chosen so that the angle
         begins to change with `velocity` under the learned equation.
@@ -130,9 +130,9 @@ class LearnedPendulum:
 def learn(angles: ArrayLike, start_velocity: float = 0.0) -> LearnedPendulum:
     """Fine-tune the ideal map on one swing, the first velocity free.
 
-    Linear weights may move; a prior of 30 % keeps the latent coordinate near the velocity (angles
-    alone do not say what it is) and hardly touches what angles do say. A swing of a tenth of a
-    radian cannot show cubic weights: they stay at the ideal map's.
+    Linear weights are free; a prior of 30 % keeps the latent coordinate near the velocity, which
+    angles alone do not determine, and hardly affects the rest. A swing of a tenth of a radian does
+    not determine cubic weights: they stay at the ideal map's.
 
     Args:
         angles: [frame], one every 0.1 s, rad.
@@ -146,15 +146,15 @@ def learn(angles: ArrayLike, start_velocity: float = 0.0) -> LearnedPendulum:
     natural = np.ones_like(weights_of(ideal))
     natural[:, 1:3] = PRIOR * np.array([[1, 1 / k], [k, 1]])
     noise = CAMERA_NOISE
-    for _ in range(3):  # the weight of the prior depends on the noise, and that on the residuals
+    for _ in range(3):  # the weight of the prior depends on the noise, which is that of residuals
         fit = fit_map(ideal, y[:, None], (0,), [y[0], start_velocity], noise, free, (0, 1), natural)
-        # of the six numbers fitted four are seen: period, damping and the start
+        # of the six fitted numbers four are determined: period, damping and the start
         noise = float(np.sqrt((fit.residuals**2).sum() / (len(y) - 4)))
     return LearnedPendulum(fit, noise)
 
 
 def predict(taylor_map: TaylorMap, angles: ArrayLike, seen: int = 5) -> Array:
-    """Angles of a swing from its first frames: a map's own best start, then the map alone.
+    """Return angles of a swing from its first frames: a map's best start, then the map alone.
 
     Args:
         taylor_map: learned or ideal.
@@ -175,7 +175,7 @@ def predict(taylor_map: TaylorMap, angles: ArrayLike, seen: int = 5) -> Array:
 
 @dataclass(frozen=True)
 class SwingTest:
-    """A swing that was not learned from: angles [frame] as filmed and as two maps predict it."""
+    """A swing that was not learned: angles [frame] as filmed and as two maps predict it."""
 
     source: str
     angles: Array
@@ -184,7 +184,7 @@ class SwingTest:
     seen: int
 
     def rms(self) -> tuple[float, float]:
-        """Rms error of the learned and the ideal map over the frames not seen, rad."""
+        """Return rms errors of the learned and the ideal map over the frames not seen, rad."""
         left = np.stack([self.learned, self.ideal])[:, self.seen :] - self.angles[self.seen :]
         learned, ideal = np.sqrt(np.mean(left**2, axis=1))
         return float(learned), float(ideal)
@@ -192,7 +192,7 @@ class SwingTest:
 
 @dataclass(frozen=True)
 class PendulumStudy:
-    """What was learned from a simulated swing and, where the film is there, from the real one."""
+    """Results from a simulated swing and, if there is a film, from the real one."""
 
     angles: Array
     simulated: LearnedPendulum
@@ -225,7 +225,7 @@ def study(seed: int = 0) -> PendulumStudy:
 
 
 def comparisons(done: PendulumStudy) -> list[Comparison]:
-    """The paper's figures beside ours."""
+    """Return comparisons of the paper's figures with ours."""
     W3 = ideal_map().coefficients[3]
     rows = [
         Comparison(f"ideal map, W3 row {i + 1}, {name}", printed, float(W3[i, j]),

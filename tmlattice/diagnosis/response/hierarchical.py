@@ -24,7 +24,6 @@ from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.outliers import good_monitors, outliers, without
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import (
-    WAVED,
     Outcome,
     State,
     allow,
@@ -213,17 +212,14 @@ def _rejected(state: State, family: Family) -> Step:
 
 
 def _validated(state: State, rejected_steps: list[Step], progress: Callable[[str], Any]) -> State:
-    """The state with orbit waves in each step, if the readings support them and the inner set does
-    not reject them, because waves absorb gradient errors; and without late families that it
-    rejects."""
+    """Return the state with orbit waves in each step, if the log evidence demands them and the
+    validation correctors do not object; and without late families that these correctors reject."""
     progress("validation")
-    for block in (1,):
-        if not used(state, block).any():
-            continue
-        more = settle(with_waves(state, block), gain=LEADS)
+    if used(state, 1).any():
+        more = settle(with_waves(state), gain=LEADS)
         rise = lost(inner(state), inner(more), CORRECTORS)
         gained = log_evidence(more) - log_evidence(state)
-        log.info("%s: evidence %+.1f, validation %+.3f +- %.3f", WAVED[block], gained, *rise)
+        log.info("waves: evidence %+.1f, validation %+.3f +- %.3f", gained, *rise)
         if gained > WORTH and not against(rise):
             state = more
     for family in [own for own in state.families if own.name in SECOND]:

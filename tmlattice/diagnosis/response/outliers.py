@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
-from tmlattice.diagnosis.response.state import WAVED, State
+from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import FREEDOM, used
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -383,12 +383,8 @@ def common_modes(state: State) -> list[str]:
     """A message about the common mode of all readings of a step, if it exceeds their noise."""
     noise, data = state.noise, state.data
     moved = []
-    for plane in (0, 1):
-        blocks = [
-            block for block in (0, 1) if WAVED[block] in noise.kinds and used(state, block).any()
-        ]
-        waves = noise.waves.shape[1]
-        rms = max((float(noise.scale[b, plane, 0]) * np.sqrt(waves) for b in blocks), default=0.0)
+    for plane in (0, 1) if "waves" in noise.kinds else ():
+        rms = float(noise.scale[1, plane, 0]) * np.sqrt(noise.waves.shape[1])
         if rms > float(np.median(data.noise[:, plane])):
             moved.append(f"{1e6 * rms:.2g} µm rms in {'xy'[plane]}")
     if not moved:

@@ -25,9 +25,8 @@ from tmlattice.diagnosis.response.weights import (
 )
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.common import common, times_precision
-from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.normal import Posterior, inverse_of_lower, solve
 from tmlattice.inference.priors import Group
-from tmlattice.inference.triangles import inverse_of_lower
 
 Array = NDArray[np.float64]
 

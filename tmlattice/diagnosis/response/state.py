@@ -81,10 +81,9 @@ KINDS = {
     "drift": slice(WAVES, WAVES + 1),
     "place": slice(WAVES + 1, None),
 }
-"""Common modes of a step, by their patterns: beam jitter, energy drift, and the corrector's
-place."""
-WAVED = ("waves in plane", "waves across")
-"""Names of the waves by block: each is admitted separately."""
+"""Common modes of a step, by their patterns: beam jitter (in the plane that is not kicked: in the
+kicked plane it would absorb what gradients and the energy explain), a drift of the energy, and the
+field of the corrector at another place (in the kicked plane)."""
 DRIFT = 1e-4
 """First guess of the rms drift of the energy within a step, in RF steps."""
 PLACE = 3e-3
@@ -106,8 +105,7 @@ class Noise:
         size: prior rms of the amount of each common mode, [block, column, pattern].
         scale: of the kinds of common modes, [block, plane that is read, kind].
         waves: orbits of unit rms, [plane that is read, pattern, monitor].
-        kinds: of common modes that are admitted, names of `KINDS` or `WAVED`. Waves are admitted by
-            validation alone: they absorb what gradients should explain.
+        kinds: of common modes that are admitted, names of `KINDS`; waves by validation alone.
     """
 
     column: Array
@@ -161,8 +159,9 @@ class State:
         kept: rows of the ring's variables, reused until the ring has moved.
         apart: numbers of single faults.
         guessed: rms of the logarithm of a family's scale about its first guess.
-        closed: families rejected by the validation set, or as implausible: their numbers are zero,
-            and stated errors include their uncertainty (those of the ring, where they are few).
+        rejected: families that the validation set, or physics, rejects: their numbers are taken
+            for zero, and stated errors know that they may not be (those of the ring, where they are
+            few).
         outcome: how the last fit ended.
     """
 
@@ -178,7 +177,7 @@ class State:
     kept: Mapping[str, Kept] = field(default_factory=dict)
     apart: tuple[Apart, ...] = ()
     guessed: float = SCALE_SPREAD
-    explained: tuple[Family, ...] = ()
+    rejected: tuple[Family, ...] = ()
     outcome: Outcome | None = None
 
     def of_block(self, block: int) -> tuple[Family, ...]:
@@ -237,7 +236,7 @@ def allow(state: State, families: Sequence[Family]) -> State:
     more = [family for family in families if not state.allows(family.name)]
     state = replace(
         state, families=(*state.families, *more), values={**values, **state.values},
-        explained=tuple(family for family in state.explained if family.name not in names),
+        rejected=tuple(family for family in state.rejected if family.name not in names),
     )  # fmt: skip
     return state.moved(state.values) if begun else state
 
@@ -249,8 +248,8 @@ def forbid(state: State, families: Sequence[Family]) -> State:
     left = tuple(family for family in state.families if family.name not in names)
     values = {f.variable: state.values[f.variable] for f in left}
     groups = {name: group for name, group in state.groups.items() if name not in gone}
-    explained = (*state.explained, *families)
-    return replace(state, families=left, groups=groups, explained=explained).moved(values)
+    rejected = (*state.rejected, *families)
+    return replace(state, families=left, groups=groups, rejected=rejected).moved(values)
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:

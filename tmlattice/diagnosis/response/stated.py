@@ -72,11 +72,11 @@ def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -
 
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
-    """Root F of the covariance F F^T by unknown prior scales, those of rejected families too,
+    """What unknown prior scales add to the covariance, rejected families included: F, of F F^T,
     [parameter, direction]; see `stated`."""
     tried = [
         family
-        for family in state.explained
+        for family in state.rejected
         if family.block == block and family.per == "ring" and family.size(state.data) <= MAX_MEMBERS
     ]
     whole = linear(allow(state, tried), block) if tried else there

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.state import DRIFT, KINDS, PLACE, WAVED, State
+from tmlattice.diagnosis.response.state import DRIFT, KINDS, PLACE, State
 from tmlattice.inference.common import amounts, common, times_precision
 from tmlattice.inference.priors import Group
 
@@ -33,9 +33,7 @@ counts as much for each BPM."""
 LEAST = 0.05
 """Least misfit of a column, as a share of the noise."""
 DAMPING = 0.7
-"""Damping of the misfits' steps: columns and BPMs would oscillate otherwise."""
-STEPS = 5
-"""Steps of a plane required for the scale of jitter."""
+"""Share of a step of the misfits that is taken: columns and monitors would else take turns."""
 MEDIAN_SQUARE = 0.455
 """Median of chi-square of one degree of freedom."""
 
@@ -77,7 +75,7 @@ def patterns(state: State, block: int) -> Array:
     data, at, noise = state.data, state.at, state.noise
     plane = data.plane_of(block)
     out = np.zeros((data.shape[0], noise.size.shape[2], data.shape[1]))
-    if WAVED[block] in noise.kinds:
+    if "waves" in noise.kinds and block == 1:
         out[:, KINDS["waves"]] = noise.waves[plane]
     if "drift" in noise.kinds:
         out[:, KINDS["drift"]] = at.seen(at.beam)[-1].T[plane][:, None]
@@ -85,23 +83,8 @@ def patterns(state: State, block: int) -> Array:
         kicks = data.kicks * (1 + at.errors.calibration)
         out[:, KINDS["place"]] = (data.pick(at.seen(at.jumps)) * kicks[:, None])[:, None]
     out *= noise.size[block][:, :, None]
-    # the RF's orbit is single: its common modes are its own, except for beam jitter
-    out[-1] = 0.0
-    read = plane[-1]
-    out[-1, KINDS["waves"]] = noise.waves[read] * _jitter(state, read)
+    out[-1] = 0.0  # the RF's orbit is one step: nothing is common to it and others
     return out
-
-
-def _jitter(state: State, read: int) -> float:
-    """rms amount of each wave of the jitter in a plane, m, from steps of either plane, with the
-    model discrepancy of these steps."""
-    noise = state.noise
-    sizes = [
-        float(noise.scale[block, read, 0]) if WAVED[block] in noise.kinds else 0.0
-        for block in (0, 1)
-        if (state.fitted & (state.data.plane_of(block) == read)).sum() >= STEPS
-    ]
-    return min(sizes, default=0.0)
 
 
 def taken(state: State, block: int) -> Array:
@@ -165,17 +148,13 @@ def learnt(state: State, spent: dict[int, Spent], alike: bool = False) -> State:
     return replace(state, noise=replace(new, column=column, monitor=monitor))
 
 
-def with_waves(state: State, block: int) -> State:
-    """The state with orbit waves in each step, with a scale by least squares, because misfits would
-    absorb them.
-
-    Args:
-        state: without.
-        block: of the steps that have some.
-    """
-    old = state.noise
+def with_waves(state: State) -> State:
+    """Return the state with orbit waves in the plane that is not kicked, as a common mode of each
+    step. Their first size is that of a least-squares fit to the residuals: given discrepancies that
+    contain them already, they would stay at zero."""
+    old, block = state.noise, 1
     noise = replace(
-        old, kinds=(*old.kinds, WAVED[block]), column=old.column.copy(), size=old.size.copy(),
+        old, kinds=(*old.kinds, "waves"), column=old.column.copy(), size=old.size.copy(),
         scale=old.scale.copy(),
     )  # fmt: skip
     use, plane = used(state, block), state.data.plane_of(block)
@@ -220,7 +199,7 @@ def _learn_modes(
         for kind, (name, which) in enumerate(KINDS.items()):
             own = np.ix_(mine, there[which])
             now = noise.size[block][own]
-            if not now.size or (WAVED[block] if name == "waves" else name) not in noise.kinds:
+            if not now.size or name not in noise.kinds or (name == "waves" and block == 0):
                 continue
             group = Group(
                 name, np.eye(now.size), noise.scale[block, read, kind],
