@@ -147,7 +147,7 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
 
 
 def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None = None) -> Figure:
-    """The same around one finding, with the monitors; linear, so that neighbours can be told apart.
+    """The same around one finding, with the monitors; linear, so that neighbours are separated.
 
     Args:
         diagnosis: of `diagnose`.
@@ -266,7 +266,7 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     side.set_xticks(range(len(best)), [find(effect).label for effect in best])
     side.tick_params(axis="x", labelrotation=90, labelsize="x-small", labelbottom=True)
     for label in side.get_xticklabels():
-        label.set_in_layout(False)  # they hang into the empty corner beside the strip
+        label.set_in_layout(False)  # they hang into the empty corner next to the strip
     side.set_xlim(-0.7, max(len(best), 1) - 0.3)
     side.set_title("whole ring", fontsize="small")
 
@@ -294,7 +294,7 @@ def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | N
 
 # --- the gap --------------------------------------------------------------------------------------
 LABEL = 34
-"""Letters of a line beside a bar."""
+"""Letters of a line next to a bar."""
 
 
 def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
@@ -344,7 +344,7 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
 
 
 def gap_axes(diagnosis: Diagnosis) -> Axes:
-    """High enough for all names beside the bars."""
+    """High enough for all names next to the bars."""
     labels = gap_labels(diagnosis)
     lines = max(len(wrap(label, LABEL)) for label in labels)
     height = 1.3 + max(0.5, 0.1 + 0.17 * lines) * max(len(labels), 2)
@@ -367,7 +367,7 @@ def gap_labels(diagnosis: Diagnosis) -> list[str]:
     """What each model of the held-out gap has in it beyond the one before, the design first."""
     steps = 0 if diagnosis.heldout is None else len(diagnosis.heldout.misfits)
     if diagnosis.priors:
-        return [diagnosis.ring.model, "+ small errors everywhere", "+ what was found"][:steps]
+        return [diagnosis.ring.model, "+ distributed errors", "+ findings"][:steps]
     faults = (f"+ {find(c.effect).words} {c.element or ''}".rstrip() for c in diagnosis.faults)
     return [diagnosis.ring.model, *faults][:steps]
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Small:
-    """What is drawn small, beside the orbit: by so much of the ring's size, outside positive."""
+    """A small symbol next to the orbit. `beside`: offset over the ring's size, outside positive."""
 
     marker: str
     colour: str
@@ -63,7 +63,7 @@ def place_of(finding: Finding, diagnosis: Diagnosis, plan: Survey) -> Array | No
 
 
 def inwards(place: Array, plan: Survey) -> tuple[str, str]:
-    """Where beside a place its name has room: towards the middle of the ring."""
+    """The side of a place where its name has space: towards the middle of the ring."""
     away = place - plan.ends.mean(axis=0)
     side = "left" if away[0] > 0 else "right"
     if abs(away[1]) > abs(away[0]):
@@ -109,7 +109,7 @@ def label(number: int, finding: Finding) -> str:
 
 
 def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
-    """The ring from above: magnets along the orbit, monitors and correctors small, culprits marked.
+    """The ring from above: magnets along the orbit, small monitors and correctors, marked findings.
 
     Args:
         diagnosis: of `diagnose`.

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 BEFORE, AFTER = "C0", "C3"
 
 ENOUGH = 4
-"""Monitors before a finding that tell the launch without it."""
+"""Number of monitors before a finding that determines the launch without it."""
 
 
 def _starts(finding: Finding) -> float | None:

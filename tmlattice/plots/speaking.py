@@ -133,7 +133,7 @@ def _lines(measured: Any) -> Iterator[tuple[str, Array]]:
 
 
 def _tunes(measured: TuneReading, ring: Ring | None) -> Figure:
-    """Tunes, and chromaticities where there are some, by shot; the ring's own beside them."""
+    """Tunes, and chromaticities where there are some, by shot, together with the ring's own."""
     told = [("Q{}", measured.tune, measured.tune_error)]
     if measured.chromaticity is not None:
         told.append(("chromaticity {}", measured.chromaticity, measured.chromaticity_error))

@@ -29,7 +29,7 @@ def plot_spectrum(
         states: at the start of each turn, [turns, n].
         plane: 0 for x, 1 for y.
         ax: where to draw; else a new one.
-        optics: for the normalisation, which tells Q from 1 - Q.
+        optics: for the normalisation, which separates Q from 1 - Q.
         colour: of the line.
     """
     if ax is None:

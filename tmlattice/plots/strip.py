@@ -65,7 +65,7 @@ def _sign(element: Any) -> float:
 
 
 def plain_log(ax: Axes) -> None:
-    """A logarithmic axis upwards with 1, 2, 5, 10 beside it, not powers."""
+    """A logarithmic vertical axis whose labels are 1, 2, 5, 10 instead of powers."""
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")

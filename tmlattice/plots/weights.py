@@ -1,4 +1,4 @@
-"""What a network says of its ring, along s."""
+"""Figure of the errors that a network's weights show, along s."""
 
 from typing import TYPE_CHECKING
 
