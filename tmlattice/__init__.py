@@ -4,7 +4,7 @@ The package determines from beam measurements which element of a ring is wrong, 
 which standard error, and what the data leave open. It reads first turns, turn-by-turn data, closed
 orbits, dispersion, tunes and orbit response matrices. It then computes the power supply settings
 that correct the optics. Each magnet is a second-order Taylor map from OCELOT. The ring is also a
-PyTorch network with one layer per magnet, which predicts the tunes from a single first turn.
+PyTorch network with one layer per magnet: fine-tuned on one first turn, it predicts the tunes.
 
 The tour
 --------

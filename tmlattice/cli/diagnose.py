@@ -141,8 +141,8 @@ def diagnose(
     measurements of one machine are diagnosed together. The verdict is one of named, equivalent
     (several explanations fit alike), located (an error that the catalogue does not explain),
     distributed (no single place) and nothing; the exit code is 0 for each of them. The diagnosis of
-    an orbit response alone has a step for each family of errors; options about launches have no
-    effect on it.
+    an orbit response alone has a step for each family of errors; options about launches do not
+    apply to it.
     """
     from tmlattice.files import output_file, output_folder
 
