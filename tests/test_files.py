@@ -154,7 +154,7 @@ def test_a_lock_that_somebody_keeps_stops_no_output(tmp_path, monkeypatch):
 def test_devices_and_pipes_stay_what_they_are(tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    with pytest.raises(OutputError, match="nobody reads this pipe"), output_file(pipe) as path:
+    with pytest.raises(OutputError, match="no process reads this pipe"), output_file(pipe) as path:
         path.write_text("x")
     told = []
     reader = threading.Thread(target=lambda: told.append(pipe.read_text()))

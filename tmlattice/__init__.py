@@ -1,12 +1,14 @@
-"""tmlattice: the gap between the model of a storage ring and the ring itself.
+"""tmlattice: find the difference between a storage ring and its model.
 
-Magnets as second-order Taylor maps from OCELOT, the ring as a network of one unshared layer per
-magnet; from one first turn, or from whatever else was measured, to the tunes and to the magnet that
-is wrong.
+The package determines from beam measurements which element of a ring is wrong, by how much, with
+which standard error, and what the data leave open. It reads first turns, turn-by-turn data, closed
+orbits, dispersion, tunes and orbit response matrices. It then computes the power supply settings
+that correct the optics. Each magnet is a second-order Taylor map from OCELOT. The ring is also a
+PyTorch network with one layer per magnet: fine-tuned on one first turn, it predicts the tunes.
 
 The tour
 --------
-A ring is a built-in name, a lattice file (OCELOT, AT, MAD-X, elegant, Xsuite), an object of AT,
+Load a ring: a built-in name, a lattice file (OCELOT, AT, MAD-X, elegant, Xsuite), an object of AT,
 Xsuite, OCELOT or cpymad, or a `Ring`:
 
 >>> import tmlattice
@@ -14,23 +16,25 @@ Xsuite, OCELOT or cpymad, or a `Ring`:
 >>> ring["qd*"], ring.twiss().to_dataframe(), ring.to_at()
 >>> figure = ring.plot()                                   # betas and magnets
 
-A machine whose fault is known, what its monitors read, and what that says:
+Simulate a machine with a known fault, and diagnose its readings:
 
 >>> weak = [tmlattice.Cause("quadrupole_gradient", "qd::12", -0.2)]
 >>> measurement = tmlattice.simulate(ring, weak, shots=6, seed=1).measurement()
 >>> diagnosis = tmlattice.diagnose(ring, measurement)
 >>> print(diagnosis.report())                              # diagnosis.plot(), .save("folder")
 
-Your own: a folder, or a control room's file (`tmlattice import --example --out x` has templates):
+Diagnose your own data: a measurement folder, or a file of a control room
+(`tmlattice import --example --out x` writes templates):
 
 >>> diagnosis = tmlattice.diagnose("machine.madx", "readings.csv")      # or a pandas DataFrame
 >>> diagnosis.tables["errors"]                                          # and data frames back
 
-The paper's experiment, one orbit to the tunes, by the recipe and by what does better:
+Repeat the paper's experiment, the tunes from one orbit, by the paper's recipe and by the sparse
+fit:
 
 >>> print(tmlattice.tune_fit("petra3").advice)
 
-The network itself:
+Use the network itself:
 
 >>> network = tmlattice.TaylorNetwork.from_ring(ring)
 >>> readings = network([[1e-3, 0, 1e-3, 0]])               # [1, 246, 2], m
@@ -39,13 +43,19 @@ The network itself:
 
 Where things are
 ----------------
-`lattice` rings and their files; `effects` what can be wrong, `CATALOGUE`; `measurement` what was
-read; `importers` other programs' files; `machine` the virtual machine; `diagnosis`, `fitting`;
-`optics`, `harmonics`; `plots`; `report`. Each is there after `import tmlattice`, and each says in
-its own `help` what it holds. On the command line: `tmlattice --help`.
+- `lattice`: rings and their files; `maps`, `optics`, `harmonics`: Taylor maps, optics and tunes
+- `effects`: the errors that a ring can have, with `CATALOGUE`
+- `measurement`: kinds of measurement; `importers`: files of other programs
+- `machine`: the simulated machine
+- `diagnosis`, `correction`: the fault, and the settings that correct the optics
+- `network`, `fitting`: the network, and its fine-tuning on readings
+- `plots`, `report`: figures and pages
 
-Names and rooms are imported when they are first used: `import tmlattice` itself loads neither torch
-nor OCELOT, which take seconds.
+Each package is available after `import tmlattice`, and its `help` states what it holds. On the
+command line, `tmlattice --help` lists the commands.
+
+Names and packages are imported when they are first used: `import tmlattice` itself loads neither
+torch nor OCELOT, which take seconds.
 """
 
 import sys

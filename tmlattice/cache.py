@@ -5,7 +5,7 @@ name and moved, so that several processes may share the folder; it begins with a
 and its bytes, and one that does not fit is made anew. Nothing in it is ever executed.
 
 The folder is `tmlattice` below the one that `TMLATTICE_CACHE` names (`off`: none), else below
-`XDG_CACHE_HOME` or `~/.cache`. It is used only if it belongs to this user and nobody else can write
+`XDG_CACHE_HOME` or `~/.cache`. It is used only if it belongs to this user and no one else can write
 to it. Files that have no name of an entry are left alone.
 """
 
@@ -45,7 +45,7 @@ def folder() -> Path | None:
 
 
 def is_private(state: os.stat_result) -> bool:
-    """Whether a file or folder is this user's own and nobody else can write to it."""
+    """Whether a file or folder belongs to this user and no one else can write to it."""
     return state.st_uid == os.geteuid() and not state.st_mode & 0o022
 
 
@@ -90,7 +90,7 @@ def own_folder(name: str) -> Path | None:
 
 @contextlib.contextmanager
 def _opened() -> Iterator[int | None]:
-    """A descriptor of the folder, so that nobody can exchange it meanwhile; None where there is
+    """A descriptor of the folder, so that no one can replace it meanwhile; None where there is
     none, or others could have written to it."""
     place = folder()
     if place is None or not place.exists() or not private_or_warn(place):

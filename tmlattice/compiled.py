@@ -1,8 +1,8 @@
 """How kernels are compiled, and where what numba made of them is kept: it is code.
 
-It lies beside the package's own files; where those cannot be written, in the cache folder
-(`tmlattice.cache`), or in the folder that `NUMBA_CACHE_DIR` names, if it is this user's own and
-nobody else can write to it.
+It lies next to the package's own files. If those cannot be written, it lies in the cache folder
+(`tmlattice.cache`), or in the folder that `NUMBA_CACHE_DIR` names, if that folder belongs to this
+user and no one else can write to it.
 
 >>> @jit
 ... def kernel(first, last, values): ...
@@ -20,7 +20,7 @@ _PACKAGE = Path(__file__).parent
 
 
 def _place() -> str:
-    """The folder that numba is told; "" where it is that of the package's files, or none."""
+    """The cache folder that is passed to numba; "": the one of the package's files, or none."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return chosen if private_or_warn(Path(chosen), "NUMBA_CACHE_DIR") else ""
     return "" if os.access(_PACKAGE, os.W_OK) else str(own_folder("numba") or "")

@@ -1,4 +1,4 @@
-"""The package's own errors. Each message is one sentence: what is wrong, where, what mends it."""
+"""Errors of the package. Each message is one sentence: what is wrong, where, how to correct it."""
 
 import difflib
 import unicodedata
@@ -37,7 +37,7 @@ def first_of(names: Sequence[object], most: int = 5) -> str:
 
 
 class TmlatticeError(Exception):
-    """Input that cannot be used, or a result that does not exist; the message says the mend."""
+    """Input that cannot be used, or a result that does not exist; the message states what to do."""
 
 
 class LatticeError(TmlatticeError):
@@ -77,8 +77,7 @@ class ChoiceError(TmlatticeError, ValueError):
 
 
 class MissingPackageError(TmlatticeError, ImportError):
-    """A package that not everything needs, and that is not installed; the message says the extra
-    that brings it."""
+    """An optional package that is not installed; the message states the extra that installs it."""
 
 
 class EffectError(TmlatticeError):

@@ -96,14 +96,14 @@ def output_file(path: Path) -> Iterator[Path]:
     What a link points to is replaced, not the link; a device or a pipe is written to.
 
     Raises:
-        OutputError: the folder is not there or cannot be written, or nobody reads the pipe.
+        OutputError: the folder is missing or cannot be written, or no process reads the pipe.
     """
     try:
         special = path.exists() and not path.is_file() and not path.is_dir()
         path = path.absolute() if special else path.resolve()
         if path.is_dir():
             raise OutputError(f"'{path}' is a folder; name a file")
-        # beside a device no file may be made: the system's folder for temporary files then
+        # no file may be made next to a device: the system's folder for temporary files then
         made = temporary_file(None if special else path.parent)
         temporary = made.__enter__()
     except (OSError, RuntimeError, ValueError) as error:
@@ -130,7 +130,7 @@ def _pour(made: Path, device: Path) -> None:
         descriptor = os.open(device, os.O_WRONLY | waits)
     except OSError as error:
         if error.errno == errno.ENXIO and waits:
-            raise OSError(errno.ENXIO, "nobody reads this pipe") from error
+            raise OSError(errno.ENXIO, "no process reads this pipe") from error
         raise
     os.set_blocking(descriptor, True)
     with made.open("rb") as source, os.fdopen(descriptor, "wb") as sink:

@@ -5,7 +5,7 @@
 >>> tune.fraction                                       # [batch, 2], (x, y), in turns
 
 The normalised complex coordinate z = x_N - i p_N (`Optics.normalised`) turns by +Q a turn, so Q and
-1 - Q differ: a real signal cannot tell them apart, and the wrong sign would exchange them. Motion
+1 - Q differ: a real signal cannot separate them, and the wrong sign would exchange them. Motion
 that grows or shrinks (a network that is not symplectic) keeps its phase: the trend of log |z| is
 taken out before the line is sought.
 """

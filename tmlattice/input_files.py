@@ -54,8 +54,8 @@ def _check(path: Path, status: os.stat_result, error: type[TmlatticeError]) -> N
 def content_of(path: Path, error: type[TmlatticeError]) -> bytes:
     """The bytes of a regular file, no more than it states to have.
 
-    A pipe is not waited for, and of a file without an end (of a virtual file system) nothing is
-    read.
+    A pipe is not waited for. Nothing is read of an endless file, such as one of a virtual file
+    system.
 
     Raises:
         error: it cannot be read, is no regular file, or is larger than `MOST_BYTES`.

@@ -36,7 +36,7 @@ class MachineFile:
         lattice: a built-in name, or a path that is relative to the working directory as `path` is;
             None: the file names none.
         options: of `load_ring`, for this lattice: sequence, energy, particle, monitors, correctors.
-        told: of files of readings: unit, noise, names, bad monitors, conventions.
+        told: stated for files of readings: unit, noise, names, bad monitors, conventions.
         supplies: path of a table of knobs, or its rows; None: the file states none.
         trusted: a lattice that is Python code may be run.
     """

@@ -182,7 +182,7 @@ def normal_modes(matrix: Array) -> tuple[ComplexArray, ComplexArray]:
 def matrix_tunes(matrix: Array) -> Array:
     """Fractional tunes (x, y) in [0, 1) of a 4x4 one-turn matrix, [2].
 
-    Q and 1 - Q are told apart by the direction in which the eigenvectors turn.
+    Q and 1 - Q are distinguished by the direction in which the eigenvectors turn.
 
     Raises:
         UnstableRingError: no tune exists.

@@ -6,7 +6,7 @@ from pathlib import PurePath
 
 
 class Speaks:
-    """Shows what `_told` tells. A dataclass of it has `repr=False`."""
+    """Shows the title and rows that `_told` returns. Its dataclasses have `repr=False`."""
 
     def _told(self) -> tuple[str, dict[str, str]]:
         """A title, and what is worth knowing, each with its name."""

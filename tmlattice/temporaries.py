@@ -1,4 +1,4 @@
-"""Temporary files and folders beside what they become.
+"""Temporary files and folders next to what they become.
 
 A temporary is locked by its process until it is moved or removed. A killed process holds no lock:
 what it left is known by that, and removed by the next that makes a temporary in the same folder.
@@ -135,7 +135,7 @@ def remove_stale(folder: Path) -> None:
 
 
 def _is_stale(entry: "os.DirEntry[str]") -> bool:
-    """Whether nobody holds its lock. Where locks are not known, nothing is taken for stale."""
+    """Whether no process holds its lock. Where locks are unavailable, nothing counts as stale."""
     try:
         import fcntl
 

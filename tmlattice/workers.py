@@ -41,7 +41,7 @@ class Caught(NamedTuple):
 
 
 def caught(work: Callable[..., Any], *arguments: Any) -> Caught:
-    """Do the work, its warnings kept: a worker's standard error reaches nobody for certain."""
+    """Do the work and keep its warnings, as a worker's standard error may reach no one."""
     with warnings.catch_warnings(record=True) as told:
         result = work(*arguments)
     return Caught(result, tuple((str(w.message), w.category) for w in told))
@@ -51,7 +51,7 @@ _heard: set[str] = set()
 
 
 def heard(made: Caught) -> Any:
-    """The result; its warnings are told here, each once in this process."""
+    """Return the result and issue its warnings, each once in this process."""
     for text, category in made.warnings:
         if text not in _heard:
             _heard.add(text)

@@ -63,7 +63,7 @@ class CaseSettings:
         shots: of first turns, and kicks of a stored beam.
         signal, amount: see `Draw`.
         background: rms of distributed errors by effect.
-        told: whether the diagnosis is given these rms.
+        told: whether the diagnosis is given these rms values.
     """
 
     tier: str

@@ -182,7 +182,7 @@ def _check(
         raise TmlatticeError("a reference is for tier B; leave --reference out")
     if learnt and (tier != "B" or reference or told):
         raise TmlatticeError(
-            "a machine is learnt in tier B alone, without --reference or --told; leave --learnt out"
+            "--learnt is for tier B, without --reference or --told; leave --learnt out"
         )
     if background and tier != "B" and not kinds:
         raise TmlatticeError(

@@ -108,8 +108,8 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
 
 
 def one_action(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | None:
-    """Whether the answer is one finding, named, with the action that takes the true cause away;
-    None of a result from before there were remedies."""
+    """Whether the answer is one finding, named, with the action that corrects the true cause;
+    None for an old result without recommended actions."""
     if any("recommended_action" not in finding for finding in result["findings"]):
         return None
     if result["verdict"] != "identified" or len(result["findings"]) != 1:

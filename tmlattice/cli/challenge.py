@@ -87,7 +87,7 @@ def _cluster_options(function: Any) -> Any:
 )
 @click.option("--effect", "effects", multiple=True, help="Draw from these alone (repeat).")
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
-@background_option("Tiers B, E, R, T, P and M: small errors everywhere")
+@background_option("Tiers B, E, R, T, P and M: distributed errors")
 @quiet_option
 def make(
     tier: str,
@@ -97,11 +97,11 @@ def make(
     background: tuple[tuple[str, float | None], ...],
     **options: Any,
 ) -> None:
-    """Make cases of a TIER: A one effect, B one among small errors everywhere, C two or three,
-    D one that the catalogue does not hold, E none, all in first turns; R one in an orbit response,
-    T in turns of a stored beam, M in two or three kinds together, P what changed between two.
+    """Make cases of a TIER: A one effect, B one among distributed errors, C two or three, D one
+    outside the catalogue, E none, all in first turns; R one in an orbit response, T in turns of a
+    stored beam, M in two or three kinds together, P what changed between two.
 
-    AT is the real machine. The truth goes to the folder's `truth`, which only `score` opens.
+    AT simulates the real machine. The folder's `truth` holds the truth; only `score` opens it.
     """  # fmt: skip
     from tmlattice.challenge import make as make_cases
 
@@ -167,7 +167,7 @@ def score(
     json_file: Path | None,
     quiet: bool,
 ) -> None:
-    """Hold the results in FOLDER against the truth, beside oracle and baselines."""
+    """Score the results in FOLDER against the truth, together with oracle and baselines."""
     from tmlattice.challenge import score as score_cases
     from tmlattice.files import output_file, output_folder, write_json
 

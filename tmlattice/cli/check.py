@@ -41,12 +41,11 @@ def check(
     json_file: Path | None,
     quiet: bool,
 ) -> None:
-    """Say what is wrong with a measurement as a whole, in a second.
+    """Check a measurement as a whole for errors of the data, in a second.
 
-    Wrong signs, units, names and orders everywhere; launches and noise that are not what is
-    stated; silent, frozen, copied monitors; single readings far off. MEASUREMENT is a folder of
-    any kind. The exit code is 0 where a diagnosis means something, 1
-    where something has to be mended first.
+    The check finds wrong signs, units, names and orders; launches and noise that contradict the
+    stated ones; silent, frozen and copied monitors; and outliers. MEASUREMENT is a folder of any
+    kind. The exit code is 0 if the data can be diagnosed, and 1 if they must be corrected first.
     """
     from contextlib import nullcontext
 

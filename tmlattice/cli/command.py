@@ -129,9 +129,9 @@ class Terminated(BaseException):
 
 
 def main() -> NoReturn:
-    """Run the command line. Exit code 0: done; 1: done, and told what is wrong (`check`); 2: input
+    """Run the command line. Exit code 0: done; 1: done, and errors reported (`check`); 2: input
     that cannot be used; 128 and the signal's number: stopped, 130 by Ctrl-C, 143 by SIGTERM, 141
-    where nobody reads the output."""
+    if no process reads the output."""
     _prepare()
     code = 0
     try:
@@ -211,5 +211,5 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    if not issubclass(category, RuntimeWarning):  # numpy's, of numbers that are judged elsewhere
+    if not issubclass(category, RuntimeWarning):  # numpy's, of numbers that are checked elsewhere
         click.echo(f"tmlattice: warning: {harmless(str(message))}", err=True)

@@ -19,7 +19,7 @@ def compare(first: str, second: str, json_file: Path | None, quiet: bool) -> Non
     A and B are folders of `tmlattice diagnose --out` (or a diagnosis.json); built-in names or
     lattice files; or measurement folders. Errors are differences over their standard errors, both
     taken as independent. Of a response each corrector's orbits are compared at the kick of A: rms
-    of the difference beside what the noise alone makes, and the ratio of the two responses.
+    of the difference, the rms that the noise alone makes, and the ratio of the two responses.
     """
     from tmlattice.files import output_file, write_json
     from tmlattice.report.compare import compare as run

@@ -40,7 +40,7 @@ class TargetText(click.ParamType):  # type: ignore[type-arg]
         except ValueError:
             tolerance = -1.0
         if tolerance is not None and not 0 < tolerance < float("inf"):
-            self.fail(f"'{text}' is no tolerance; give {name}=0.01, say", param, ctx)
+            self.fail(f"'{text}' is no tolerance; give for example {name}=0.01", param, ctx)
         return name.strip(), tolerance
 
 
@@ -98,9 +98,9 @@ def correct(
 ) -> None:
     """Settings of power supplies that bring the ESTIMATED ring to the design, with their gain.
 
-    ESTIMATED is a lattice file of `diagnose --lattice-out`, beside which stands what the data leave
-    open, or the folder of `diagnose --out` with it. Predicted rms errors have 68 % intervals. A
-    correction whose expected gain is below its error changes no setting.
+    ESTIMATED is a lattice file of `diagnose --lattice-out`, with the file of remaining
+    uncertainties next to it, or the folder of `diagnose --out` with it. Predicted rms errors have
+    68 % intervals. A correction whose expected gain is below its error changes no setting.
     """
     from contextlib import ExitStack
 

@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
     metavar="DIR",
     multiple=True,
     help="A measurement of the same machine and kind before the fault: static errors cancel, and "
-    "what changed is told. Repeat it where several are diagnosed together.",
+    "the diagnosis reports what changed. Repeat it if several are diagnosed together.",
 )
 @click.option(
     "--settings",
@@ -58,13 +58,13 @@ log = logging.getLogger(__name__)
     help="settings.csv of `tmlattice correct`, applied between the reference and the measurement: "
     "the calibration of each device, measured over asked change, is printed.",
 )
-@background_option("Small errors everywhere (not given: the data say)")
+@background_option("Distributed errors (not given: estimated from the data)")
 @assume_option
 @click.option(
     "--max-effects",
     type=click.IntRange(1),
     default=None,
-    help="Findings at most: 8 where nothing is said, 40 of a change between two responses. Of an "
+    help="Findings at most: 8 by default, 40 of a change between two responses. Of an "
     "orbit response, steps that are kept at most: all.",
 )
 @click.option(
@@ -96,17 +96,17 @@ log = logging.getLogger(__name__)
     "--lattice-out",
     type=FILE,
     metavar="FILE",
-    help="The ring as found, with its errors: .json (the package's own), .at.json (AT), "
-    ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json beside it "
-    "holds what monitors and correctors do (`tmlattice predict`).",
+    help="The estimated ring, with its errors: .json (the package's own), .at.json (AT), "
+    ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json next to it "
+    "holds the calibration of monitors and correctors (`tmlattice predict`).",
 )
 @click.option(
     "--corrected-out",
     type=FILE,
     metavar="FILE",
-    help="The ring repaired, in the same formats: the design with the settings that, loaded into "
-    "the machine as found, make it the design again (a quadrupole that gives 20 % less is told "
-    "25 % more). What no setting mends is printed.",
+    help="The corrected ring, in the same formats: the design with the settings that, loaded into "
+    "the real machine, restore the design (a quadrupole that gives 20 % less is set 25 % higher). "
+    "Errors that no setting corrects are printed.",
 )
 @json_option
 @click.option(
@@ -133,16 +133,16 @@ def diagnose(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Say where the ring differs from LATTICE, by which effect, and how far the gap shrinks.
+    """Find where the ring differs from LATTICE, by which effect, and how far the misfit shrinks.
 
     MEASUREMENT is a folder, as `tmlattice simulate` writes it: first turns, turns of a stored beam,
-    a closed orbit, dispersion, tunes, an orbit response; or a file of first turns as a control room
-    has it (.csv, .txt, .h5, .sdds), its columns taken as they come and what is assumed of them
-    said. Several of one machine are diagnosed
-    together. The verdict is one of named, equivalent (several explanations fit alike), located
-    (something is there that the catalogue does not explain), distributed (no single place) and
-    nothing; the exit code is 0 for each of them. An orbit response alone ends in a step for each
-    family of errors, and options that speak of launches have no meaning for it.
+    a closed orbit, dispersion, tunes, an orbit response; or a control room's file of first turns
+    (.csv, .txt, .h5, .sdds), whose columns are recognised; the assumptions are printed. Several
+    measurements of one machine are diagnosed together. The verdict is one of named, equivalent
+    (several explanations fit alike), located (an error that the catalogue does not explain),
+    distributed (no single place) and nothing; the exit code is 0 for each of them. The diagnosis of
+    an orbit response alone has a step for each family of errors; options about launches do not
+    apply to it.
     """
     from tmlattice.files import output_file, output_folder
 
@@ -209,7 +209,7 @@ def diagnose(
             source["lattice_out"] = str(lattice_out.absolute())
         known = None
         if lattice_out:
-            tell("what is left known")  # minutes, of a large response
+            tell("remaining uncertainties")  # minutes, of a large response
             from tmlattice.diagnosis.twin import known_of
 
             known = known_of(result)
@@ -252,20 +252,20 @@ def _read(
 
 
 def _not_used(lattice: str) -> list[str]:
-    """What stands beside a lattice that an orbit response does not start from."""
+    """The file next to a lattice that the diagnosis of an orbit response does not use."""
     from tmlattice.diagnosis.twin import knowledge_file
 
     beside = knowledge_file(Path(lattice))
     if not beside.is_file():
         return []
     return [
-        f"'{beside}' is not used: an orbit response tells calibrations and small errors by itself; "
-        "--reference says what changed since an earlier one"
+        f"'{beside}' is not used: an orbit response determines calibrations and distributed errors "
+        "by itself; give --reference to find what changed since an earlier one"
     ]
 
 
 def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
-    """What an earlier diagnosis left known beside the ring as it found it."""
+    """The uncertainties that an earlier diagnosis wrote next to its estimated ring."""
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, read_known
 
     beside = knowledge_file(Path(lattice))
@@ -323,7 +323,7 @@ def _write_rings(
     lattice_out: Path | None,
     corrected_out: Path | None,
 ) -> dict[str, tuple[str, ...]]:
-    """The ring as found and the ring repaired: the files, with what they do not hold."""
+    """The estimated ring and the corrected ring: the files, with what they do not hold."""
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import write_ring

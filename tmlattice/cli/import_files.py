@@ -70,8 +70,8 @@ def import_files(
     FILES are a MATLAB LOCO file (.mat); the Middle Layer's response, dispersion and noise (.mat)
     with the machine's LOCO file; the HDF5 files of a response with name_mapping.json and the
     lattice (.mat); a table of readings or of a response (.csv, .txt, .h5, .sdds) with --lattice,
-    its columns taken as they come; or a turn-by-turn file. What was assumed (units, signs, steps)
-    is printed, and what the data contradict: nothing is mended silently.
+    whose columns are recognised; or a turn-by-turn file. The assumptions (units, signs, steps) are
+    printed, and what the data contradict: nothing is corrected silently.
     """
     if example:
         if files:

@@ -59,7 +59,7 @@ class BackgroundText(click.ParamType):  # type: ignore[type-arg]
         try:
             return name.strip(), float(size) if size else None
         except ValueError:
-            self.fail(f"'{size}' is no rms; give {name}=1e-3, say", param, ctx)
+            self.fail(f"'{size}' is no rms; give for example {name}=1e-3", param, ctx)
 
 
 def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -308,7 +308,7 @@ def _identities(path: Path) -> set[Any]:
 
 
 def no_numbers(error: Exception) -> str:
-    """What to say of data whose numbers end a calculation: singular, without end, too many."""
+    """The message for data whose numbers end a calculation: singular, not finite, too many."""
     from tmlattice.errors import plain
 
     said = plain(str(error), 100) or type(error).__name__
@@ -319,7 +319,7 @@ def no_numbers(error: Exception) -> str:
 
 
 def open_ring(lattice: str, read: bool = True) -> "Ring":
-    """The ring of a lattice, by what the machine file states of it; a part of a ring is told.
+    """The ring of a lattice, as the machine file states it; warn if it is a part of a ring.
 
     Args:
         lattice: a built-in name or a path.
@@ -436,7 +436,7 @@ def trajectories(path: Path, refusal: str, ring: "Ring", quiet: bool) -> "Measur
     """The first turns of a measurement folder, or of a file of readings; see `read_data`.
 
     Raises:
-        MeasurementError: a measurement of another kind, with what the command says to it.
+        MeasurementError: a measurement of another kind, with the command's message about it.
     """
     from tmlattice.errors import MeasurementError
     from tmlattice.measurement import Measurement, in_words

@@ -1,4 +1,4 @@
-"""`tmlattice dev reproduce`: the paper's other systems, its figures beside ours."""
+"""`tmlattice dev reproduce`: the paper's other systems, its figures compared with ours."""
 
 from collections.abc import Callable
 from contextlib import ExitStack

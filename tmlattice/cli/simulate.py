@@ -55,7 +55,7 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     multiple=True,
     help="What is wrong with the machine; repeat for more.",
 )
-@background_option("Random small errors everywhere")
+@background_option("Random distributed errors")
 @click.option(
     "--kind",
     type=click.Choice(list(KINDS)),

@@ -14,7 +14,7 @@ KINDS: Mapping[str, frozenset[str]] = {
     "dispersion": frozenset(),
     "tunes": SHOTS,
 }
-"""The options that a kind has beside those of all."""
+"""The options that a kind has in addition to those of all."""
 
 
 def simulate_stored(

@@ -57,8 +57,8 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     default="adam,map,sparse",
     show_default=True,
     metavar="NAME,...",
-    help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, told (sparse that "
-    "knows the magnet).",
+    help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, told (sparse with "
+    "the known magnet).",
 )
 @click.option(
     "--out",

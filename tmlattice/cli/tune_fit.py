@@ -114,8 +114,8 @@ def tune_fit(
     changed magnets as the readings ask for; map, the most probable changes of all magnets. Under
     them stands which one to trust, and why.
 
-    With --measurement the data are a folder's, launches are fitted too within what the data say of
-    them, and the true tunes are not known.
+    With --measurement the data are a folder's. The launches are fitted too, within their stated
+    errors, and the true tunes are unknown.
     """  # fmt: skip
     if measurement is not None:
         _refuse_own_data(click.get_current_context())
@@ -149,7 +149,7 @@ def tune_fit(
 
 
 OWN_DATA = ("magnet", "change", "launch", "noise")
-"""Options that say how data are made: of no use for data that are there."""
+"""Options that determine how data are simulated; they have no use for measured data."""
 
 
 def _refuse_own_data(context: click.Context) -> None:
@@ -205,7 +205,7 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
     noise = "-" if outcome.noise is None else f"{1e6 * outcome.noise:.4g}"
     estimated = " (estimated)" if outcome.noise_estimated else ""
     if outcome.magnet is None or outcome.change is None:
-        what = f"{outcome.shots} shots of {outcome.source}, launches fitted beside"
+        what = f"{outcome.shots} shots of {outcome.source}, with fitted launches"
     else:
         magnet = outcome.ring[outcome.magnet]
         what = (

@@ -87,7 +87,7 @@ def fine_tune(
         candidates: of the same: the only magnets that may have changed.
         prior, scale, iterations: of "map".
 
-    A warning says where the readings contradict the stated errors of the launches.
+    A warning reports readings that contradict the stated errors of the launches.
 
     Raises:
         ChoiceError: an unknown method; it is a ValueError too.
@@ -103,7 +103,7 @@ def fine_tune(
     options = _options_of(fit, given, chosen)
     if chosen is Method.TOLD and not candidates:
         raise ValueError(
-            "method 'told' is told the magnets that may have changed: give candidates="
+            "method 'told' needs the names of the magnets that may have changed: give candidates="
         )
     if fit is fit_sparse and isinstance(network, SymplecticNetwork):
         if network.ring is None:

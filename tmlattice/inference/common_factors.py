@@ -3,7 +3,7 @@
 >>> model = FactorModel(information, score, candidates, variance, slab)
 >>> [(one.candidate, one.amount, one.sigma) for one in model.reasons(model.choose(20))]
 
-Many numbers (gradients, say) are known with a covariance, and each scatters by itself. A candidate
+Many numbers (such as gradients) have a known covariance, and each scatters by itself. A candidate
 factor moves some of them together: all, a family, one. Factors are selected by adding the one with
 the largest evidence, removing redundant ones, and exchanging. The model is linear and Gaussian, so
 that the error of each amount includes the scatter.

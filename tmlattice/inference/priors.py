@@ -183,8 +183,8 @@ class Group:
     def learn(self, squares: Array, left: Array) -> "Group":
         """Return the group after a Fisher-scoring step of its log scale.
 
-        EM's own step is small where the data say little of a parameter: a scale that starts too
-        small stays there for a hundred rounds. Without data the scale stays near its first guess.
+        EM's step is small if the data hardly determine a parameter: a scale that starts too small
+        stays there for a hundred rounds. Without data the scale stays near its first guess.
 
         Args:
             squares: of the most probable parameters.

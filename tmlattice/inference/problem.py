@@ -1,8 +1,8 @@
 """A measurement as inference sees it: rows, their derivatives, and priors.
 
 A kind of measurement (see `observe`) is a `Problem`. At given causes it gives the residual of its
-readings in units of their noise, and the derivatives by causes and by its own nuisances (launches,
-say). Fit, scan and search use nothing else.
+readings in units of their noise, and the derivatives by causes and by its own nuisances (such as
+launches). Fit, scan and search use nothing else.
 """
 
 from abc import ABC, abstractmethod

@@ -1,6 +1,6 @@
 """Variance components: the sizes of a machine's distributed errors, from its readings.
 
-The errors are Gaussian with one rms per family (an effect, say): C = C0 + sum_h t_h^2 K_h with
+The errors are Gaussian with one rms per family (such as an effect): C = C0 + sum_h t_h^2 K_h with
 K_h = S_h^T S_h of the family's signatures at their usual rms. The scales t_h maximise the
 restricted likelihood, launches projected out, by the average information of Gilmour, Thompson and
 Cullis (1995). A prior keeps families that the readings do not determine near the others. The

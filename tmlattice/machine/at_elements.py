@@ -185,7 +185,8 @@ class Builder:
         return [there, *made, back]
 
     def _thin(self, element: Element, wrong: Build, where: Where) -> list[Any]:
-        """Thin gradients, px -= normal x - skew y, py += normal y + skew x, and other kicks."""
+        """Thin gradients, px -= normal x - skew y, py += normal y + skew x, and linear kicks
+        (px, py) += slopes (x, y)."""
         made: list[Any] = []
         if where in wrong.gradients:
             normal, skew = wrong.gradients[where]

@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 Names = tuple[str, ...]
 
 GAIN, CERTAIN = 12.0, 15.0
-"""Log evidence from which a global error is told, and from which it is certain: no healthy
+"""Log evidence above which a global error is reported, and above which it is certain: no healthy
 measurement of `benchmarks/data_checks.py` gains as much."""
 SHARE = 0.65
 """Share of all changed terms that an assumption must improve: the section of a fault may gain much

@@ -224,7 +224,7 @@ def _robust(residual: Array, there: Mask) -> Array:
     return np.asarray(1.4826 * middle)
 
 
-# --- what is said of it ---------------------------------------------------------------------------
+# --- reported doubts ------------------------------------------------------------------------------
 def _doubts(fit: LineFit, planes: Planes, modes: Modes, warn: Callable[[str], None]) -> None:
     turns = fit.envelope.shape[1]
     there = [line for line in modes if line is not None]

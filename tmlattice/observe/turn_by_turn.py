@@ -2,7 +2,7 @@
 
 A kicked beam oscillates in two modes. Each is a line in the spectrum of every monitor, whose
 complex amplitude is the mode's vector there times one complex number of the shot. That number is a
-nuisance, as the size and phase of the kick are not known well enough. The rest is optics: phases,
+nuisance, as size and phase of the kick are not accurate enough. The rest is optics: phases,
 which are independent of gains, ratios of amplitudes, and betatron coupling. The amplitude shifts
 the lines, see `amplitude`; the deviation of this shift from the design's is a nuisance too, zero
 within the stated error.

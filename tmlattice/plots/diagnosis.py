@@ -294,7 +294,7 @@ def _mark_findings(ax: Axes, diagnosis: Diagnosis, span: tuple[float, float] | N
 
 # --- the gap --------------------------------------------------------------------------------------
 LABEL = 34
-"""Letters of a line beside a bar."""
+"""Letters of a line next to a bar."""
 
 
 def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:

@@ -237,7 +237,7 @@ def comparisons(done: PendulumStudy) -> list[Comparison]:
     ]  # fmt: skip
     for what, made, truth in (
         ("simulated", done.simulated, (f"{TRUE_LENGTH:g} m", f"{TRUE_DAMPING:g} 1/s")),
-        ("filmed swing a", done.real, ("0.28 m, by the builder", "not known")),
+        ("filmed swing a", done.real, ("0.28 m, by the builder", "unknown")),
     ):
         if made is None:
             why = "set TMLATTICE_DATA to the folder that holds pendulum/"
