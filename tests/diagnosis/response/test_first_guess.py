@@ -121,7 +121,7 @@ def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):
     monkeypatch.setattr(hierarchical, "settle", spoilt)
     fit = fit_families(design.data, design.split, FAMILIES[:1])
     assert len(fit.steps) == 1
-    assert "more of the readings that it was fitted to" in fit.messages[-1]
+    assert "residual of the fitted readings is larger than the design's" in fit.messages[-1]
     assert fit.heldout[0] == fit.heldout[1]
 
 
