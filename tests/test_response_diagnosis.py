@@ -344,7 +344,9 @@ def test_a_cause_s_rows_are_what_it_does_to_the_readings(small_ring, measured, c
 
 def test_what_is_missing_is_said(small_ring, measured):
     sparse = measured.select(monitors=measured.monitors[:4])
-    with pytest.raises(MeasurementError, match="too few columns or monitors determine it: state it"):
+    with pytest.raises(
+        MeasurementError, match="too few columns or monitors determine it: state it"
+    ):
         diagnose(small_ring, replace(sparse, noise=None))
     with pytest.raises(MeasurementError, match="cannot be split"):
         diagnose(small_ring, measured.select(correctors=measured.correctors[:2]))
