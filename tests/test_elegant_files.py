@@ -299,7 +299,7 @@ def test_use_says_which_line(tmp_path):
         ({"CH": "UKICKMAP, L=1"}, r"UKICKMAP 'CH' \(line 6 of ring.lte\) acts on the beam"),
         ({"CH": "BRAT, L=1"}, "BRAT 'CH'"),
         ({"CH": "MATR, FILENAME=x.mat"}, "MATR 'CH'"),
-        ({"CH": "HPOLE, L=1"}, "element class 'HPOLE' is not known"),
+        ({"CH": "HPOLE, L=1"}, "element class 'HPOLE' is unknown"),
         ({"CH": "KQU, L=1"}, "element class 'KQU' may be KQUAD, KQUSE"),
         ({"CH": "MALIGN, DXP=1E-5"}, "MALIGN 'CH' .* changes the beam by its DXP"),
         ({"CH": "ENERGY, CENTRAL_ENERGY=5000"}, "ENERGY 'CH' .* CENTRAL_ENERGY"),

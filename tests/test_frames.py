@@ -270,7 +270,7 @@ def test_a_frame_that_lacks_a_column_names_it(small_ring, measured):
         Measurement.from_dataframe,
         lambda own: tmlattice.import_data(own, ring=small_ring),
     ):
-        with pytest.raises(MeasurementError, match="the DataFrame: no column 'monitor' beside 'x'"):
+        with pytest.raises(MeasurementError, match="DataFrame: no column 'monitor' next to 'x'"):
             call(frame.drop(columns="monitor"))
     with pytest.raises(MeasurementError, match="give columns x and y"):
         Measurement.from_dataframe(frame[["shot", "monitor"]])

@@ -233,7 +233,7 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
          "'bpm::2' and 'bpm::5' read each other's x"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 20, 1e-6, 1)[:, None]
                     + 1e-4 * np.random.default_rng(2).standard_normal((32, 32))},
-         "single monitors of y resemble nothing in the design: 'bpm::4'"),
+         "single monitors of y do not correlate with the design: 'bpm::4'"),
     ],
 )  # fmt: skip
 def test_a_convention_that_the_data_contradict_is_named_and_kept(simulated, brought, fields, told):

@@ -259,7 +259,7 @@ def test_what_has_no_meaning_is_a_sentence(small_ring):
         diagnose(small_ring, _turns(small_ring, []), missing=True)
     orbit = _orbit(small_ring, [])
     unknown = ClosedOrbit(orbit=orbit.orbit, monitors=orbit.monitors)
-    with pytest.raises(MeasurementError, match="noise of a closed orbit is not known"):
+    with pytest.raises(MeasurementError, match="noise of a closed orbit is unknown"):
         diagnose(small_ring, unknown)
 
 

@@ -238,7 +238,7 @@ def test_madx_tunes_vs_at_reading_and_kinds(tmp_path):
 
 def test_madx_files_that_say_too_little(tmp_path):
     silent = write(tmp_path, "silent.seq", madx())
-    with pytest.raises(LatticeError, match="no BEAM with an energy; say energy="):
+    with pytest.raises(LatticeError, match="no BEAM with an energy; give energy="):
         load_ring(silent)
     assert load_ring(silent, energy=2.0).energy == 2.0
     none = write(tmp_path, "none.seq", "q: quadrupole, l=0.1, k1=1;\n")

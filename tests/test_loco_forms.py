@@ -115,7 +115,7 @@ FORMS = {
     "a cavity of empty fields": (empty_cavity, ""),
     "monitors for x and for y": (monitors_of_each_plane, "each is one monitor"),
     "flags that say nothing": (put("LocoFlags", ResponseMatrixMeasurement=lambda f: np.zeros(0)),
-                               "no LocoFlags say so"),
+                               "no LocoFlags state it"),
 }  # fmt: skip
 
 

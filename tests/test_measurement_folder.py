@@ -418,7 +418,7 @@ def test_orbit_response_of_the_page(folder):
         ({}, [*ORBITS[:3], "rf,a,0.5,"], "line 4: x = 0.5 m is above"),
         ({}, ORBITS[:3], 'no row of "rf"'),
         ({"dispersion": False}, ORBITS, "line 4: a row of the RF step"),
-        ({"rf": None}, ORBITS, '"rf" does not say'),
+        ({"rf": None}, ORBITS, '"rf" does not state'),
         ({"rf.harmonic": 0.5}, ORBITS, "rf.harmonic is 0.5; it should be a whole number"),
         ({"columns": []}, ORBITS, "columns is .*empty"),
         ({"columns.1.plane": "z"}, ORBITS, r'columns\[1\].plane is "z"'),

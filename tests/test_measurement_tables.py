@@ -93,7 +93,7 @@ def test_turn_by_turn_file_written_by_its_own_package(tmp_path, ring_data):
 
 def test_millimetres_taken_for_metres_are_refused(tmp_path, ring_data):
     written(tmp_path / "b.sdds", ring_data, "lhc")
-    with pytest.raises(MeasurementError, match="say the unit of the file"):
+    with pytest.raises(MeasurementError, match="state the unit of the file"):
         read_turn_by_turn(tmp_path / "b.sdds")
     written(tmp_path / "small.sdds", 1e-3 * ring_data, "lhc")
     m = read_measurement(tmp_path / "small.sdds", turn_by_turn="lhc")

@@ -221,7 +221,7 @@ def test_fields_that_a_table_lacks_are_named(madx, tmp_path, old, new, drop, mes
 def test_tables_that_say_too_little(madx, tmp_path):
     with pytest.raises(LatticeError, match=r"no column L; write the table with .*k1l"):
         load_ring(table(madx, tmp_path, drop=("L",)))
-    with pytest.raises(LatticeError, match="states no ENERGY; say energy="):
+    with pytest.raises(LatticeError, match="states no ENERGY; give energy="):
         load_ring(table(madx, tmp_path, ENERGY=None))
     path = table(madx, tmp_path)
     lines = path.read_text().splitlines()
@@ -285,7 +285,7 @@ def test_environment_of_xsuite_wants_its_line_named(tmp_path):
     assert load_ring(path, sequence="two").length == load_ring(XSUITE).length
     line.pop("particle_ref")
     path.write_text(json.dumps({**line, "elements": elements}))
-    with pytest.raises(LatticeError, match="no reference particle; say energy="):
+    with pytest.raises(LatticeError, match="no reference particle; give energy="):
         load_ring(path)
 
 
@@ -305,7 +305,7 @@ RING: LINE=(CELL, CELL, CELL, CELL, CELL, CELL, CELL, CELL)
 def test_line_of_elegant(tmp_path):
     path = tmp_path / "ring.lte"
     path.write_text(ELEGANT)
-    with pytest.raises(LatticeError, match="no beam energy; say energy="):
+    with pytest.raises(LatticeError, match="no beam energy; give energy="):
         load_ring(path)
     ring = load_ring(path, energy=3.0)
     assert len(ring.monitors) == 8

@@ -53,11 +53,11 @@ def same(brought, data):
 @pytest.mark.parametrize(
     ("header", "scale", "told"),
     [
-        (lambda m, p: f"{m} {p} [mm]", 1e3, "in mm, as the file says"),
-        (lambda m, p: f"{m}_{p}_um", 1e6, "in um, as the file says"),
+        (lambda m, p: f"{m} {p} [mm]", 1e3, "in mm, as the file states"),
+        (lambda m, p: f"{m}_{p}_um", 1e6, "in um, as the file states"),
         (lambda m, p: f"{p}_{m}", 1e3, "no unit is given: readings are taken in mm"),
         (lambda m, p: f"SR:{m.upper()}:SA:{p.upper()}", 1e9, "readings are taken in nm"),
-        (lambda m, p: f"{m}.Pos{p.upper()} (µm)", 1e6, "in um, as the file says"),
+        (lambda m, p: f"{m}.Pos{p.upper()} (µm)", 1e6, "in um, as the file states"),
         (lambda m, p: f"{m}/{'H' if p == 'x' else 'V'}", 1.0, "readings are taken in m"),
     ],
 )
@@ -205,7 +205,7 @@ def test_a_machine_file_states_names_unit_noise_and_bad_bpms(small_ring, data, t
     kept = data.select(monitors=left)
     np.testing.assert_allclose(own.select(monitors=left).readings, kept.readings, rtol=1e-6)
     assert own.noise == pytest.approx(np.full((len(left), 2), 2e-6))
-    assert any("left out as told" in sentence for sentence in brought.assumed)
+    assert any("left out as stated" in sentence for sentence in brought.assumed)
 
 
 def test_a_machine_file_may_state_that_devices_are_in_beam_order(small_ring, data, tmp_path):

@@ -155,7 +155,7 @@ def test_forms_of_a_file(tmp_path):
     same(load({**environment, "particle_ref": "e", "particles": {"e": particle}}, tmp_path))
     with pytest.raises(LatticeError, match="reference particle 'e' is not in the file"):
         load({**environment, "particle_ref": "e"}, tmp_path)
-    with pytest.raises(LatticeError, match="no reference particle; say energy="):
+    with pytest.raises(LatticeError, match="no reference particle; give energy="):
         load(environment, tmp_path)
     same(load(environment, tmp_path, energy=3.0))
     own = {"lines": {"one": {**line, "elements": elements, "particle_ref": particle}}}

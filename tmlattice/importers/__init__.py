@@ -1,7 +1,7 @@
 """Measurements as other programs left them: MATLAB LOCO and Middle Layer, HDF5, CSV, turns.
 
 >>> brought = bring_in([Path("machine.loco.mat")])
->>> brought.measurement, brought.ring           # what was measured, and the model beside it
+>>> brought.measurement, brought.ring           # what was measured, and its model
 >>> print("\\n".join(brought.assumed))          # units, signs, steps: what the files do not prove
 """
 

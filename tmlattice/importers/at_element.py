@@ -88,7 +88,7 @@ def _method_of(fields: Mapping[str, Any]) -> str:
 
 
 def _one_gradient(fields: dict[str, Any]) -> None:
-    """`K` and `PolynomB` both say the gradient; a linear pass method follows `K`."""
+    """`K` and `PolynomB` both state the gradient; a linear pass method follows `K`."""
     if "PolynomB" in fields and "K" in fields:
         gradient = fields.pop("K")
         if "Linear" in str(fields.get("PassMethod")):

@@ -54,8 +54,8 @@ class Options:
         lattice: name or path of the lattice of a table or of turns, see `load_ring`.
         energy: GeV; else what the lattice states.
         turns: the kind of a turn-by-turn file, see `bring_turns`.
-        unit: of the readings of first turns or turns; else as the file says, or from their size.
-        told: what a machine file says of a table of readings.
+        unit: of the readings of first turns or turns; else as the file states, or from their size.
+        told: what a machine file states about a table of readings.
         ring: instead of `lattice`, one that is loaded already, or a function that loads it where a
             file needs one.
         noise: rms of a reading, or of an orbit change, m, where the files give none.
@@ -88,7 +88,7 @@ def bring_in(
         options: how they are read.
 
     Raises:
-        MeasurementError: files that are not known, or do not fit together.
+        MeasurementError: files that are unknown, or do not fit together.
         LatticeError: a lattice that cannot be made.
     """
     options = options or Options()
@@ -100,7 +100,7 @@ def bring_in(
         if not path.is_file():
             raise MeasurementError(f"no file '{path}'; check the path")
         if path.suffix.lower() in SHEETS:
-            text_of(path)  # says what to do
+            text_of(path)  # its error states what to do
     if options.turns and len(files) != 1:
         raise MeasurementError("turns are in one file; name one")
     known = [] if options.turns else files
@@ -122,7 +122,7 @@ def bring_in(
     if options.noise is not None and not isinstance(data, TuneReading) and data.noise is None:
         noise = np.full((len(data.monitors), 2), options.noise)
         brought = replace(brought, measurement=replace(data, noise=noise))
-        brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as told")
+        brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as stated")
     if isinstance(brought.measurement, OrbitResponse):
         brought = _with_all_noise(brought, brought.measurement)
     if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
@@ -167,7 +167,7 @@ def import_data(
         `measurement`, `ring`, `assumed` and `doubts`; `write_imported` writes them to a folder.
 
     Raises:
-        MeasurementError: a source that is not known, or does not fit together.
+        MeasurementError: a source that is unknown, or does not fit together.
         LatticeError: a lattice that cannot be made.
     """
     told = Told(names=dict(names or {}), bad=tuple(bad)) if names or bad else None
@@ -242,7 +242,7 @@ def _bring(
 
 
 def _table(source: Path | Any, ring: Ring | None, options: Options) -> Imported:
-    """A response by its columns, else readings as they come."""
+    """A response by its columns, else a table of readings."""
     name, columns = label(source), read_columns(source)
     plain_text = not isinstance(source, Path) or source.suffix.lower() in CSV
     if plain_text and is_response_table(columns):
@@ -261,7 +261,7 @@ def _framed(frame: Any, options: Options) -> Imported:
 
 
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
-    """Turns of a known kind; of SDDS of another, columns as they come."""
+    """Turns of a known kind; of SDDS of another kind, the columns as they are."""
     try:
         told = with_unit(options.told, options.unit, None)
         unit = cast("Unit | None", "um" if told.unit == "µm" else told.unit)

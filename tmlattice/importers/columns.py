@@ -1,4 +1,4 @@
-"""Columns of a file as they stand: CSV of any separator, HDF5, SDDS. What they mean is not known.
+"""Columns of a file as they stand: CSV of any separator, HDF5, SDDS. Their meaning is unknown.
 
 >>> for column in read_columns(Path("orbits.csv")):
 ...     column.name, column.unit, column.values
@@ -180,7 +180,7 @@ def _is_number(text: str) -> bool:
 
 
 def _hdf5(path: Path) -> list[Column]:
-    """A column for each array [row]; `x`, `y` [row, monitor] beside a list of names are taken apart
+    """A column for each array [row]; `x`, `y` [row, monitor] with a list of names are taken apart
     into a column a monitor. The unit is an attribute `unit` or `units`, or stands in the name."""
     content, attributes = read_apart("hdf5", path, "HDF5", MeasurementError)
     units = {name: own.get("units", own.get("unit", "")) for name, own in attributes.items()}

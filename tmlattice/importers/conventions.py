@@ -1,4 +1,4 @@
-"""What a measured response says of how it was made and written down, beside the design's.
+"""Conventions of a measured response, determined by comparison with the design's response.
 
 The data checks (`diagnosis.data_checks`) find a wrong sign, unit or order everywhere. Here each
 corrector and each BPM is compared with the design's, and the data decide whether the RF frequency
@@ -17,15 +17,15 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 
 MOST = 0.7
-"""Correlation with the design's, of the typical corrector, from which single ones can be told: on
+"""Correlation with the design's, of the typical corrector, from which single ones can be found: on
 ten real rings it is 0.93 or more, and 0.8 with two of sixteen monitors exchanged."""
 ODD = 0.6
-"""Correlation below which a single one resembles nothing; of random columns of sixteen monitors
+"""Correlation below which a single one is rejected; of random columns of sixteen monitors
 one in seventy has more."""
 SURE = 0.95
 """Correlation above which it is another's: neighbours a tenth of a wave apart have 0.8."""
 CLEARER = 1.02
-"""Ratio of what two models leave, above which the data tell them apart: on ten real rings a fixed
+"""Ratio of what two models leave, above which the data separate them: on ten real rings a fixed
 frequency leaves 1.04 to 11 times less than a fixed momentum."""
 ROUNDS = 5
 
@@ -59,7 +59,7 @@ class Plane:
 
 
 def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]:
-    """What the data confirm and what they contradict, beside the ring's own response; a sentence
+    """What the data confirm and what they contradict, given the ring's own response; a sentence
     each.
 
     Args:
@@ -104,7 +104,7 @@ def _correlation(a: Array, b: Array) -> Array:
 
 
 def _single(own: Plane) -> list[str]:
-    """Correctors and monitors that go against the others, resemble nothing, or are exchanged."""
+    """Correctors and monitors of opposite sign, without correlation, or with swapped labels."""
     sign = np.sign(np.median(own.columns()))
     monitors = own.alike() * sign
     said = []
@@ -116,7 +116,7 @@ def _single(own: Plane) -> list[str]:
         nothing = [n for n, r in zip(names, alike.tolist(), strict=True) if 0 < abs(r) <= ODD]
         for which, how in (
             (against, "have the sign against the others"),
-            (nothing, "resemble nothing in the design"),
+            (nothing, "do not correlate with the design"),
         ):
             if 0 < len(which) < len(names) / 4:
                 said.append(f"single {what} of {own.plane} {how}: {counted(which)}")

@@ -1,4 +1,4 @@
-"""Templates of the files that are taken as they come: `tmlattice import --example`."""
+"""Templates of the files that need no preparation: `tmlattice import --example`."""
 
 import csv
 import os

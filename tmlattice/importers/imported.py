@@ -62,10 +62,10 @@ def numbers(value: Any, what: str, shape: Sequence[int] | None = None) -> Array:
     try:
         array = np.asarray(value)
         if array.dtype.kind == "c":
-            raise MeasurementError(f"{what} holds complex numbers; mend it in the file")
+            raise MeasurementError(f"{what} holds complex numbers; correct it in the file")
         array = array.astype(float)
     except (TypeError, ValueError):
-        raise MeasurementError(f"{what} holds no numbers; mend it in the file") from None
+        raise MeasurementError(f"{what} holds no numbers; correct it in the file") from None
     if shape is not None:
         if [n for n in array.shape if n != 1] != [n for n in shape if n != 1]:
             raise MeasurementError(

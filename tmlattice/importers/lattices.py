@@ -1,4 +1,4 @@
-"""The lattice that stands beside a measurement: MATLAB's structures of AT elements."""
+"""The lattice stored with a measurement: MATLAB's structures of AT elements."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Elements:
         name: of the ring.
         fields: of each element, in beam order.
         energy: GeV.
-        harmonic: number, and frequency, Hz, of the RF where the lattice says so.
+        harmonic: number, and frequency, Hz, of the RF where the lattice states it.
         frequency: Hz.
     """
 

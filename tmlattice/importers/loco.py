@@ -3,11 +3,11 @@
 The response `M` is [monitors x then y, correctors H then V], mm, for the steps `HCMKicks`,
 `VCMKicks`, mrad, from one side to the other; `Eta`, mm, for a step `DeltaRF`, Hz; `BPMSTD`, mm,
 is the rms with which LOCO weighs an entry of `M`, the difference of two orbits. Indices count
-from 1. Of the lists by iteration the first says what was measured; gains, kicks and couplings of
+from 1. Of the lists by iteration the first states what was measured; gains, kicks and couplings of
 later ones are the fit's answer and are not taken.
 
 `RINGData` is the lattice with the parameters of the fit's last iteration, and `FitParameters`
-has those of every iteration: `iteration` says which are put in. A diagnosis of what LOCO fitted
+has those of every iteration: `iteration` selects which are used. A diagnosis of what LOCO fitted
 would find what LOCO left: by default the model is the one before the fit.
 """
 
@@ -87,7 +87,7 @@ def bring_loco(
         if len(index) and not 0 <= index.min() <= index.max() < len(at_monitor):
             raise MeasurementError(
                 f"'{path}': a monitor of plane {plane} is not among the {len(at_monitor)} of "
-                "BPMIndex; mend BPMData"
+                "BPMIndex; correct BPMData"
             )
     elements, of_lattice, model = _elements(lattice, content.get("FitParameters"), iteration)
     kicks: dict[int, frozenset[str]] = {}
@@ -141,7 +141,7 @@ def _counted(structure: Fields, name: str) -> Indices:
             "taken: name one element of each"
         )
     if not np.all((np.abs(index) < FURTHEST) & (index == np.round(index))):
-        raise MeasurementError(f"{name} is no list of places; mend it in the file")
+        raise MeasurementError(f"{name} is no list of places; correct it in the file")
     return index.astype(np.int64) - 1
 
 
@@ -149,7 +149,7 @@ def _index(structure: Fields, name: str) -> Indices:
     """Places, each once."""
     index = _counted(structure, name)
     if len(set(index.tolist())) < len(index):
-        raise MeasurementError(f"{name} is no list of different places; mend it in the file")
+        raise MeasurementError(f"{name} is no list of different places; correct it in the file")
     return index
 
 
@@ -169,7 +169,7 @@ def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
 def _elements(
     lattice: Fields, parameters: Any, iteration: Iteration
 ) -> tuple[list[dict[str, Any]], str, str]:
-    """The elements with an iteration's parameters, a sentence that says so, and what they are."""
+    """The elements with an iteration's parameters, a sentence about it, and what they are."""
     given = _field(lattice, "Lattice")
     if not isinstance(given, list) or not all(isinstance(e, Mapping) for e in given):
         raise MeasurementError("RINGData.Lattice is no list of elements; save the ring in it")
@@ -268,7 +268,7 @@ def _good(
                 there = _counted(structure, name)
                 if len(there) and not 0 <= there.min() <= there.max() < len(index):
                     raise MeasurementError(
-                        f"{name} counts beyond the {len(index)} of its list; mend it in the file"
+                        f"{name} counts beyond the {len(index)} of its list; correct it in the file"
                     )
                 flags[there] = True
             if not flags.all():
@@ -427,8 +427,8 @@ def conventions(flags: Fields, measured: OrbitResponse) -> list[str]:
     said = [
         "M and Eta are in mm, HCMKicks and VCMKicks in mrad from one side of the step to the other",
         "steps are two-sided"
-        + ("" if "ResponseMatrixMeasurement" in flags else " (no LocoFlags say so)") if two
-        else "steps are one-sided, as LocoFlags says; the diagnosis takes them as two-sided",
+        + ("" if "ResponseMatrixMeasurement" in flags else " (no LocoFlags state it)") if two
+        else "steps are one-sided, as LocoFlags states; the diagnosis takes them as two-sided",
         "the RF frequency stood still while correctors were stepped",
     ]  # fmt: skip
     if str(flags.get("ClosedOrbitType", "")).lower() == "fixedmomentum":

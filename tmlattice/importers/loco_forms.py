@@ -1,7 +1,7 @@
 """LOCO files in other forms than the usual one, brought to it: what other versions and hands save.
 
-The usual form is that of `importers.loco`. What cannot be told is left as it is, for the reader to
-refuse.
+The usual form is that of `importers.loco`. What cannot be determined is left as it is, and the
+reader rejects it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -207,7 +207,7 @@ def _places(correctors: dict[str, Any], said: list[str]) -> None:
 
 
 def _good_lists(monitors: dict[str, Any], correctors: dict[str, Any], said: list[str]) -> None:
-    """Lists of places: an empty one says nothing, flags are told from places."""
+    """Lists of places: an empty one selects all, flags are distinguished from places."""
     for structure, kind in ((monitors, "BPM"), (correctors, "CM")):
         for letter in "HV":
             name = f"{letter}{kind}GoodDataIndex"

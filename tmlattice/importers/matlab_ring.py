@@ -2,7 +2,7 @@
 measurement has them.
 
 A measurement names elements by their place in the lattice. What stands there becomes a monitor or a
-corrector whatever its class says, and keeps its name:
+corrector whatever its class, and keeps its name:
 
 - a corrector of one plane stays one element;
 - where one place kicks in both planes, all of its family become two thin correctors in the middle
@@ -117,7 +117,7 @@ def ring_of_elements(
         try:
             ring = ring_from_at(lattice, name, energy)
         except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError) as error:
-            raise LatticeError(f"the lattice cannot be taken over ({error}); mend it") from error
+            raise LatticeError(f"the lattice cannot be taken over ({error}); correct it") from error
     names = _names(ring, [_family(element) for element in sequence], where.values())
     return Placed(
         ring=ring,

@@ -1,4 +1,4 @@
-"""Response files of the MATLAB Middle Layer: `Rmat`, with dispersion and noise beside it.
+"""Response files of the MATLAB Middle Layer: `Rmat`, with dispersion and noise from other files.
 
 `Rmat` is [plane read][plane kicked] of structures: `Data`, orbit per step; `ActuatorDelta`; the
 orbits `Monitor1` and `Monitor2`; devices by their lists. `BPMxDisp`, `BPMyDisp` hold the
@@ -66,7 +66,7 @@ def bring_middle_layer(
 
     Raises:
         MeasurementError: a field is missing, a device that LOCO's file does not have, or a unit
-            that is not known.
+            that is unknown.
     """
     known = bring_loco(loco, path, iteration, keep_bad, energy)
     model, good = bring_loco(loco, path, iteration, True, energy).measurement, known.measurement
@@ -119,7 +119,7 @@ def bring_middle_layer(
 
 
 def _of_model(known: Imported) -> list[str]:
-    """What LOCO's file says of its lattice and its good lists: not how its own data were taken."""
+    """Statements of LOCO's file about its lattice and good lists: not how its data were taken."""
     response = known.measurement
     assert isinstance(response, OrbitResponse)
     own = {sentence for flags in ({}, {"a": ""}) for sentence in conventions(flags, response)}

@@ -1,10 +1,10 @@
-"""First turns or orbits of a control room's file, its columns taken as they come.
+"""First turns or orbits of a control room's file, its columns taken as they are.
 
 Wide: a row a shot, and a column a monitor and plane (`SR:BPM_07:X [mm]`, `bpm_7_x`, `x_bpm7`).
 Long: a row a monitor (and shot, and turn), with columns `monitor`, `x`, `y`, or a `value` with a
 `plane`, or with the plane in the device's name (`SR:BPM_07:X 0.13`). What the file does not prove,
-units above all, is said. A sum signal (`SR:BPM_07:SUM`, `intensity`, `charge`) says which of the
-BPMs had a beam.
+units above all, is reported. A sum signal (`SR:BPM_07:SUM`, `intensity`, `charge`) states which of
+the BPMs had a beam.
 """
 
 import re
@@ -27,7 +27,7 @@ from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 Array = NDArray[np.float64]
 
 SIZES = ((0.02, "m"), (30.0, "mm"), (3e4, "um"), (np.inf, "nm"))
-"""Readings below the first are in the second, where nothing says their unit: orbits of 20 mm and
+"""Readings below the first are in the second, where nothing states their unit: orbits of 20 mm and
 more have no room in a beam pipe, and those of a micrometre are noise."""
 
 SHOTS = ("shot", "shots", "shot_id", "cycle", "time", "timestamp", "date", "datetime")
@@ -65,7 +65,7 @@ def bring_readings(
     told: Told | None = None,
     monitors: Sequence[str] | None = None,
 ) -> Imported:
-    """The measurement of a table whose columns are not known.
+    """The measurement of a table with unknown columns.
 
     Args:
         path: what messages call it, see `columns.label`.
@@ -105,7 +105,7 @@ def bring_readings(
         if taken[where]:
             raise MeasurementError(
                 f"{path}: monitor '{names[at]}' stands twice in one shot; give a column 'shot' or "
-                "'turn' that tells them apart"
+                "'turn' that separates them"
             )
         taken[where] = True
         both[where] = value
@@ -134,9 +134,9 @@ def bring_readings(
     of_noise = (
         "no noise is given: a diagnosis estimates it from the readings"
         if told.noise is None
-        else f"the noise is {1e6 * told.noise:g} µm, as told"
+        else f"the noise is {1e6 * told.noise:g} µm, as stated"
     )
-    beam = "where the beam was launched is not known"
+    beam = "the launch of the beam is unknown"
     if isinstance(data, Measurement) and data.readings.shape[1] >= FEWEST:  # as of other files
         beam = f"{data.readings.shape[1]} turns are those of a stored beam that was kicked before"
         data = TurnByTurn(
@@ -150,7 +150,7 @@ def bring_readings(
     sums = about_sums(both[..., SUM], silent, before, names)
     said = [of_unit, beam, of_noise, *finder.said, *sums]
     if bad:
-        said.append(f"bad monitors, left out as told: {counted(bad)}")
+        said.append(f"bad monitors, left out as stated: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
     return Imported(data, ring, tuple(said), doubts, guessed)
 
@@ -203,7 +203,7 @@ def _wide(path: str, columns: Sequence[Column], told: Told) -> Found:
         alone = [column.name for column in columns if _plane(column.name) is not None]
         if alone:
             raise MeasurementError(
-                f"{path}: no column 'monitor' beside '{alone[0]}'; add it, with the name of the "
+                f"{path}: no column 'monitor' next to '{alone[0]}'; add it, with the name of the "
                 "BPM of each row, or name each column as 'bpm_1 x'"
             )
         raise MeasurementError(
@@ -240,7 +240,7 @@ def _joined(
 
 
 def _holds(plane: int, column: Column) -> bool:
-    """Whether a column holds what its name says: of other meanings of a sum nothing is read."""
+    """Whether a column holds what its name states: of other meanings of a sum nothing is read."""
     return plane != SUM or all(map(_is_number, column.values))
 
 
@@ -269,7 +269,7 @@ def _is_number(text: str) -> bool:
 
 
 def _called(columns: Sequence[Column], key: str, usual: Sequence[str], told: Told) -> Column | None:
-    """The column of this meaning, as told or by its usual names."""
+    """The column of this meaning, by its stated name or its usual names."""
     wanted = [told.columns[key].casefold()] if key in told.columns else usual
     for name in wanted:
         for column in columns:
@@ -363,14 +363,14 @@ class _Finder:
                     f"{path}: {len(devices)} devices, and the lattice has {len(self._names)} "
                     "monitors; name them in [channels], they are not the same in order"
                 )
-            self.said.append("devices are the lattice's monitors in beam order, as told")
+            self.said.append("devices are the lattice's monitors in beam order, as stated")
             found: dict[str, int | None] = {device: i for i, device in enumerate(devices)}
         else:
             found = {device: self.find(device) for device in devices}
         if all(at is None for at in found.values()):
             error = unknown_name("monitor", devices[0], self._names)
             raise MeasurementError(
-                f"{path}: {error}; say which is which in [channels] of "
+                f"{path}: {error}; assign the names in [channels] of "
                 "tmlattice.toml (`tmlattice import --example` writes one)"
             )
         loose = [d for d, at in found.items() if at is not None and not self._same(d, at)]
@@ -419,7 +419,7 @@ def _unique(key: Callable[[str], str], names: Sequence[str]) -> dict[str, int]:
 
 
 def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str, str | None]:
-    """Metres per unit of each number, what is to be said of it, and a unit that is a guess."""
+    """Metres per unit of each number, a sentence about it, and a unit that is a guess."""
     known = {"µm": "um", "μm": "um", "micron": "um", "metre": "m", "meter": "m"}
     plain = [known.get(unit.strip().casefold(), unit.strip().casefold()) for unit in units]
     strange = [unit for unit in plain if unit and unit not in METRES]
@@ -431,10 +431,10 @@ def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str,
     scale = np.array([METRES[unit] if unit else 1.0 for unit in plain])
     stated = sorted(set(plain) - {""})
     if not silent.any():
-        return scale, f"readings are in {' and '.join(stated)}, as the file says", None
+        return scale, f"readings are in {' and '.join(stated)}, as the file states", None
     if told.unit is not None:
         scale[silent] = METRES[told.unit]
-        return scale, f"readings are in {told.unit}, as told", None
+        return scale, f"readings are in {told.unit}, as stated", None
     own = np.abs(values[silent])
     own = own[np.isfinite(own)]
     size = float(np.percentile(own, 95)) if len(own) else 0.0
@@ -443,13 +443,13 @@ def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str,
     return (
         scale,
         f"no unit is given: readings are taken in {unit}, for most are below {size:.3g} "
-        "(`unit` in [data] of tmlattice.toml says otherwise)",
+        "(`unit` in [data] of tmlattice.toml changes it)",
         unit,
     )
 
 
 def with_unit(told: Told | None, unit: str | None, noise: float | None) -> Told:
-    """What is told, with what options of the command say beside it."""
+    """What the user stated, together with the options of the command."""
     told = told or Told()
     return replace(
         told,

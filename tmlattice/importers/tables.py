@@ -2,7 +2,7 @@
 
 Long: `corrector,monitor,x [mm],y [mm],kick [mrad]`, a row for each corrector and monitor; rows of
 the corrector `rf` hold the orbit change for a step of `kick`, Hz. Wide: `monitor,plane` and a
-column `name [mm/mrad]` for each corrector, whose steps are not known then. Units stand in the
+column `name [mm/mrad]` for each corrector, whose steps are unknown then. Units stand in the
 header, in brackets; without one they are m, rad and m/rad. Names are the lattice's.
 """
 
@@ -59,7 +59,7 @@ def bring_table(
         told: names of monitors and correctors, bad monitors.
 
     Raises:
-        MeasurementError: a header that is not known, or a field that is no number: with its line.
+        MeasurementError: an unknown header, or a field that is no number: with its line.
         UnknownNameError: a name that the lattice does not have.
     """
     header = [(column.name, column.unit) for column in columns]
@@ -123,7 +123,7 @@ def bring_turns(
         ]
         turns = data.readings.shape[1]
         if turns < FEWEST:
-            said.append("turn 0 is the first in the file; where the beam was launched is not known")
+            said.append("turn 0 is the first in the file; the launch of the beam is unknown")
             return Imported(_unlaunched(data, ring), ring, tuple(said), doubts)
         said.append(f"{turns} turns are those of a stored beam that was kicked before the first")
         if turns > MOST:
@@ -256,8 +256,8 @@ def _wide(
             own[monitor] = (value, y) if plane == "x" else (x, value)
         columns[name] = KICK, own
     said = [
-        f"the table is orbit per kick, in {header[-1][1] or 'm/rad'}: what the steps were is not "
-        f"known, and {KICK:g} rad is taken"
+        f"the table is orbit per kick, in {header[-1][1] or 'm/rad'}: the steps are "
+        f"unknown, and {KICK:g} rad is taken"
     ]
     return _response(ring, columns, None, said, told)
 
@@ -294,7 +294,7 @@ def _response(
         "no noise is given",
     ]
     if bad:
-        more.append(f"bad monitors, left out as told: {counted(bad)}")
+        more.append(f"bad monitors, left out as stated: {counted(bad)}")
     return Imported(
         OrbitResponse(
             correctors=tuple(of[name] for name in columns),

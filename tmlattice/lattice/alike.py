@@ -14,7 +14,7 @@ from tmlattice.lattice.slices import Piece, stem
 
 Array = NDArray[np.float64]
 Supplies = Mapping[str, tuple[str, ...]]
-"""Names of all magnets of each, their pieces too, by what tells of it."""
+"""Names of all magnets of each, their pieces too, by what identifies it."""
 
 
 class Body(Piece, Protocol):

@@ -50,7 +50,7 @@ def check_methods(elements: Iterable[Any]) -> None:
 
 
 class Tracker:
-    """A child that tells first-order matrices; it is started by the first element.
+    """A child process that computes first-order matrices; it is started by the first element.
 
     >>> with Tracker(3e9) as tracker:
     ...     matrix = tracker.matrix(element)                # [6, 6], AT's coordinates
@@ -85,7 +85,7 @@ class Tracker:
             return np.frombuffer(said, "<f8").reshape(6, 6)
         why = said.decode("utf-8", "replace") or "its tracking does not come back"
         raise LatticeError(
-            f"AT cannot track the element '{element.FamName!s:.40}' ({why:.200}); mend it"
+            f"AT cannot track the element '{element.FamName!s:.40}' ({why:.200}); correct it"
         )
 
     def _asked(self, message: bytes) -> bytes:

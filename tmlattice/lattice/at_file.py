@@ -9,8 +9,8 @@ Each AT element becomes an OCELOT element of the same first- and second-order ph
   fuller one: AT's has no product of curvature and gradient, and edges of first order.
 - Wigglers made of thin bends of alternating sign become one matrix each (`lattice.wigglers`).
 - A corrector kicks px += KickAngle[0], py += KickAngle[1]. It has one plane where its MADType
-  (HKICKER, VKICKER) or its name says so; else it is two correctors in one place, NAME_h and NAME_v.
-- A cavity is a drift to the maps; over several turns it gives what its voltage says.
+  (HKICKER, VKICKER) or its name states it; else it is two correctors in one place: NAME_h, NAME_v.
+- A cavity is a drift to the maps; over several turns it gives the energy of its voltage.
 
 Coordinates of a matrix element are turned from AT's (.., delta, ct) into OCELOT's (.., tau, p):
 tau = ct, p = beta0 delta.
@@ -243,7 +243,7 @@ def _convert(
 
 
 def _passive(element: Any, left_out: Counter[str]) -> bool:
-    """Whether AT passes it as if nothing were there, whatever its fields say: a magnet that was
+    """Whether AT passes it as if nothing were there, whatever its fields: a magnet that was
     switched off by its pass method; and noise of the radiation, which moves no orbit."""
     method = element.PassMethod
     fields = ("PolynomA", "PolynomB", "BendingAngle")
@@ -253,7 +253,7 @@ def _passive(element: Any, left_out: Counter[str]) -> bool:
 
 
 def _correctors(element: Any, family: str, mad: str) -> list[Place]:
-    """One corrector where something tells its plane, else one of each plane."""
+    """One corrector where something states its plane, else one of each plane."""
     kicks = np.zeros(2)
     given = np.asarray(element.KickAngle, dtype=float).ravel()[:2]
     kicks[: len(given)] = given

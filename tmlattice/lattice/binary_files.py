@@ -416,7 +416,7 @@ def limit(seconds: float) -> None:
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
     except (OSError, ValueError):
-        return  # a system that does not say what is taken does not limit it either
+        return  # a system that does not state what is taken does not limit it either
     bytes_ = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (bytes_, resource.getrlimit(resource.RLIMIT_AS)[1]))
 

@@ -1,4 +1,4 @@
-"""What a ring must be before work begins: one sentence each, with the mend."""
+"""What a ring must be before work begins: one sentence each, with the correction."""
 
 import math
 import warnings
@@ -34,7 +34,9 @@ def reading(path: Path) -> Iterator[None]:
         raise LatticeError(f"'{path}' is nested too deeply; write it out") from error
     except Exception as error:
         said = plain(str(error), 200) or type(error).__name__
-        raise LatticeError(f"'{path}' holds no ring that can be read ({said}); mend it") from error
+        raise LatticeError(
+            f"'{path}' holds no ring that can be read ({said}); correct it"
+        ) from error
 
 
 def check_ring(ring: Ring) -> None:
@@ -55,7 +57,7 @@ def check_ring(ring: Ring) -> None:
     if not ring.energy <= highest:
         raise LatticeError(
             f"'{ring.name}' has the energy {ring.energy:g} GeV, above {highest:g}; energies are in "
-            "GeV, not in eV or MeV: mend it, or say energy="
+            "GeV, not in eV or MeV: correct it, or give energy="
         )
     seen: set[str] = set()
     backwards = 0
@@ -64,12 +66,13 @@ def check_ring(ring: Ring) -> None:
         if not all(map(math.isfinite, numbers)) or abs(e.length) > LONGEST:
             raise LatticeError(
                 f"'{plain(e.name, 60)}' of '{ring.name}' has the length {e.length:g} m and the "
-                f"strengths {e.k1:g}, {e.k2:g}, {e.angle:g}, tilt {e.tilt:g}; mend it in the file"
+                f"strengths {e.k1:g}, {e.k2:g}, {e.angle:g}, tilt {e.tilt:g}; "
+                "correct it in the file"
             )
         if e.length < -SHORTEST and (e.is_magnet or e.kind == "monitor"):
             raise LatticeError(
                 f"the {e.kind} '{plain(e.name, 60)}' of '{ring.name}' has the negative length "
-                f"{e.length:g} m; mend it in the file"
+                f"{e.length:g} m; correct it in the file"
             )
         backwards += e.length < -SHORTEST
         if e.name.casefold() in seen:
@@ -98,7 +101,7 @@ def need_monitors(ring: Ring) -> None:
         names = dict.fromkeys(e.family for e in ring.elements if e.kind == "marker")
         mend = f", such as '{next(iter(names))}'" if names else ""
         raise LatticeError(
-            f"'{ring.name}' has no monitor; say which of its elements are: [lattice] monitors = "
+            f"'{ring.name}' has no monitor; state which of its elements are: [lattice] monitors = "
             f"['BPM*'] in tmlattice.toml (in Python: monitors='BPM*'), names of markers or "
             f"drifts{mend}"
         )

@@ -153,7 +153,7 @@ def read_elegant(
     inside = [name for items in reader.lines.values() for name in inner_names(items)]
     use = chosen(path, list(reader.lines), sequence, reader.used or "", inside)
     if energy is None:
-        raise LatticeError(f"'{path}' has no beam energy; say energy= (GeV)")
+        raise LatticeError(f"'{path}' has no beam energy; give energy= (GeV)")
     try:
         parts = reader.parts(use, energy)
         return ring_of_parts(parts, name, energy, charge=-1.0, report=reader.report)
@@ -800,7 +800,7 @@ def _class_of(word: str) -> str:
     if longest:
         found = [max(longest, key=len)]
     if len(found) != 1:
-        which = f"may be {', '.join(found[:5])}" if found else "is not known"
+        which = f"may be {', '.join(found[:5])}" if found else "is unknown"
         raise LatticeError(f"the element class '{plain(word, 40)}' {which}")
     return found[0]
 

@@ -53,7 +53,7 @@ class Arithmetic:
 
         Args:
             text: Python's syntax.
-            names: what names mean; the first that has one says it.
+            names: what names mean; the first that has one applies.
 
         Raises:
             NameError: a name that none has (AT's readers come back to such a statement).
@@ -159,7 +159,7 @@ def _bounded(value: Any) -> Any:
 
 
 HIGHEST_ORDER = 100
-"""Of a magnet's field; AT lays out as many numbers as `MaxOrder` says."""
+"""Of a magnet's field; AT lays out as many numbers as `MaxOrder` states."""
 
 
 def check_order(fields: Mapping[str, Any]) -> None:

@@ -225,6 +225,5 @@ def _with_errors(path: Path, element: Element, errors: dict[str, Any] | None) ->
         return replace(element, errors=Errors(**given))
     except TypeError as error:
         raise LatticeError(
-            f"'{path}': errors of '{element.name}' are not known here ({error}); "
-            "save the ring again"
+            f"'{path}': errors of '{element.name}' are unknown here ({error}); save the ring again"
         ) from error

@@ -43,7 +43,7 @@ def load_ring(
     """Return the ring of a built-in lattice, a lattice file or an object of another package.
 
     Names that occur more than once are numbered in beam order. What the maps cannot model is
-    warned of (an octupole is a drift at second order). Each reader says what it takes over:
+    warned of (an octupole is a drift at second order). Each reader states what it takes over:
     `read_ocelot`, `read_at`, `read_madx`, `read_xsuite`, `read_tfs`, `read_json`.
 
     Args:
@@ -55,7 +55,7 @@ def load_ring(
         sequence: which of the variables, keys, lines or sequences is the ring.
         energy: GeV; else what the lattice states.
         monitors, correctors: patterns of names, such as "BPM*", of elements that are monitors or
-            correctors although the file does not say so: see `marked`.
+            correctors although the file does not state it: see `marked`.
         particle: "electron" or "proton"; else what the file states, an electron where it is silent.
 
     Raises:

@@ -23,7 +23,7 @@ class Beam:
         self.given: dict[str, float | str] = dict(given or {})
 
     def update(self, given: Mapping[str, float | str]) -> None:
-        """What another BEAM statement says: a new energy replaces an earlier one."""
+        """Apply another BEAM statement: a new energy replaces an earlier one."""
         if any(name in given for name in ENERGIES):
             self.given = {k: v for k, v in self.given.items() if k not in ENERGIES}
         if "particle" in given:

@@ -179,7 +179,7 @@ def read_madx(
     use = reader.chosen(path, sequence)
     beam = reader.beam(use)
     if energy is None and not beam.has_energy:
-        raise LatticeError(f"'{path}' has no BEAM with an energy; say energy= (GeV)")
+        raise LatticeError(f"'{path}' has no BEAM with an energy; give energy= (GeV)")
     try:
         parts = reader.parts(use)
         if reader.undefined:

@@ -65,7 +65,7 @@ def named_file(file: Any) -> Iterator[Path]:
     """A path to the content of an open file: its own, else that of a copy, gone at the end.
 
     Args:
-        file: open for reading, with a `name` whose suffix says the format.
+        file: open for reading, with a `name` whose suffix states the format.
 
     Raises:
         LatticeError: no name, or no suffix.
@@ -73,10 +73,10 @@ def named_file(file: Any) -> Iterator[Path]:
     path = Path(str(getattr(file, "name", "")))
     if not path.suffix:
         raise LatticeError(
-            "an open file needs a name whose suffix says its format (ring.seq, ring.json); give "
+            "an open file needs a name whose suffix states its format (ring.seq, ring.json); give "
             "the path, or set its .name"
         )
-    if path.is_file():  # what it calls or imports is found beside it
+    if path.is_file():  # what it calls or imports is found next to it
         yield path
         return
     with TemporaryDirectory() as folder:

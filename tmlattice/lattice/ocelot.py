@@ -1,4 +1,4 @@
-"""OCELOT, imported without its greeting and without what nobody here uses.
+"""OCELOT, imported without its greeting and without the parts that the package does not use.
 
 `import ocelot` takes seconds: it compiles three functions for collective effects, and loads pandas
 and half of scipy. Everything in this package that needs OCELOT imports it from here, when it is

@@ -35,7 +35,7 @@ def read_ocelot(
     """The ring of an OCELOT lattice file, which is code and is run.
 
     An element's name is its OCELOT id; where OCELOT generated that id, the lowest-sorting
-    variable of the file that holds the element, else its kind. Damaged things are mended where
+    variable of the file that holds the element, else its kind. Damaged things are corrected where
     there is one meaning: a matrix element without a longitudinal block gets R55 = R66 = 1;
     nested sequences are flattened.
 
@@ -197,7 +197,7 @@ def _name_places(places: list[Any], variables: Mapping[str, Any]) -> tuple[Eleme
 
 
 def _displaced(source: Any) -> bool:
-    """Whether an element has its field beside the axis; in `Element` that is one of its errors."""
+    """Whether an element has its field off the axis; in `Element` that is one of its errors."""
     return bool(source.dx or source.dy) and type(source).__name__ in _WITH_OFFSET
 
 
@@ -212,7 +212,7 @@ def _energy(path: Path, variables: Mapping[str, Any]) -> float:
         if type(value).__name__ in ("Twiss", "Beam") and getattr(value, "E", 0.0) > 0:
             return float(value.E)
     warnings.warn(
-        f"'{path}' states no beam energy; {DEFAULT_ENERGY} GeV is taken (say energy= to change)",
+        f"'{path}' states no beam energy; {DEFAULT_ENERGY} GeV is taken (energy= changes it)",
         stacklevel=3,
     )
     return DEFAULT_ENERGY

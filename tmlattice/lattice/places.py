@@ -120,7 +120,7 @@ def place_elements(
     Args:
         families: names without numbers.
         sources: OCELOT elements; one object may stand in many places.
-        kinds: else what `source_kind` says of each source and its family's name.
+        kinds: else what `source_kind` returns for each source and its family's name.
 
     Raises:
         LatticeError: a length that is not finite.
@@ -170,6 +170,6 @@ def _warn_of_octupoles(sources: Sequence[Any]) -> None:
 def _check(source: Any) -> None:
     length = float(source.l)
     if not math.isfinite(length):
-        raise LatticeError(f"'{source.id}' has the length {length}; mend it in the lattice file")
+        raise LatticeError(f"'{source.id}' has the length {length}; correct it in the lattice file")
     if length < 0:
         log.debug("element '%s' has the negative length %.3g m", source.id, length)

@@ -48,7 +48,7 @@ class Errors:
 
     Attributes:
         dx, dy: offset of the magnet's centre, m.
-        ds: of its field along the beam, m; positive further down. What stands beside it stays.
+        ds: of its field along the beam, m; positive further down. Its neighbours stay.
         roll: about the beam axis, rad; positive turns x towards y.
         kick_x, kick_y: px and py gain these at the middle, rad; in a bend they are spread over it.
         k1l, k1sl: thin quadrupole at the middle: px -= k1l x, py += k1l y; thin skew quadrupole:
@@ -119,7 +119,7 @@ class Element:
         tilt: rotation about the beam axis, rad.
         source: the OCELOT element; shared by all places of one object, so never change it
             (`changed` copies).
-        errors: how it differs from what `source` can say.
+        errors: how it differs from what `source` can express.
     """
 
     name: str
@@ -210,10 +210,10 @@ class Ring(Speaks):
         elements: in beam order from the start of the sequence.
         energy: of a particle, rest energy included, GeV.
         changes: what was changed since it was loaded, by element name.
-        mass: rest energy of a particle, GeV; an electron's unless the lattice says otherwise.
+        mass: rest energy of a particle, GeV; an electron's unless the lattice states another.
         known_supplies: those of the design that this ring was changed from; None: it is one.
         model: what the lattice is of the machine, as reports call it: "design", or what its file
-            says ("fitted lattice", "model before the fit").
+            states ("fitted lattice", "model before the fit").
     """
 
     name: str
@@ -277,7 +277,7 @@ class Ring(Speaks):
 
     @property
     def map_energy(self) -> float:
-        """GeV; what OCELOT is told: the energy of an electron that is as fast. Maps of given
+        """GeV; the energy that OCELOT receives: that of an electron that is as fast. Maps of given
         normalised strengths depend on the velocity alone."""
         return self.energy * (ELECTRON_GEV / self.mass)
 

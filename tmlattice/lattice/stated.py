@@ -158,7 +158,7 @@ def curvatures(ring: Ring, stated: Stated) -> list[float]:
 
     Args:
         ring: with thin bends without a length; one of curvature h focuses as |angle| h.
-        stated: what the header says; without tunes there is none.
+        stated: what the header states; without tunes there is none.
     """
     from scipy.optimize import brentq
 

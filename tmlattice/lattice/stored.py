@@ -28,7 +28,7 @@ _REACHES_OUT = {
 
 def depends_on_nothing(code: bytes) -> bool:
     """Whether a file of Python imports only OCELOT's elements and mathematics, reads no file and
-    draws no random number: as far as one can tell without running it."""
+    draws no random number: as far as the text shows without running it."""
     try:
         tree = ast.parse(code)
     except (SyntaxError, ValueError):
@@ -102,7 +102,7 @@ def _check(kept: Any) -> None:
 
 
 def save(key: str, ring: Ring) -> None:
-    """Keep a ring, where data can say all that it is."""
+    """Keep a ring, where data can describe it completely."""
     texts: dict[int, str] = {}
     back: dict[str, Any] = {}
     index: dict[tuple[Any, ...], int] = {}

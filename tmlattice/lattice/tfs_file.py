@@ -67,7 +67,7 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     if energy is None:
         energy = _number(header, "ENERGY")
     if energy is None:
-        raise LatticeError(f"'{path}' states no ENERGY; say energy= (GeV)")
+        raise LatticeError(f"'{path}' states no ENERGY; give energy= (GeV)")
     mass = _number(header, "MASS") or ELECTRON_GEV
     charge = _number(header, "CHARGE") or 1.0
     rows: list[Row] = table.to_dict("records")

@@ -71,7 +71,7 @@ def _lacks(ring: Ring) -> tuple[str, ...]:
     # by the name that the element has there: a source that comes from the cache has none
     other = sum(e.kind != source_kind(e.source, e.family) for e in ring.elements)
     if other:
-        told.append(f"OCELOT's classes do not tell the kind of {other} elements")
+        told.append(f"OCELOT's classes do not state the kind of {other} elements")
     return tuple(told)
 
 

@@ -145,7 +145,7 @@ def ring_of_content(
         line = content["lines"][chosen(path, list(content["lines"]), sequence)]
     mass, charge, stated = _particle(line, content, beside)
     if energy is None and stated is None:
-        raise LatticeError(f"'{path}' has no reference particle; say energy= (GeV)")
+        raise LatticeError(f"'{path}' has no reference particle; give energy= (GeV)")
     energy = float(stated or 0.0) if energy is None else energy
     reader = _Reader(content, line, energy, mass)
     parts = reader.parts()

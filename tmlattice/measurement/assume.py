@@ -205,7 +205,7 @@ def _earlier(data: Measurement) -> Measurement:
     """Turns one earlier; nothing was read on turn 0."""
     if data.readings.shape[1] < 2 or np.isfinite(data.readings[:, 0]).any():
         raise MeasurementError(
-            "turns are said to count from 1, but there are readings of turn 0, or of no other; "
+            "turns are stated to count from 1, but there are readings of turn 0, or of no other; "
             "leave 'turns-from-1' out"
         )
     return _with(data, readings=data.readings[:, 1:])
@@ -355,7 +355,7 @@ ASSUMPTIONS: dict[str, Assumption] = {
         "delta of the launches is in per cent", "divide it by 100", _launches, 1, 1, 1, 1, 0.01
     ),
     "launches-unknown": _first(
-        "the launches are not what is stated", "mend them, or their launch_sigma", _no_launches
+        "the launches are not what is stated", "correct them, or their launch_sigma", _no_launches
     ),
     "settings-reversed": _first(
         "the kicks in the shots' settings have the wrong sign", SIGN.format("all of them"),

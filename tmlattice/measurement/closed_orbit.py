@@ -29,11 +29,11 @@ class ClosedOrbit(Shots):
     Attributes:
         orbit: (x, y) in m, [shot, monitor, 2]; NaN where missing.
         monitors: names, in the order of the readings.
-        noise: rms of one (averaged) reading, m, [monitor, 2], NaN where not known; None: unknown.
+        noise: rms of one (averaged) reading, m, [monitor, 2], NaN where unknown; None: all unknown.
             A pair (x, y), or a mapping of pairs by monitor, is taken too.
         settings: of each shot, see `Measurement`; () for the design's in every shot.
         shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data say of them (GeV); hints.
+        lattice, energy: what the data state about them (GeV); hints.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.

@@ -51,7 +51,7 @@ def read_document(
 
 
 def _misspelt(document: dict[str, Any], schema: dict[str, Any]) -> str | None:
-    """What to say of a key that is all but a known one; others are whoever wrote them's own."""
+    """The message about a misspelt key; unknown keys belong to whoever wrote the file."""
     parts = [schema, schema.get("then", {}), schema.get("else", {})]
     known = {name: rule for part in parts for name, rule in part.get("properties", {}).items()}
     places: list[tuple[str, dict[str, Any], Iterable[str]]] = [("it", document, known)]
@@ -68,7 +68,7 @@ def _misspelt(document: dict[str, Any], schema: dict[str, Any]) -> str | None:
 
 
 class Digest:
-    """What says that a table is the one that its measurement.json was written with.
+    """Digest that proves that a table was written together with its measurement.json.
 
     Lines may end as any system ends them.
     """
@@ -86,7 +86,7 @@ class Digest:
 
 
 def check_table(document: dict[str, Any], table: Path) -> None:
-    """Whether a table is whole, and belongs to the document beside it, where that says so.
+    """Whether a table is whole, and belongs to its document, where that holds a digest.
 
     Raises:
         MeasurementError: it cannot be read, or is another.

@@ -81,7 +81,7 @@ def read_measurement(
         A record of the folder's kind.
 
     Raises:
-        MeasurementError: one sentence with the file, the line and what would mend it.
+        MeasurementError: one sentence with the file, the line and the correction.
     """
     path = Path(path)
     if turn_by_turn is not None:
@@ -184,7 +184,7 @@ def _orbit_response(
     with located(file):
         correctors = Names("corrector", [column["corrector"] for column in columns])
         if dispersion and rf is None:
-            raise MeasurementError('"dispersion" is true but "rf" does not say the step; add it')
+            raise MeasurementError('"dispersion" is true but "rf" does not state the step; add it')
 
     rows = read_rows(file.with_name("response.csv"), RESPONSE)
     rows.check("corrector", "monitor")

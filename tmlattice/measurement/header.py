@@ -1,4 +1,4 @@
-"""What measurement.json says for every kind: format, kind, lattice, energy and noise."""
+"""Fields of measurement.json of every kind: format, kind, lattice, energy and noise."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -60,7 +60,7 @@ def read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) -> 
     if unread and known is None:
         warnings.warn(
             f"the noise names {len(unread)} monitors of which nothing was read, such as "
-            f"'{plain(unread[0], 60)}'; mend the name where it should be another",
+            f"'{plain(unread[0], 60)}'; correct the name where it should be another",
             stacklevel=2,
         )
     return noise_table(there, read)

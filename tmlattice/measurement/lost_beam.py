@@ -140,7 +140,7 @@ def no_beam(sums: Array) -> Flags:
 
 
 def about_sums(sums: Array, silent: Flags, read: Flags, names: Sequence[str]) -> list[str]:
-    """What is said of sum signals [shot, turn, monitor], and of readings that are left out."""
+    """Sentences about sum signals [shot, turn, monitor], and about readings that are left out."""
     if not np.isfinite(sums).any():
         return []
     lost = silent & read

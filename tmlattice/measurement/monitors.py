@@ -62,7 +62,7 @@ class Names:
 
 
 def merge_spellings(spellings: Sequence[str]) -> tuple[tuple[str, ...], NDArray[np.int64]]:
-    """Names that differ in case alone, or in `::0` beside the bare name, become one.
+    """Names that differ in case alone, or in `::0` after the bare name, become one.
 
     Returns:
         The names, in order of first appearance and in their first spelling, and for each
@@ -83,11 +83,11 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
 
     Args:
         noise: a pair (x, y) for all monitors, an array [monitor, 2], a mapping of pairs by
-            monitor, or None; m, NaN where not known.
+            monitor, or None; m, NaN where unknown.
         monitors: their names.
 
     Returns:
-        [monitor, 2], m, NaN where not known; None where nothing is.
+        [monitor, 2], m, NaN where unknown; None where nothing is.
 
     Raises:
         MeasurementError: not positive, or of another shape.
@@ -118,6 +118,6 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
         place, plane = (int(i) for i in np.argwhere(wrong)[0])
         raise MeasurementError(
             f"the noise of monitor '{monitors[place]}' in {'xy'[plane]} is "
-            f"{table[place, plane]:g} m; it is an rms: above zero, or absent where not known"
+            f"{table[place, plane]:g} m; it is an rms: above zero, or absent where unknown"
         )
     return None if np.isnan(table).all() else table

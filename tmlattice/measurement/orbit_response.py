@@ -36,7 +36,7 @@ class RfStep:
 HIGHEST_RF = 1e12
 """Hz, and of its harmonic: no cavity is smaller."""
 LARGEST_KICK = 1e6
-"""rad: what was written down in microradians is told by the data, beyond that it is none."""
+"""rad: the data determine whether kicks are in microradians; a larger kick is rejected."""
 
 
 def check_rf(rf: RfStep) -> None:
@@ -63,10 +63,10 @@ class OrbitResponse(Shown):
         monitors: names.
         response: the orbit change for that kick, m (not m/rad), [column, monitor, 2], NaN where
             missing.
-        noise: rms of a reading, m, [monitor, 2], NaN where not known; None: unknown. A pair
+        noise: rms of a reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
             (x, y), or a mapping of pairs by monitor, is taken too.
         rf: the RF's step, or None.
-        lattice, energy: what the data say of them (GeV); hints.
+        lattice, energy: what the data state about them (GeV); hints.
         devices: names that the control system has for monitors and correctors, by the names here;
             empty: unknown.
 
@@ -105,7 +105,7 @@ class OrbitResponse(Shown):
             x, y: orbit change for the kick, [corrector, monitor], m (not m/rad); None: not read.
             monitors, correctors: names, or elements of a ring.
             kicks: rad, one for all or one a corrector.
-            planes: "x" or "y" for all, or one a corrector; None: as the elements' kinds say.
+            planes: "x" or "y" for all, or one a corrector; None: as the elements' kinds state.
             unit: of x and y.
             noise, rf: see the attributes.
 

@@ -258,7 +258,7 @@ def _first_wrong(rows: list[list[str]], width: int, place: dict[str, int]) -> tu
     """The first row of a chunk that is wrong, and what it should be."""
     for number, row in enumerate(rows):
         if len(row) != width:
-            return number, f"{len(row)} fields where the header has {width}; mend the row"
+            return number, f"{len(row)} fields where the header has {width}; correct the row"
         for name, i in place.items():
             try:
                 _parse([[row[i]]], 1, {name: 0}, {name: {}})

@@ -70,7 +70,7 @@ class Shown(Speaks):
         if "launches" in own:
             sigma = own["launch_sigma"]
             known = sigma is not None and np.isfinite(sigma[:, :4]).all()
-            rows["launches"] = "stated" if known else "not known"
+            rows["launches"] = "stated" if known else "unknown"
         if own.get("tune") is not None:
             pairs = (" ".join(f"{q:.5f}" for q in pair) for pair in own["tune"][:3])
             rows["tunes"] = "; ".join(pairs)
@@ -93,6 +93,6 @@ def same(one: Any, other: Any) -> bool:
 
 def _noise(noise: Any) -> str:
     if noise is None or not np.isfinite(noise).any():
-        return "not known"
+        return "unknown"
     x, y = (1e6 * np.sqrt(np.nanmean(np.square(plane))) for plane in np.asarray(noise).T)
     return f"{x:.3g} µm" if np.isclose(x, y) else f"{x:.3g} µm in x, {y:.3g} µm in y"

@@ -1,7 +1,7 @@
 """Folders of a stored beam's turns, closed orbits, dispersion and tunes: see `measurement.folder`.
 
-Each kind has a reader of its document and table, and a writer of the table that tells the
-document.
+Each kind has a reader of its document and table, and a writer of the table that completes
+the document.
 """
 
 import csv

@@ -45,7 +45,7 @@ def read_table(
         unit: of x and y.
 
     Raises:
-        MeasurementError: one sentence with the file, the line and what would mend it.
+        MeasurementError: one sentence with the file, the line and the correction.
     """
     rows = read_rows(Path(path), COLUMNS, optional=("shot", "turn"))
     rows = replace(rows, xy=rows.xy * metres(unit))
@@ -117,7 +117,7 @@ def read_turn_by_turn(
     if (np.abs(readings) > LARGEST_READING).any():
         raise MeasurementError(
             f"{path}: readings up to {np.nanmax(np.abs(readings)):g} m are above "
-            f"{LARGEST_READING} m; say the unit of the file (unit='mm')"
+            f"{LARGEST_READING} m; state the unit of the file (unit='mm')"
         )
     with located(path):
         if monitors is not None:

@@ -58,7 +58,7 @@ class Measurement(Shown):
             m and rad; given as [shot, 4], delta is 0.
         readings: (x, y) in m, [shot, turn, monitor, 2]; NaN where missing. Turn 0 is the first.
         monitors: names, in the order of the readings.
-        noise: rms of one reading, m, [monitor, 2], NaN where not known; None: unknown. A pair
+        noise: rms of one reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
             (x, y), or a mapping of pairs by monitor, is taken too.
         launch_sigma: rms of the launches, [shot, 5]; inf: unknown, fitted with no prior;
             0: exact. Given as [shot, 4], delta is exact. None: unknown, delta exact.
@@ -66,8 +66,8 @@ class Measurement(Shown):
             "k1_relative", "k2_relative", or "frequency_relative" under the name "rf"; () for
             the design's in every shot.
         shots: their ids; () for 0, 1, ...
-        lattice: what the data say of the lattice; a hint.
-        energy: what the data say of the beam energy, GeV; a hint.
+        lattice: what the data state about the lattice; a hint.
+        energy: what the data state about the beam energy, GeV; a hint.
         devices: names that the control system has for monitors and correctors, by the names here;
             empty: unknown.
 
@@ -278,7 +278,7 @@ class Measurement(Shown):
         )
 
     def split(self, holdout: float, seed: int = 0) -> tuple["Measurement", "Measurement | None"]:
-        """Shots to fit, and shots held out to judge the fit by; both in their order.
+        """Shots to fit, and held-out shots for validation; both in their order.
 
         Args:
             holdout: part of the shots to hold out, in [0, 1), rounded to whole shots: one at
@@ -363,7 +363,7 @@ def check_settings(shot: int, settings: Settings) -> None:
     """Settings of a shot are known, finite, and each element's own.
 
     Raises:
-        MeasurementError: says which is not.
+        MeasurementError: states which is not.
         UnknownNameError: a setting that no element has.
     """
     Names("element", settings)

@@ -82,7 +82,7 @@ def read_truth(path: str | Path) -> Truth:
     """Read a truth file.
 
     Raises:
-        MeasurementError: one sentence with the file and what would mend it.
+        MeasurementError: one sentence with the file and the correction.
     """
     path = Path(path)
     document = read_document(path, "truth", FORMAT)

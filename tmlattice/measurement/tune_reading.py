@@ -19,18 +19,18 @@ class TuneReading(Shown):
     """Tunes, and chromaticities where they were measured, of one or more settings.
 
     A tune is the fraction of the full tune, in [0, 1): 37.87 is 0.87. A spectrum shows 0.13 for it:
-    whoever writes the tune down says which of the two it is. (`harmonics.Tunes` are those of a
+    whoever writes the tune down states which of the two it is. (`harmonics.Tunes` are those of a
     signal; these were read.)
 
     Attributes:
         tune: (x, y), [shot, 2], NaN where not measured; of one shot [2] is taken too.
-        tune_error: its rms, [shot, 2], NaN where not known; None: unknown.
+        tune_error: its rms, [shot, 2], NaN where unknown; None: all unknown.
         chromaticity: (x, y), dQ / d delta, not divided by the tune, [shot, 2], NaN where not
             measured; None: not measured.
         chromaticity_error: its rms, as `tune_error`.
         settings: of each shot, see `Measurement`; () for the design's in every shot.
         shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data say of them (GeV); hints.
+        lattice, energy: what the data state about them (GeV); hints.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or nothing measured.
@@ -95,6 +95,6 @@ def _rms(of: str, values: Any, tune: Array) -> Array | None:
     if wrong.any():
         raise MeasurementError(
             f"an error of the {of} is {error[wrong][0]:g}; it is an rms: above zero, or absent "
-            "where not known"
+            "where unknown"
         )
     return error

@@ -32,11 +32,11 @@ class TurnByTurn(Shots):
     Attributes:
         readings: (x, y) in m, [shot, turn, monitor, 2]; NaN where missing, as behind a lost beam.
         monitors: names, in the order of the readings.
-        noise: rms of one reading, m, [monitor, 2], NaN where not known; None: unknown. A pair
+        noise: rms of one reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
             (x, y), or a mapping of pairs by monitor, is taken too.
         settings: of each shot, see `Measurement`; () for the design's in every shot.
         shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data say of them (GeV); hints.
+        lattice, energy: what the data state about them (GeV); hints.
         devices: names that the control system has for monitors and correctors, by the names here;
             empty: unknown.
 

@@ -119,7 +119,7 @@ def _write_response(folder: Path, response: OrbitResponse) -> None:
 
 
 def _write_signed(folder: Path, document: dict[str, Any], table: Path) -> None:
-    """measurement.json beside its table, with what says that they belong together."""
+    """measurement.json next to its table, with the digest that links them."""
     digest = Digest()
     with table.open("rb") as file:
         while part := file.read(1 << 20):
