@@ -258,7 +258,7 @@ def test_what_was_exchanged_on_one_day_is_located(small_ring, before, axis, a, b
     assert (result.verdict, found.effect) == ("localised", None)
     assert set(found.elements) == {names[a], names[b]}
     text = " ".join(report_text(result).split())
-    assert "answer each as the other one did. 1." in text  # and no word of small errors, or of
+    assert "respond each as the other one did. 1." in text  # and no word of small errors, or of
     assert "--corrected-out" not in text  # gradients to be set
 
 

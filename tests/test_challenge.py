@@ -170,9 +170,9 @@ def test_baselines_of_several_causes_give_a_finding_each():
     guesses = [{"effect": "a", "element": str(i)} for i in range(3)]
     assert len(baseline_answer(guesses)["findings"]) == 1
     assert len(baseline_answer(guesses)["findings"][0]["credible_set"]) == 3
-    apart = baseline_answer(guesses, apart=2)
+    apart = baseline_answer(guesses, separate=2)
     assert [f["element"] for f in apart["findings"]] == ["0", "1"]
-    assert baseline_answer([], apart=2) == {"verdict": "none", "findings": []}
+    assert baseline_answer([], separate=2) == {"verdict": "none", "findings": []}
 
 
 def test_unknowns_and_a_reduced_catalogue_share_tier_d(tmp_path):

@@ -196,7 +196,7 @@ def test_make_run_ends_with_a_fault_found_named_and_reported(tmp_path):
     for words in commands[1:]:
         done = tmlattice(*words, cwd=tmp_path, check=0)
     assert words[0] == "diagnose"
-    assert "NAMED: quadrupole qd::12" in done.stdout
+    assert "IDENTIFIED: quadrupole qd::12" in done.stdout
     assert (tmp_path / "first-run" / "report" / "report.html").stat().st_size > 10_000
 
 
