@@ -171,7 +171,8 @@ def with_waves(state: State) -> State:
         own = likely[plane == read]
         own = own[np.isfinite(own[:, 0])]
         if len(own):
-            noise.scale[block, read, 0] = float(np.sqrt(np.mean(np.median(own**2, axis=0))))
+            square = np.mean(np.median(own**2, axis=0))
+            noise.scale[block, read, 0] = float(np.sqrt(max(square, _floor(state))))
         noise.size[block, plane == read, KINDS["waves"]] = noise.scale[block, read, 0]
     return replace(state, noise=noise)
 
