@@ -34,7 +34,7 @@ class Slopes(NamedTuple):
     def times(self, readings: Array) -> Array:
         """Readings [..., column, monitor] times the derivatives, summed, [error, ...]."""
         own = readings if self.now is None else self.now * readings
-        flat = self.rows.reshape(len(self.rows), -1)
+        flat = self.rows.reshape(len(self.rows), int(np.prod(self.rows.shape[1:])))
         summed = flat @ own.reshape(-1, flat.shape[1]).T
         return np.asarray(summed.reshape(len(self.rows), *readings.shape[:-2]))
 
