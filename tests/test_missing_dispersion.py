@@ -23,11 +23,11 @@ from tmlattice.diagnosis.families.dispersion import (
     patterns_of_kicks,
 )
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import FAMILIES
-from tmlattice.diagnosis.response.hierarchical import fit_families
+from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response
@@ -46,7 +46,7 @@ from tmlattice.observe.split import split_columns
 
 STEP = -2000.0
 """Hz."""
-WITHOUT = [own for own in FAMILIES if not isinstance(own, HorizontalKicks)]
+WITHOUT = [step for step in STEPS if not isinstance(step.families[0], HorizontalKicks)]
 
 
 def simulated(ring, causes, **how):
@@ -71,7 +71,7 @@ def with_kicks(ring, measured, more):
 def state_of(ring, measured, fit):
     data = response_data(ring, measured)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    return fit_families(data, split, WITHOUT).state if fit else begin(data, split)
+    return fit_steps(data, split, WITHOUT).state if fit else begin(data, split)
 
 
 @pytest.fixture(scope="module")
@@ -134,13 +134,13 @@ def measured(small_ring, beside):
     return causes, plain, with_kicks(small_ring, plain, beside)
 
 
-def test_gradients_are_not_biased_by_other_dispersion(small_ring, measured):
+def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, measured):
     causes, plain, kicked = measured
     amounts = {cause.element: cause.amount for cause in causes}
     missed, said = [], []
-    for own, steps in ((plain, FAMILIES), (kicked, FAMILIES), (kicked, WITHOUT)):
+    for own, steps in ((plain, STEPS), (kicked, STEPS), (kicked, WITHOUT)):
         data = response_data(small_ring, own)
-        fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
         true = [amounts[name] for name in QuadrupoleGradient().places(data)]
         missed.append(np.std(fit.state.values["gradient"] - true))
         said.append(len(list(dispersion_by_kicks(fit.state.values, data))))
@@ -260,7 +260,7 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
     for row, said in (
         ('{"element": "QF::1", "x": 0, "y": 0}', "is a quadrupole"),
         ('{"element": "v1", "x": 1e999, "y": 0}', "is no number"),
-        ('{"element": "v1", "x": 0, "y": 0}, {"element": "v1", "x": 0, "y": 0}', "occurs twice"),
+        ('{"element": "v1", "x": 0, "y": 0}, {"element": "v1", "x": 0, "y": 0}', "stands twice"),
     ):
         other = tmp_path / "other.json"
         other.write_text(
@@ -291,7 +291,7 @@ def test_evidence_wants_kicks_where_they_are_and_not_elsewhere(small_ring, besid
     assert said[0].amount < 5e-5 < said[1].amount < 1e-3
 
 
-def test_without_the_rf_nothing_is_reported_of_it(small_ring):
+def test_without_the_rf_nothing_is_said_of_it(small_ring):
     measured = simulated(small_ring, [], kick=1e-5, noise=2e-8, engine="ocelot")
     state = state_of(small_ring, replace(measured, rf=None), False)
     assert HYPOTHESES["dispersion"](state) is None
@@ -346,7 +346,7 @@ def test_a_kick_that_a_particle_of_another_energy_misses(ring_kicking_x, monkeyp
 
 
 @pytest.mark.parametrize("plane", [0, 1])
-def test_a_model_with_orbit_kicks_has_their_dispersion_and_its_slopes(small_ring, plane):
+def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_ring, plane):
     """In a ring that is changed, too: the layers that are made anew have theirs. Slopes against
     differences, to what these are good for."""
     design = ResponseModel(small_ring)

@@ -8,14 +8,15 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.families.steps import CHANGES, FAMILIES
+from tmlattice.diagnosis.families.steps import CHANGES, STEPS
 from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.before_after import ANY
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
 from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.single_change import SingleChange, _Line, _peaks
-from tmlattice.diagnosis.response.state import allow, begin, jump
+from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.diagnosis.response.undetermined import (
     Blur,
     Undetermined,
@@ -57,7 +58,7 @@ def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
     data = response_data(small_ring, before)
     split = split_columns(data, 0.2, np.random.default_rng(0))
-    state = settle(jump(allow(begin(data, split), FAMILIES)))
+    *_, (_, state) = one_by_one(begin(data, split), STEPS)
     return state
 
 
@@ -78,8 +79,9 @@ def crowded_change(small_ring, before, fitted):
     data = response_change(first, ring_alone, second)
     split = split_columns(data, 0.2, np.random.default_rng(0))
     state = begin(data, split)
-    state = allow(replace(state, exploring=False, guessed=ANY), CHANGES)
-    return settle(settle(jump(state), alike=True))
+    for _, settled in one_by_one(replace(state, exploring=False, guessed=ANY), CHANGES):
+        state = settled
+    return settle(state)
 
 
 def chi2_per_reading(state):

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.families.steps import FAMILIES
+from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.missing_effects import control, weigh
-from tmlattice.diagnosis.response.outliers import without_gross
+from tmlattice.diagnosis.response.odd_readings import without_gross
+from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.diagnosis.response.unlike_model import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT
@@ -60,7 +60,7 @@ def of_plane(plane):
     [
         (in_plane_alone, "no corrector is read in the other plane"),
         (of_plane("y"), "no corrector kicks in x"),
-        (y_monitors, "no BPM reads x"),
+        (y_monitors, "no monitor reads x"),
     ],
     ids=["in-plane readings alone", "y alone", "monitors of y alone"],
 )
@@ -88,7 +88,7 @@ def test_reversed_monitors_and_correctors_are_fitted_and_named(small_ring, whole
     response[3] *= -1
     data = replace(whole, response=response, rf=replace(whole.rf, orbit=orbit))
     split = split_columns(response_data(small_ring, data), 0.2, np.random.default_rng(1))
-    fit = fit_families(response_data(small_ring, data), split, FAMILIES[:4])
+    fit = fit_steps(response_data(small_ring, data), split, STEPS[:3])
     assert fit.steps[-1].heldout_rms_in_plane < 3e-8
     assert reversed_ones(fit.state) == [
         "monitors that read with the wrong sign: "
@@ -108,15 +108,15 @@ def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, mo
     0.17 to 0.13 µm; and have nothing to say where nothing is missing."""
     data = response_data(small_ring, whole)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    calibrations = FAMILIES[0]
+    calibrations = replace(STEPS[0], families=STEPS[0].families[:1])
     waves = HYPOTHESES["orbit_drift"]
     monkeypatch.setitem(HYPOTHESES, "random", lambda state: control(waves(state)))
-    lacking = fit_families(data, split, [calibrations]).state
+    lacking = fit_steps(data, split, [calibrations]).state
     none, own, random = weigh(lacking, ["orbit_drift", "random"])
     assert random.heldout_rms_in_plane < 0.9 * none.heldout_rms_in_plane
     assert random.judgement == "as random ones do"
     assert own.judgement == "helps"
-    fitted = fit_families(data, split, [calibrations, *FAMILIES[2:4]]).state
+    fitted = fit_steps(data, split, [calibrations, *STEPS[1:3]]).state
     none, own = weigh(fitted, ["orbit_drift"])
     assert own.judgement == "excluded"
     assert own.evidence < 0
@@ -128,9 +128,9 @@ def test_fields_that_their_neighbours_shift_are_weighed_by_the_magnets_beside_th
     """All vertical correctors between the same two families by 2 cm."""
     data = response_data(small_ring, whole)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    trials = [FAMILIES[0], *FAMILIES[2:4]]
+    trials = [replace(STEPS[0], families=STEPS[0].families[:1]), *STEPS[1:3]]
     name = "corrector_position_neighbours"
-    patterns = HYPOTHESES[name](fit_families(data, split, trials).state).patterns
+    patterns = HYPOTHESES[name](fit_steps(data, split, trials).state).patterns
     counts = (np.abs(patterns).max(axis=2) > 0).sum(axis=1)
     assert (counts > 1).all()
     response = data.measured.response.copy()
@@ -138,7 +138,7 @@ def test_fields_that_their_neighbours_shift_are_weighed_by_the_magnets_beside_th
     shift = 0.02 * patterns[int(np.argmax(counts))][:-1]
     response[own] += shift
     moved = response_data(small_ring, replace(data.measured, response=response))
-    none, row = weigh(fit_families(moved, split, trials).state, [name])
+    none, row = weigh(fit_steps(moved, split, trials).state, [name])
     assert row.judgement == "helps"
     assert row.heldout_rms_in_plane < 0.7 * none.heldout_rms_in_plane
     assert row.amount * np.sqrt(row.parameters) == pytest.approx(0.02, rel=0.2)
@@ -170,6 +170,6 @@ def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_
         response[place] += 20 * np.nanstd(response)
     data = replace(whole, response=response)
     measured, (said,) = without_gross(data, response_data(small_ring, data))
-    assert said.endswith(f"rejected: 4; most at {whole.correctors[2]} (2)")
+    assert said.endswith(f"left out: 4; most at {whole.correctors[2]} (2)")
     gone = np.isnan(measured.response) & np.isfinite(response)
     assert [tuple(place) for place in np.argwhere(gone)] == places

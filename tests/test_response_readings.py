@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.families.steps import FAMILIES
+from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
-from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.outliers import common_modes, messages
+from tmlattice.diagnosis.response.odd_readings import odd_readings
+from tmlattice.diagnosis.response.odd_steps import odd_steps
+from tmlattice.diagnosis.response.other_kicks import other_kicks
+from tmlattice.diagnosis.response.set_aside import taken_back
+from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.stepwise import fit_steps, one_by_one
 from tmlattice.diagnosis.response.swaps import (
     correctors_back,
     monitors_back,
@@ -44,7 +49,7 @@ def clean(small_ring):
 def fitted(ring, measured):
     data = response_data(ring, measured)
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    return fit_families(data, split, [*FAMILIES[:2], FAMILIES[3]]).state
+    return fit_steps(data, split, [STEPS[0], STEPS[2]]).state
 
 
 def error(state):
@@ -65,9 +70,9 @@ def test_single_readings_that_stick_out_count_little_and_are_named(small_ring, c
     for c, m in zip(columns, places, strict=True):
         response[c, m, int(clean.planes[c] == "y")] += 2e-7  # of a noise of 2e-8
     best, state = (fitted(small_ring, one) for one in (clean, replace(clean, response=response)))
-    assert not messages(best)
+    assert not odd_readings(best)
     assert error(state) < 1.05 * error(best)
-    (said,) = messages(state)
+    (said,) = odd_readings(state)
     assert said.startswith("24 of ")
     assert f"{clean.monitors[6]} (" in said
 
@@ -84,10 +89,10 @@ def test_readings_that_went_wrong_are_left_out_by_the_fit_and_their_monitors_sta
         response[c, m, int(clean.planes[c] == "y")] += 5e-6 * rng.choice([-1, 1])
     data = response_data(small_ring, replace(clean, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    fit = fit_families(data, split, FAMILIES[:4])
-    (said,) = fit.messages
+    fit = fit_steps(data, split, STEPS[:3])
+    (said,) = fit.said
     assert said.startswith("single readings that differ from the fit by 20 times")
-    assert "rejected: 12" in said
+    assert "left out: 12" in said
     assert np.isnan(fit.state.data.orbits).sum() == 12
     assert fit.state.good.all()
     assert fit.steps[-1].heldout_chi2_per_dof < 1.5
@@ -105,8 +110,8 @@ def test_a_tenth_of_the_readings_that_a_step_has_are_no_single_ones(
     response[4, ::7][:wrong, int(clean.planes[4] == "y")] += 5e-6
     data = response_data(small_ring, replace(clean, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    fit = fit_families(data, split, FAMILIES[:4])
-    assert any(said.startswith("single readings") for said in fit.messages) == alone
+    fit = fit_steps(data, split, STEPS[:3])
+    assert any(said.startswith("single readings") for said in fit.said) == alone
 
 
 def lagging(response, planes, columns, late):
@@ -126,16 +131,29 @@ def test_steps_that_some_monitors_read_too_early_are_left_out_and_named(small_ri
     late = np.arange(0, clean.response.shape[1], 2)
     wrong = replace(clean, response=lagging(clean.response, clean.planes, columns, late))
     data = response_data(small_ring, wrong)
-    assert not fit_families(
-        data, split, [*FAMILIES[:2], FAMILIES[3]]
-    ).messages  # gains may break triples, too
-    fit = fit_families(data, split, FAMILIES[:4])
-    (said,) = fit.messages
-    told_of = said.split("rejected: ")[1].split(";")[0].split(", ")
-    assert sorted(own.split(" (")[0] for own in told_of) == sorted(names[c] for c in columns)
+    assert not fit_steps(data, split, [STEPS[0], STEPS[2]]).said  # gains may break triples, too
+    fit = fit_steps(data, split, STEPS[:3])
+    (said,) = fit.said
+    told_of = said.split("left out: ")[1].split(";")[0].split(", ")
+    assert sorted(told_of) == sorted(names[c] for c in columns)
     assert fit.steps[-1].heldout_chi2_per_dof < 1.5
     assert not fit.state.split.held[columns].any()
     assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
+
+
+def test_a_step_whose_calibration_was_a_wrong_guess_is_not_odd(small_ring, clean):
+    """Diamond, 68 % from its design: +153 %, with the third order of such a step."""
+    data = response_data(small_ring, clean)
+    split = split_columns(data, 0.2, np.random.default_rng(1))
+    *_, (_, state) = one_by_one(begin(data, split), STEPS[:3])  # with gains
+    column = int(np.flatnonzero(state.fitted & (data.plane == 1))[0])
+    values = {name: own.copy() for name, own in state.values.items()}
+    values["calibration"][column] = 1.5
+    bent = np.zeros_like(data.orbits)
+    bent[column, ::2] = 0.3 * data.orbits[column, ::2]  # neighbours contradict each other
+    far = replace(state, at=Predicted(data, state.at.errors, bent)).moved(values)
+    assert inconsistent(far)[column]
+    assert [own.said for own in odd_steps(far)] == [(), ()]
 
 
 def test_a_kick_elsewhere_is_an_orbit(small_ring, clean):
@@ -150,7 +168,7 @@ def test_a_kick_elsewhere_is_an_orbit(small_ring, clean):
     response[y[3]] *= -1
     response[y[4]] = 0.0
     moved = response_data(small_ring, replace(clean, response=response))
-    assert not inconsistent(fit_families(moved, split, [*FAMILIES[:2], FAMILIES[3]]).state).any()
+    assert not inconsistent(fit_steps(moved, split, [STEPS[0], STEPS[2]]).state).any()
 
 
 def test_a_larger_step_is_not_odd(small_ring):
@@ -168,11 +186,11 @@ def test_a_larger_step_is_not_odd(small_ring):
         kicks[c] *= 20
     data = response_data(small_ring, replace(measured, response=response, kicks=kicks))
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    steps = [own for own in FAMILIES if own.name in WITH_ROLLS - {"monitor_roll"}]
-    assert fit_families(data, split, steps).messages == ()
+    steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS - {"monitor_roll"}]
+    assert fit_steps(data, split, steps).said == ()
 
 
-def test_a_step_with_another_kick_in_it_is_named_and_left_out(small_ring, clean):
+def test_a_step_with_another_kick_in_it_is_named_and_not_read_in_that_plane(small_ring, clean):
     """PETRA III: 0.1 mrad of one corrector, and 3 urad in y a kilometre away."""
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
     causes.append(Cause("corrector_roll", "v9", 0.05))  # as large, and its own
@@ -188,17 +206,49 @@ def test_a_step_with_another_kick_in_it_is_named_and_left_out(small_ring, clean)
     response[inside] += 0.1 * response[source]
     data = response_data(small_ring, replace(measured, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    steps = [own for own in FAMILIES if own.name in WITH_ROLLS]
-    fit = fit_families(data, split, steps)
-    said = " ".join(fit.messages)
+    steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS]
+    fit = fit_steps(data, split, steps)
+    (said,) = fit.said
     assert all(f"{name} (" in said for name in ("v2", "v4"))
-    unread = np.isnan(fit.state.data.orbits[:-1]).all(axis=(1, 2))
-    assert set(np.flatnonzero(unread)) <= {across, inside}
+    assert said.count(" µrad in ") == 2
+    readings = np.isfinite(fit.state.data.orbits[:-1]).any(axis=1)
+    assert readings[across].tolist() == [False, True]
+    assert readings[inside].tolist() == [False, False]
+    assert readings.sum() == 2 * len(names) - 3
+    # the kick that is told makes the orbit that was added, with its sign
+    whole = replace(fit.state, data=data, at=Predicted(data, fit.state.at.errors))
+    model, added = whole.at.model, 0.1 * measured.response[source, :, 1]
+    told = next(own for own in other_kicks(whole) if own.column == inside)
+    rows = model.reading_slopes[:, told.plane]
+    orbit = orbits_of_kicks(model, [told.layer], model.maps.at, rows, told.plane)[:, 0]
+    assert told.plane == 1
+    assert np.allclose(told.amount * orbit, added, atol=0.1 * np.abs(added).max())
     assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
 
 
+def test_neighbours_that_were_set_aside_are_taken_back_where_they_are_sound(small_ring, clean, rng):
+    """Pohang: the magnet beside them was far off, and was not found without them."""
+    state = fitted(small_ring, clean)
+    monitor = np.arange(len(state.good))
+    alone = replace(state, good=monitor != 12)
+    assert taken_back(alone) is alone
+    back = taken_back(replace(state, good=~np.isin(monitor, [6, 7])))
+    assert back.good.all()
+    assert error(back) < 1.1 * error(state)
+    apart = 2e-7 * rng.standard_normal(clean.response[:, [6, 7]].shape)
+    crate = apart[:, [0, 0]]  # one crate reads both
+    for bad in (apart, crate):
+        response = clean.response.copy()
+        response[:, [6, 7]] += bad
+        noisy = fitted(small_ring, replace(clean, response=response))
+        assert np.flatnonzero(~noisy.good).tolist() == [6, 7]
+        assert taken_back(noisy) is noisy
+
+
 @pytest.mark.parametrize(("plane", "times"), [("x", 5), ("x", 200), ("y", 20)])
-def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(small_ring, ring_kicking_x, plane, times):
+def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
+    small_ring, ring_kicking_x, monkeypatch, plane, times
+):
     """PETRA III: a closed orbit in every step, the RF's too, each time another amount of it."""
     noise = 2e-8
     ring = small_ring if plane == "x" else ring_kicking_x("i")
@@ -215,19 +265,28 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(small_ring, ring_kicki
     moved[:, :, moves] += amounts[:-1, None] * orbit
     rf[:, moves] += amounts[-1] * orbit
     moved = replace(measured, response=moved, rf=replace(measured.rf, orbit=rf))
-    steps = [own for own in FAMILIES if own.name in WITH_ROLLS]
+    steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS]
 
     def found(response):
         data = response_data(ring, response)
-        return fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        return fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
 
     still, told = found(measured), found(moved)
-    assert not common_modes(still.state)
-    (said,) = common_modes(told.state)
-    assert f"rms in {plane}" in said
+    assert still.state.jitter is None
+    (said,) = (one for one in told.said if "the beam moved" in one)
+    assert f"rms in {plane} (as from " in said
     assert f"rms in {'xy'[rests]}" not in said
-    # so large a jitter leaves the RF's orbit nothing to say
-    assert error(told.state) < (3.0 if times > 100 else 1.3) * error(still.state)
+    patterns = told.state.jitter[moves]
+    assert not told.state.jitter[rests].any()
+    # alike at all monitors, and as large: fifteen columns know their rms to a fifth
+    missed = np.linalg.lstsq(patterns.T, orbit, rcond=None)[0] @ patterns - orbit
+    assert np.sqrt(np.mean(missed**2)) < 0.02 * np.sqrt(np.mean(orbit**2))
+    size = np.sqrt(np.mean((patterns**2).sum(axis=0)))
+    assert size == pytest.approx(np.sqrt(np.mean(amounts**2)) * times * noise, rel=0.4)
+    assert error(told.state) < 1.3 * error(still.state)
+    if times > 100:
+        monkeypatch.setattr("tmlattice.diagnosis.response.stepwise.sought", lambda state: None)
+        assert error(found(moved).state) > 10 * error(told.state)
 
 
 def test_noise_that_is_stated_too_low_is_told(small_ring, clean):
@@ -291,8 +350,8 @@ def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
     (told_of,) = swapped_monitors(fitted(small_ring, wrong), clean.monitors)
     assert sorted(told_of) == sorted(pair)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
-    assert any("monitors with swapped labels, corrected" in s for s in found.warnings)
-    assert not any("cannot describe" in said for said in found.warnings)
+    assert any("monitors that answer each as the other one should" in s for s in found.warnings)
+    assert not any("resemble nothing" in said for said in found.warnings)
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
 
 
@@ -319,7 +378,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     assert found.verdict == "localised"
     (one,) = found.findings
     assert set(one.elements) == set(pair)
-    assert one.words == f"{what} {' and '.join(one.elements)} respond each as the other one should"
+    assert one.words == f"{what} {' and '.join(one.elements)} answer each as the other one should"
     # chi-square as it was read, less that of sound readings: a free gain has taken some of it
     own = response_data(small_ring, wrong)
     model = Predicted(own, Errors.none(own)).read
@@ -357,5 +416,5 @@ def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring,
     there = linear(state, 0)
     plain = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where["gradient"]]
     size, without = (np.sqrt(np.mean((off / own) ** 2)) for own in (sigma, plain))
-    assert 0.6 < size < 1.7  # 32 gradients, which pull against one another
+    assert 0.6 < size < 1.4  # 32 gradients, which pull against one another
     assert without > 1.5 or not waves

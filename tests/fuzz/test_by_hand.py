@@ -17,8 +17,8 @@ from inputs import ring, write_all
 
 from tmlattice import diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.families.fields import VerticalFocusing
-from tmlattice.diagnosis.families.steps import MonitorGain
-from tmlattice.diagnosis.response.hierarchical import fit_families
+from tmlattice.diagnosis.families.steps import MonitorGain, Trial
+from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -145,9 +145,11 @@ def test_what_a_ring_has_no_places_of_is_no_step_of_a_fit(whole):
     """Linear algebra of no numbers at all prints what nobody asked for, past Python."""
     data = response_data(load_ring(whole / "ring.json"), read_measurement(whole / "response"))
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    assert not VerticalFocusing().count(data)
-    found = fit_families(data, split, (VerticalFocusing(), MonitorGain()))
-    assert [family.name for family in found.state.families] == [MonitorGain.name]
+    straights = Trial((VerticalFocusing(),), 2, 0)
+    assert not straights.families[0].count(data)
+    found = fit_steps(data, split, (straights, Trial((MonitorGain(),), 2, 0)))
+    tried = [step.effect for step in (*found.steps[1:], *found.rejected_steps)]
+    assert tried == [MonitorGain().title]
 
 
 def test_a_pipe_in_place_of_a_table_is_not_waited_for(folder):

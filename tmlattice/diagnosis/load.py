@@ -20,9 +20,9 @@ from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import element_kind
 from tmlattice.diagnosis.response.common_factors import CommonFactors, Instead
-from tmlattice.diagnosis.response.hierarchical import Step
 from tmlattice.diagnosis.response.inconsistencies import Inconsistency
 from tmlattice.diagnosis.response.missing_effects import Weighed
+from tmlattice.diagnosis.response.stepwise import Step
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import Suspect

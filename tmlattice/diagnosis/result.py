@@ -35,9 +35,9 @@ from tmlattice.observe.calibration import CALIBRATES, Dispersion
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis.response.common_factors import CommonFactors
-    from tmlattice.diagnosis.response.hierarchical import Step
     from tmlattice.diagnosis.response.inconsistencies import Inconsistency
     from tmlattice.diagnosis.response.missing_effects import Weighed
+    from tmlattice.diagnosis.response.stepwise import Step
     from tmlattice.diagnosis.suspects import Suspect
 
 _MEASURES = {

@@ -1,4 +1,4 @@
-"""A fit of a design that is far from the ring that was measured, or stores no beam at all."""
+"""A dense fit of a design that is far from the ring that was measured, or stores no beam at all."""
 
 import dataclasses
 
@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from tmlattice.diagnosis.data_checks import check_data
-from tmlattice.diagnosis.families.steps import FAMILIES, CorrectorCalibration
-from tmlattice.diagnosis.response import first_guess, hierarchical
-from tmlattice.diagnosis.response.hierarchical import fit_families
-from tmlattice.diagnosis.response.rounds import settle
-from tmlattice.diagnosis.response.state import allow, begin, bend, jump
+from tmlattice.diagnosis.families.steps import STEPS, CorrectorCalibration, Trial
+from tmlattice.diagnosis.response import first_guess, stepwise
+from tmlattice.diagnosis.response.state import begin, bend
+from tmlattice.diagnosis.response.stepwise import fit_steps, one_by_one
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
@@ -47,7 +46,7 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
     (values,) = first_guess.first_guess(design).values.values()
     own = [e.k1 > 0 for e in small_ring.elements if e.kind == "quadrupole"]
     assert (values[own] < 0).all()  # of several that resemble the readings the best one
-    fit = fit_families(design.data, design.split, FAMILIES[:4])
+    fit = fit_steps(design.data, design.split, STEPS[:3])
     assert fit.steps[0].heldout_rms_in_plane > 20 * NOISE
     assert fit.steps[-1].heldout_rms_in_plane < 1.5 * NOISE
     gradients = fit.state.values["gradient"]
@@ -93,10 +92,10 @@ def test_units_are_asked_of_a_far_lattice_too(small_ring, change, said):
 def test_magnets_of_no_family_begin_there_too(small_ring):
     """Families alone had led single magnets back to nothing, and every round astray."""
     design = begun(small_ring, measured(small_ring, -0.03))
-    alone = CorrectorCalibration()
+    alone = Trial((CorrectorCalibration(),), 3, 0)
     assert first_guess.begun(design, [alone]) is design
-    near = first_guess.begun(design, [alone, FAMILIES[3]])
-    state = settle(jump(allow(near, [alone])), alike=True)
+    near = first_guess.begun(design, [alone, STEPS[2]])
+    (_, state), *_ = one_by_one(near, [alone])
     assert state.values["gradient"].any()
     assert score(state, state.split.held).in_plane < 2 * NOISE
 
@@ -110,18 +109,18 @@ def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):
     design = begun(small_ring, measured(small_ring, 0.0))
     astray = [Cause("quadrupole_gradient", e.name, 0.02) for e in small_ring.elements
               if e.kind == "quadrupole"]  # fmt: skip
+    settled = stepwise.robust
 
-    def spoilt(state, *args, **options):
-        return (
-            state
-            if state.exploring
-            else dataclasses.replace(state, at=state.at.with_causes(astray))
-        )
+    def spoilt(state):
+        state = settled(state)
+        at = state.at.with_causes(astray)
+        return stepwise.replace(state, at=at, values={k: 0 * v for k, v in state.values.items()})
 
-    monkeypatch.setattr(hierarchical, "settle", spoilt)
-    fit = fit_families(design.data, design.split, FAMILIES[:1])
+    monkeypatch.setattr(stepwise, "robust", spoilt)
+    monkeypatch.setattr(stepwise, "settle", lambda state, *args, **options: state)
+    fit = fit_steps(design.data, design.split, STEPS[:1])
     assert len(fit.steps) == 1
-    assert "residual of the fitted readings is larger than the design's" in fit.messages[-1]
+    assert "more of the readings that it was fitted to" in fit.said[-1]
     assert fit.heldout[0] == fit.heldout[1]
 
 

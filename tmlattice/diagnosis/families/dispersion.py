@@ -1,8 +1,9 @@
-"""Families of closed-orbit kicks that change the dispersion, see `beam.kicks`.
+"""Families of the kicks that a closed orbit has: what they add to the dispersion, see `beam.kicks`.
 
-Dispersion from kicks would bias the gradients, because the RF's orbit is fitted too. Single kicks
-are degenerate, so the parameters are amplitudes of patterns of independent kicks, as many as the
-BPMs separate. They are linearised in the design's optics.
+Dispersion that no gradient makes would else draw the gradients astray: the RF's orbit is read as
+well as any, and a step of it is large. One kick looks like another one, so the numbers are those of
+patterns: as many as the monitors tell apart, each as large as independent kicks make it. They are
+taken in the design's optics, for what they stand for is not known any better.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,13 +27,13 @@ from tmlattice.observe.response_data import ResponseData
 Array = NDArray[np.float64]
 
 LEAST = 3e-3
-"""Share of the strongest pattern below which a weaker one is omitted."""
+"""Share of the strongest pattern below which a weaker one is left out."""
 USUAL = 1e-4
-"""Kick rms, rad, of a ring aligned to some tenths of a millimetre."""
+"""rad: of the kicks of a ring that was aligned to some tenths of a millimetre."""
 
 
 class Patterns(NamedTuple):
-    """Patterns of independent kicks of one size, the strongest first; none without an RF step.
+    """Of independent kicks of one size, the strongest first; none where no RF's orbit was read.
 
     Attributes:
         rf: of the RF's orbit, m/rad, [pattern, monitor].
@@ -47,7 +48,7 @@ class Patterns(NamedTuple):
 
 
 def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
-    """The dispersion patterns of independent kicks of one size, as many as the BPMs separate."""
+    """What independent kicks of one size make of the dispersion, as many as monitors tell apart."""
     data, model = at.data, at.model
     if not np.isfinite(data.orbits[-1, :, plane]).any():
         return Patterns(*(np.zeros((0, n)) for n in (len(data.at), len(data.kicks) - 1, 0)))
@@ -66,11 +67,11 @@ class _Kicks(Family):
 
     @property
     def largest(self) -> float:
-        """Zero: a pattern has no members."""
+        """Patterns have none: a single kick makes all of them."""
         return 0.0
 
     def patterns(self, data: ResponseData) -> Patterns:
-        """The kicks in the design."""
+        """In the design."""
         read = bool(np.isfinite(data.orbits[-1, :, self.plane]).any())
         names = tuple(data.measured.correctors)
         planes = data.plane.tobytes()
@@ -82,16 +83,15 @@ class _Kicks(Family):
         return found
 
     def size(self, data: ResponseData) -> int:
-        """Number of patterns."""
+        """Of the patterns."""
         return len(self.patterns(data).rf)
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of independent kicks."""
+        """Of independent kicks."""
         return [Group(self.name, np.eye(self.size(data)), USUAL)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """Responses of the RF's orbit, and of the correctors by the energy, see
-        `beam.kicks.by_energy`."""
+        """Of the RF's orbit, and of the correctors' by the energy, see `beam.kicks.by_energy`."""
         data, model, patterns = at.data, at.model, self.patterns(at.data)
         names = data.measured.correctors
         read = data.plane_of(self.block)[:-1]
@@ -102,7 +102,7 @@ class _Kicks(Family):
         kicks = data.kicks[:-1] * (1 + at.errors.calibration[:-1])
         out = np.zeros((len(values), *data.shape))
         out[:, -1] = patterns.rf
-        own = np.flatnonzero(read == self.plane)  # their orbit is read in the plane of the kicks
+        own = np.flatnonzero(read == self.plane)  # whose orbit is read where the kicks act
         by_monitors = kicks[own] * energy[own]
         out[:, own] = by_monitors[:, None] * (patterns.rf / data.energy_of_rf)[:, None]
         by_correctors = more * kicks * patterns.at_correctors
@@ -111,7 +111,7 @@ class _Kicks(Family):
         return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The errors with the kicks' dispersion."""
+        """Beside what the ring makes."""
         patterns = self.patterns(data)
         more = np.zeros((len(data.at), 2))
         more[:, self.plane] = values @ patterns.rf
@@ -124,16 +124,16 @@ class _Kicks(Family):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """No causes: single kicks are degenerate."""
+        """Nothing: other kicks make the same dispersion."""
         return []
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """No effect of the catalogue."""
+        """No effect of the catalogue: kicks that no orbit shows."""
         return [{} for _ in range(self.size(data))]
 
 
 class HorizontalKicks(_Kicks):
-    """Horizontal dispersion by kicks, not by gradients."""
+    """What gradients cannot make of the dispersion."""
 
     name, effects = "horizontal kicks", ("dipole_field",)
     block, variable, plane = 0, "horizontal kicks", 0
@@ -141,7 +141,7 @@ class HorizontalKicks(_Kicks):
 
 
 class VerticalKicks(_Kicks):
-    """Vertical dispersion by kicks, not by skew gradients."""
+    """What skew gradients cannot make of the vertical dispersion."""
 
     name, effects = "vertical kicks", ("dipole_roll",)
     block, variable, plane = 1, "vertical kicks", 1
@@ -149,7 +149,7 @@ class VerticalKicks(_Kicks):
 
 
 def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
-    """A message for each plane in which kicks make a significant part of the RF's orbit.
+    """A sentence for each plane in which the RF's orbit has something that no gradient makes.
 
     Args:
         values: that were found, by variable.
@@ -157,20 +157,20 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
     """
     for family, gradient in ((HorizontalKicks(), "gradient"), (VerticalKicks(), "skew gradient")):
         own = values.get(family.variable, np.zeros(0))
-        size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2)) if own.any() else 0.0
-        if size > np.median(data.noise[:, family.plane]):
+        if own.any():
+            size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2))
             yield (
-                f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from "
-                f"a {gradient} "
-                "but from kicks of the closed orbit (errors of bends, quadrupole offsets, "
-                "correctors), which the data do not separate"
+                f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} no {gradient} "
+                "makes: kicks of the closed orbit do (errors of bends, displaced quadrupoles, "
+                "correctors), which the data do not tell apart"
             )
 
 
 def fitted_orbit_kicks(at: Predicted) -> Array | None:
-    """Return the kicks behind each magnet that make the fitted additional dispersion, in x and y,
-    rad, [magnet, 2]: see `ResponseModel`. They are computed in the ring with its errors. None
-    without such dispersion."""
+    """What makes the dispersion that the errors have beside the ring's, as kicks behind each magnet
+    in x and y, rad, [magnet, 2]: see `ResponseModel`. In the ring with its errors, in which other
+    kicks make it than in the design. None where there is no such dispersion.
+    """
     ring, orbit_kicks = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
     beside = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))
     for plane in (0, 1):
@@ -184,8 +184,8 @@ def fitted_orbit_kicks(at: Predicted) -> Array | None:
 def dispersion_beside(
     values: Mapping[str, Array], data: ResponseData
 ) -> dict[str, tuple[float, float]]:
-    """Return the fitted additional dispersion at all BPMs and correctors of the ring, m per
-    relative energy in x and y; empty where none was fitted.
+    """What was found beside the lattice's dispersion, at all monitors and correctors of the ring, m
+    per relative energy in x and y; empty where nothing was.
 
     Args:
         values: that were found, by variable.
@@ -212,8 +212,7 @@ def dispersion_beside(
 
 
 def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, float]]) -> Errors:
-    """The design with the additional dispersion of `dispersion_beside`, for other correctors and
-    BPMs."""
+    """The design with what `dispersion_beside` says, as other correctors and monitors have it."""
     none = Errors.none(data)
     if not dispersion:
         return none

@@ -1,13 +1,14 @@
-"""Families of errors of a hierarchical fit of an orbit response: each is one object.
+"""Families of errors that a dense fit of an orbit response may have: each is one object.
 
-To add one, write a class with places, prior, derivatives, errors and causes (`family.Family`), and
-name it in `FAMILIES`. Fields in the ring are in `fields`, energies of the beam in `energy`.
+To add one, write a class with its places, prior, rows, how its values are put among the errors and
+how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`, of the
+beam's energies in `energy`); and name it in `STEPS`, which says when it is tried.
 
-Families with the same numbers (single gradients, and gradients of whole families) share a
+Families that move the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,19 +50,19 @@ class _Monitors(Family):
 
 
 class MonitorGain(_Monitors):
-    """Gains, x and y of each BPM: free but for a mean of each plane."""
+    """Gains, x and y of each monitor: free but for a mean of each plane."""
 
     name, effects = "monitor_gain", ("monitor_gain_x", "monitor_gain_y")
     block, variable, trust, gross = 0, "gain", 0.01, 0.5
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Priors of single BPMs and of all BPMs of a plane."""
+        """Each its own, and those of a plane alike."""
         alike = np.zeros((self.size(data), 2))
         alike[0::2, 0] = alike[1::2, 1] = 1
         return [self._own(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The diagonals of the BPMs' matrices."""
+        """On the diagonals."""
         monitors = errors.monitors.copy()
         monitors[:, [0, 1], [0, 1]] = 1 + values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
@@ -69,7 +70,7 @@ class MonitorGain(_Monitors):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """Causes: all of x, then all of y."""
+        """All of x, then all of y."""
         names, gain = data.measured.monitors, Monitors.of(errors.monitors).gain
         return [
             (Cause(f"monitor_gain_{p}", name, float(gain[i, j])), float(sigma[2 * i + j]))
@@ -78,26 +79,26 @@ class MonitorGain(_Monitors):
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """One number a BPM and plane."""
+        """Each its own."""
         return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
 
 
 LEAST_GAIN = 1e-3
-"""The rotation of a BPM with an angle."""
+"""Of a monitor that has an angle."""
 
 
 class MonitorRoll(_Monitors):
-    """The cross-talk of a BPM's planes: roll and coupling."""
+    """What each plane of a monitor reads of the other: roll and coupling."""
 
     name, effects = "monitor_roll", ("monitor_roll", "monitor_coupling")
     block, variable, trust = 1, "mixing", 0.02
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """One number a BPM and plane."""
+        """Each its own."""
         return [self._own(data)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The off-diagonals of the BPMs' matrices."""
+        """Beside the diagonals."""
         monitors = errors.monitors.copy()
         monitors[:, [0, 1], [1, 0]] = values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
@@ -105,7 +106,7 @@ class MonitorRoll(_Monitors):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """For small values x reads (coupling + roll) y, y reads (coupling - roll) x."""
+        """Of small ones x reads (coupling + roll) y, y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
         own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
         spread = np.hypot(*(sigma.reshape(-1, 2) / own).T) / 2
@@ -116,7 +117,7 @@ class MonitorRoll(_Monitors):
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """The share of y in x, and of x in y."""
+        """What x reads of y, and y of x."""
         roll, coupling = self.effects
         return [
             {(roll, name): side / 2, (coupling, name): 0.5}
@@ -126,7 +127,7 @@ class MonitorRoll(_Monitors):
 
 
 LEAST_KICK = 1e-3
-"""Calibration relative to the stated kick, of a corrector at an angle to its plane."""
+"""Share of what it is told, of a corrector that has an angle to its plane."""
 
 
 class _Columns(Family):
@@ -136,10 +137,10 @@ class _Columns(Family):
         return len(data.kicks)
 
     def count(self, data: ResponseData) -> int:
-        return len(data.kicks) - 1  # the RF step is exact
+        return len(data.kicks) - 1  # the RF's step is known
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """One number a corrector; none of the RF."""
+        """Each its own; of the RF there is none."""
         own: list[dict[Hypothesis, float]] = [
             {(self.name, name): 1.0} for name in data.measured.correctors
         ]
@@ -154,13 +155,13 @@ class _Columns(Family):
 
 
 class CorrectorCalibration(_Columns):
-    """Priors of single correctors and of families."""
+    """Each its own, and what correctors of a family share."""
 
     name, effects = "corrector_calibration", ("corrector_calibration",)
     block, variable, trust, gross = 0, "calibration", 0.01, 0.3
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Numbers of single correctors and of families."""
+        """Of each, and of families."""
         kinds = families([*data.measured.correctors, "\0"])[1]
         return [
             Group(self.name, np.eye(self.size(data)), 0.02, TAILS),
@@ -174,14 +175,13 @@ class CorrectorCalibration(_Columns):
         return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The calibrations as causes."""
+        """As it stands."""
         return replace(errors, calibration=values)
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """The calibration of the whole kick; a rolled corrector has a part of it in the other
-        plane."""
+        """Of the whole kick, of which a rolled corrector has a part in the other plane."""
         return self._causes_of(errors.kick - 1, sigma, data)
 
 
@@ -192,7 +192,7 @@ class CorrectorRoll(_Columns):
     block, variable, trust, gross = 1, "roll", 0.02, 0.1
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """One number a corrector."""
+        """Of each."""
         return [Group(self.name, np.eye(self.size(data)), 0.01, TAILS)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
@@ -200,31 +200,58 @@ class CorrectorRoll(_Columns):
         return np.asarray(at.gain(1) * at.data.pick(at.across, 1))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The kick in the other plane, as a share of the stated kick."""
+        """The kick in the other plane, as a share of what the corrector is told."""
         return replace(errors, roll=values)
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """The angle of the kick to the corrector's plane: 90 degrees without a part in it."""
+        """The angle of its kick to its plane: a right one where it has none in that."""
         return self._causes_of(
             errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data
         )
 
 
-FAMILIES: tuple[Family, ...] = (
-    CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), BendGradient(),
-    VerticalFocusing(), EdgeFocusing(), CorrectorPosition(), EnergySpread(), MonitorRoll(),
-    CorrectorRoll(), SkewGradient(), HorizontalKicks(), EnergyOffset(), VerticalKicks(),
-)  # fmt: skip
-"""Families of a ring's errors. All are fitted from the start, except those of `SECOND`."""
+@dataclass(frozen=True)
+class Trial:
+    """Families that are tried together.
 
-SECOND = ("energy_offset", "energy_spread", "horizontal kicks", "vertical kicks")
-"""Families of second order, or of one orbit: they are added after the others have converged,
-because far from the ring they absorb other errors."""
+    Attributes:
+        families: the first one's block says who judges.
+        own, across: rounds in-plane, and before them rounds of the other plane.
+    """
 
-CHANGES: tuple[Family, ...] = (
-    CorrectorCalibration(), MonitorGain(), FamilyGradient(), QuadrupoleGradient(), OtherGradient(),
-    FocusingChange(), MonitorRoll(), CorrectorRoll(), SkewGradient(),
-)  # fmt: skip
-"""Families of changes between two measurements of one ring."""
+    families: tuple[Family, ...]
+    own: int
+    across: int
+
+
+STEPS = (
+    Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
+    Trial((MonitorGain(),), 2, 0),
+    Trial((QuadrupoleGradient(),), 4, 0),
+    Trial((BendGradient(),), 2, 0),
+    Trial((VerticalFocusing(),), 2, 0),
+    Trial((EdgeFocusing(),), 2, 0),
+    Trial((CorrectorPosition(),), 2, 0),
+    Trial((EnergySpread(),), 2, 0),
+    Trial((MonitorRoll(),), 0, 1),
+    Trial((CorrectorRoll(),), 0, 1),
+    Trial((SkewGradient(),), 2, 2),
+    Trial((HorizontalKicks(),), 2, 0),
+    Trial((EnergyOffset(),), 2, 0),
+    Trial((VerticalKicks(),), 0, 2),
+)
+"""What is tried, one after another. Skew gradients move the tunes to second order, which the
+gradients then take back. A beam off its energy has another dispersion: it comes in once that has
+what else may be wrong with it."""
+
+CHANGES = (
+    Trial((CorrectorCalibration(),), 3, 0),
+    Trial((MonitorGain(),), 2, 0),
+    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), FocusingChange()), 4, 0),
+    Trial((MonitorRoll(),), 0, 1),
+    Trial((CorrectorRoll(),), 0, 1),
+    Trial((SkewGradient(),), 2, 2),
+)
+"""What may have changed between two measurements of one ring."""

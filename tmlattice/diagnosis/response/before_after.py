@@ -1,15 +1,16 @@
-"""The change between two orbit responses of one machine.
+"""What changed between two orbit responses of one machine, without knowing the machine.
 
 >>> change = diagnose_change(ring, before, after)
 >>> [(own.effect, own.element, own.amount, own.amount_sigma) for own in change.findings]
 
-The ring, its BPMs and its correctors are fitted to the first measurement. The residual is in both
-measurements and cancels in their difference (`observe.response_change`), which is fitted in turn,
-with the dispersion and the energy of the first fit. Drifts of BPMs and correctors are nuisances
-whose scales are learnt. The scatter of the magnets of one supply in their change is learnt, and is
-in the error of every amount; so are undetermined errors of the first fit (`undetermined`). Findings
-are supplies (magnets whose names begin alike), single magnets, gradients in sextupoles and wigglers
-(of the orbit there), and insertion devices, by the marginal likelihood, see `inference.levels`.
+The ring, its monitors and its correctors are fitted to the first measurement; what that leaves is
+in both and cancels in their difference (`observe.response_change`), which is fitted in turn, in a
+ring that has the first one's dispersion: kicks that make it, and the beam's energy, too. Drifts
+of monitors and correctors, whose sizes are learnt, are nuisances. Magnets scatter, too: how far
+those of one supply differ in their change is learnt, and is in the error of every amount, as is
+what the fit of the first leaves open (`left_open`). Findings are supplies (magnets whose names
+begin alike), single magnets, gradients in sextupoles and wigglers (of the orbit there), and
+insertion devices: by evidence, see `inference.levels`.
 """
 
 import time
@@ -24,9 +25,9 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
 from tmlattice.diagnosis.families.energy import EnergyOffset
-from tmlattice.diagnosis.families.family import Family, StatedCause
+from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import CHANGES, FAMILIES
+from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
     least_certain,
@@ -36,13 +37,13 @@ from tmlattice.diagnosis.findings import (
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.changed_supplies import MOST, REPRODUCED, changed_supplies
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
-from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, Step, fit_families
 from tmlattice.diagnosis.response.label_findings import label_findings
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.procedure import as_diagnosis, families_of, provenance
+from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
-from tmlattice.diagnosis.response.state import State, allow, begin, bend, jump
+from tmlattice.diagnosis.response.state import State, begin, bend, jump
+from tmlattice.diagnosis.response.stepwise import Step, StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.swaps_since import all_right, since
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.validation import score
@@ -63,13 +64,13 @@ from tmlattice.observe.split import Split, split_columns
 Array = NDArray[np.float64]
 
 ANY = 6.0
-"""rms of the logarithm of a change's scale about its first guess: most families did not change."""
+"""rms of the logarithm of a change's size about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
-"""Relative scatter of magnets from which on it is reported without a single detected change."""
+"""Relative scatter of magnets from which a change of all of them is told though none stands out."""
 SEEN = 3.0
-"""Standard deviations from which on an energy offset of the reference is reported."""
+"""Standard deviations from which an energy of the reference is told."""
 LEAST_NOISE = 0.2
-"""Least noise of the difference of two measurements, as a share of the stated noise."""
+"""Share of the stated noise that two measurements differ by at least."""
 
 
 def diagnose_change(
@@ -85,17 +86,17 @@ def diagnose_change(
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> Diagnosis:
-    """Diagnose the change from one response to the other.
+    """What changed from one response to the other.
 
     Args:
         ring: the design.
-        before, after: of the same machine; correctors and monitors of only one of them are left
+        before, after: of the same machine; correctors and monitors that one of them lacks are left
             out.
-        holdout: share of the correctors that validate the gap; amounts are fitted to all of them.
+        holdout: share of the correctors that judge the gap; amounts are fitted to all of them.
         effects: only changes of these are looked for.
         max_effects: findings at most.
-        false_alarm: probability of a finding in two measurements of an unchanged machine.
-        assume: what is recorded wrongly everywhere in both, see `measurement.assume`.
+        false_alarm: chance that two measurements of an unchanged machine are said to differ.
+        assume: what was written down wrongly everywhere in both, see `measurement.assume`.
         seed: of the split.
         progress: called with the name of each stage.
 
@@ -108,32 +109,32 @@ def diagnose_change(
         UnstableRingError: no closed orbit.
     """
     started = time.perf_counter()
-    families = families_of(effects, CHANGES)
+    trials = trials_of(effects, CHANGES)
     before, after = (corrected_data(ring, one, assume) for one in (before, after))
-    said = data_checks(ring, after, reference=before)
-    said += _lost(before, after)
+    messages = data_checks(ring, after, reference=before)
+    messages += _lost(before, after)
     before, after = alike(ring, before, after)
     first, second = response_data(ring, before), response_data(ring, after)
-    said += assumed_of(after, second)
+    messages += assumed_of(after, second)
     same = _same(first, second)
     if same:
-        families = []
-        said.append("the two measurements are the same, to the last digit")
+        trials = []
+        messages.append("the two measurements are the same, to the last digit")
     before, first, swaps_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    open_families = () if same else FAMILIES
-    fitted, more = _reference(first, split_columns(first, holdout, rng), open_families, progress)
+    steps = () if same else STEPS
+    fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
     orbit_kicks = fitted_orbit_kicks(fitted.at)
-    said += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]
-    first, second, errors = _by_good_monitors(ring, fitted, before, after, said)
+    messages += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]
+    first, second, errors = _by_good_monitors(ring, fitted, before, after, messages)
 
     def change(measured: OrbitResponse) -> ResponseData:
         return response_change(first, errors, response_data(ring, measured), orbit_kicks)
 
     _, data, swaps_after = all_right(change, second.measured, holdout)
     there = data.ring
-    pairs = label_findings(there, since(swaps_before, swaps_after, said), other="did")
+    pairs = label_findings(there, since(swaps_before, swaps_after, messages), other="did")
     split = split_columns(data, holdout, rng)
     judgement = Judgement(false_alarm=false_alarm)
     options = {
@@ -142,7 +143,7 @@ def diagnose_change(
         "false_alarm": false_alarm, **({"assume": list(assume)} if assume else {}),
     }  # fmt: skip
     open_ = undetermined(fitted)
-    fit = _sparse_or_all(data, split, families, effects, judgement, seed, progress, open_)
+    fit = _sparse_or_all(data, split, trials, effects, judgement, seed, progress, open_)
     if isinstance(fit, SparseFit):
         causes = tuple(cause for cause, _ in fit.fitted_causes)
         sought = [own for own in fit.findings if not is_drift(cause_of(own))]
@@ -151,11 +152,11 @@ def diagnose_change(
             there, fit.fit, fit.fit.state.at.errors.ring, fit.fitted_causes,
             verdict=least_certain(found, fit.verdict),
             findings=with_consequences(there, found, causes),
-            warnings=(*said, *fit.messages),
+            warnings=(*messages, *fit.messages),
             noise_estimated=False,
             provenance=provenance(ring, options, seed, started),
         )  # fmt: skip
-    progress("changes")
+    progress("what changed")
     whole = settle(_all_columns(fit.state))
     changed, scatter = changed_supplies(whole, judgement, open_)
     changed += outstanding(whole, judgement)
@@ -175,7 +176,7 @@ def diagnose_change(
         there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
         verdict=least_certain(found, _verdict(whole)),
         findings=with_consequences(there, found, causes),
-        warnings=(*said, *_messages(data, fit, whole, scatter)),
+        warnings=(*messages, *_messages(data, fit, whole, scatter)),
         supports=tuple(supports),
         noise_estimated=True,
         provenance=provenance(ring, options, seed, started),
@@ -183,27 +184,27 @@ def diagnose_change(
 
 
 def changes() -> list[str]:
-    """Effects that may change between two measurements: every usual one, and all supplies of
-    families."""
+    """Names of what changes between two measurements: every usual effect, and supplies of families,
+    which one measurement alone does not ask for all of."""
     families = [name for name, effect in CATALOGUE.items() if isinstance(effect, FamilyEffect)]
     return list(dict.fromkeys([*modelled(), *families]))
 
 
 def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
-    said = []
+    messages = []
     for what, a, b in (
         ("correctors", before.correctors, after.correctors),
         ("monitors", before.monitors, after.monitors),
     ):
         alone = sorted({n.casefold() for n in a} ^ {n.casefold() for n in b})
         if alone:
-            said.append(f"{what} of one measurement alone, not used: {', '.join(alone)}")
-    return said
+            messages.append(f"{what} of one measurement alone, left out: {', '.join(alone)}")
+    return messages
 
 
 # --- the fits -------------------------------------------------------------------------------------
 def _not_validated(split: Split) -> Split:
-    """A split in which all correctors, and all of the RF's orbit, are fitted."""
+    """All correctors are fitted, and all of the RF's orbit."""
     nobody, half = np.zeros_like(split.held), split.half.copy()
     half[-1] = True
     return Split(nobody, nobody, half, np.zeros_like(split.inner_rf))
@@ -217,44 +218,45 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 
 
 def _reference(
-    data: ResponseData, split: Split, families: Sequence[Family], progress: Callable[[str], Any]
+    data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
 ) -> tuple[State, list[str]]:
-    """The errors of the lattice, fitted to the first measurement, and messages. The design where
-    the fit diverges."""
+    """What a lattice can have wrong, as one measurement has it, then fitted to all of the first.
+    The design where that goes astray. And what is to be said of it."""
     nothing = replace(begin(data, _not_validated(split)), exploring=False)
-    if not families:
+    if not steps:
         return nothing, []
     try:
-        fit = fit_families(data, split, families, progress)
+        fit = fit_steps(data, split, steps, len(steps), progress)
         return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.messages)
     except (TmlatticeError, np.linalg.LinAlgError):
         return nothing, ["it could not be fitted, and the change is one of the design"]
 
 
 def _of_the_ring(fitted: State) -> Iterator[str]:
-    """Messages about the ring of the reference that no list of causes shows."""
+    """What no list of causes shows of the ring that changed."""
     energy, where = fitted.at.errors.energy, EnergyOffset.variable
     if energy:
         there = linear(fitted, EnergyOffset.block)
         sigma = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where[where]]
         if abs(energy) > SEEN * sigma[0]:
             yield (
-                f"its beam differs from the nominal energy by {energy:.2e} ± {sigma[0]:.0e} "
-                "(relative), "
+                f"its beam is off the nominal energy by {energy:.2e} ± {sigma[0]:.0e} (relative), "
                 "and the tunes are those there"
             )
     yield from dispersion_by_kicks(fitted.values, fitted.data)
 
 
 def _by_good_monitors(
-    ring: Ring, fitted: State, before: OrbitResponse, after: OrbitResponse, said: list[str]
+    ring: Ring, fitted: State, before: OrbitResponse, after: OrbitResponse, messages: list[str]
 ) -> tuple[ResponseData, ResponseData, Errors]:
-    """Both measurements, and the errors of the first, without BPMs and outliers that are bad in it;
-    messages go to `said`."""
+    """Both measurements, and what is wrong with the first, without monitors that are bad in it, and
+    without its odd readings; which ones goes to what is `said`."""
     errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     if not fitted.good.all():
         names = np.array(fitted.data.measured.monitors)
-        said.append(f"BPMs rejected in the reference: {', '.join(names[~fitted.good])}")
+        messages.append(
+            f"monitors left out, bad in the reference: {', '.join(names[~fitted.good])}"
+        )
         kept = names[fitted.good].tolist()
         before, after = (one.select(monitors=kept) for one in (before, after))
     first, second = (response_data(ring, one) for one in (before, after))
@@ -262,27 +264,30 @@ def _by_good_monitors(
 
 
 def _fit_change(
-    data: ResponseData, split: Split, families: Sequence[Family], progress: Callable[[str], Any]
-) -> HierarchicalFit:
-    """The fit of all families of changes, with the noise of both measurements."""
+    data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
+) -> StepwiseFit:
+    """All that may have changed, with the noise that the two measurements have."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
     before = score(design, split.held)
     steps = [Step.scored("reference", 0, before)]
-    there = [f for f in families if design.reads(f.block) and f.size(data) and f.count(data)]
-    progress("all families")
-    state = settle(bend(jump(allow(design, there))), alike=True)
-    state = settle(_learnt_noise(settle(bend(jump(state)))))
+    state = design
+    for trial, settled in one_by_one(design, trials, progress):
+        state = settled
+        count = sum(family.count(data) for family in trial.families)
+        title = ", ".join(family.title for family in trial.families)
+        steps.append(Step.scored(title, count, score(state, split.held)))
+    state = settle(bend(jump(state)))
+    state = settle(_learnt_noise(state))
     after = score(state, split.held)
-    if there:
-        count = sum(family.count(data) for family in there)
-        steps.append(Step.scored("all families", count, after))
+    if len(steps) > 1:
+        steps[-1] = Step.scored(steps[-1].effect, steps[-1].parameters, after)
     design = _with_noise(design, state.data.noise)
-    return HierarchicalFit(design, state, tuple(steps), (), (score(design, split.held), after))
+    return StepwiseFit(design, state, tuple(steps), (), (score(design, split.held), after))
 
 
 def _learnt_noise(state: State) -> State:
-    """Data with less noise where two measurements agree better than stated; the misfit of each
-    column covers the opposite."""
+    """With less noise where two measurements agree better than is stated; where they agree worse,
+    every column's own lack says so."""
     scales = []
     data = state.data
     for block in (0, 1):
@@ -301,22 +306,22 @@ def _with_noise(state: State, noise: Array) -> State:
 
 
 def _all_columns(state: State) -> State:
-    """The fit with held-out correctors included."""
+    """To be fitted to the held-out correctors too."""
     return replace(state, split=_not_validated(state.split))
 
 
-# --- messages ---------------------------------------------------------------------------------
+# --- what is told ---------------------------------------------------------------------------------
 def _sparse_or_all(
     data: ResponseData,
     split: Split,
-    families: Sequence[Family],
+    trials: Sequence[Trial],
     effects: Sequence[str] | None,
     judgement: Judgement,
     seed: int,
     progress: Callable[[str], Any],
     open_: Undetermined,
-) -> SparseFit | HierarchicalFit:
-    """The sparse solution of a change, or the fit of all families of changes."""
+) -> SparseFit | StepwiseFit:
+    """The few causes that explain a change, or the fit of everything that may have changed."""
     asked = changes() if effects is None else effects
     sparse = sparse_fit(
         data, split, asked, MOST, judgement, seed, progress, and_orbits(data.ring, open_)
@@ -325,7 +330,7 @@ def _sparse_or_all(
         sparse = None
     if sparse is not None and sparse.noise:
         return sparse
-    fit = _fit_change(data, split, families, progress)
+    fit = _fit_change(data, split, trials, progress)
     return fit if sparse is None or outperforms(fit, sparse.fit) else sparse
 
 
@@ -335,25 +340,25 @@ def _verdict(state: State) -> str:
 
 
 def _messages(
-    data: ResponseData, fit: HierarchicalFit, state: State, scatter: Mapping[str, float]
+    data: ResponseData, fit: StepwiseFit, state: State, scatter: Mapping[str, float]
 ) -> list[str]:
-    """Messages on the agreement of two measurements, and the scatter of magnets and supplies."""
+    """How well two measurements agree, and by how much magnets, and supplies, scatter."""
     left = data.pick(state.at.left)[:-1][:, state.good]
     agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
     stated = 1e6 * float(np.median(data.noise))
-    said = [
-        f"with the changes the two measurements agree to {agree:.2g} µm (their stated noise gives "
+    messages = [
+        f"with what changed the two measurements agree to {agree:.2g} µm (their stated noise makes "
         f"{stated:.2g})"
     ]
     if scatter:
         size = scatter[QuadrupoleGradient.name]
-        said.append(
+        messages.append(
             f"magnets of one supply differ in their change by {size:.1g} (rms, relative), which is "
-            f"in the errors; changes below {REPRODUCED:g} are ignored"
+            f"in the errors; changes below {REPRODUCED:g} are taken for none"
         )
     if size := scatter.get(FamilyGradient.name, 0.0):
-        said.append(
-            f"further supplies changed by {size:.1g} (rms, relative), which is in the errors: "
-            "the readings do not determine which ones"
+        messages.append(
+            f"other supplies changed, too, by {size:.1g} (rms, relative), which is in the errors: "
+            "which ones, and by how much each, these readings do not tell"
         )
-    return said
+    return messages

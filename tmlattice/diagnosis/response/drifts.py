@@ -1,6 +1,6 @@
-"""Changes of BPMs and correctors on the second of two days.
+"""What monitors and correctors do otherwise on the second of two days.
 
-All of them drift a little; an outlier among them is a finding.
+Everybody drifts a little; who changed far more than the others is a finding.
 """
 
 import numpy as np
@@ -20,7 +20,8 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.normal import solve
 
 DRIFT, OUTSTANDING = 0.03, 8.0
-"""Least change of a BPM or a corrector that is reported, and its least ratio to those of others."""
+"""A monitor or a corrector is told where it changed by more than this, and by so many times as much
+as others do."""
 
 
 def drifts(state: State) -> list[tuple[StatedCause, Support]]:
@@ -38,7 +39,7 @@ def drifts(state: State) -> list[tuple[StatedCause, Support]]:
 
 
 def outstanding(state: State, judgement: Judgement) -> list[Finding]:
-    """Findings: BPMs and correctors whose change is an outlier of the usual drift."""
+    """Monitors and correctors whose change is another thing than everybody's drift."""
     changes = [row for row, _ in drifts(state)]
     found = []
     for effect in dict.fromkeys(cause.effect for cause, _ in changes):
@@ -57,6 +58,8 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
 
 
 def is_drift(cause: Cause) -> bool:
-    """Whether a cause is a usual drift from day to day."""
-    of_each = {name for family in CHANGES if family.per != "ring" for name in family.effects}
+    """Whether it is no more than what monitors and correctors do from day to day: everybody may
+    have it, and the largest of them is no finding."""
+    of_each = {name for trial in CHANGES for family in trial.families if family.per != "ring"
+               for name in family.effects}  # fmt: skip
     return cause.effect in of_each and abs(cause.amount) <= DRIFT

@@ -1,8 +1,9 @@
-"""The start of a hierarchical fit, if the design is far from the ring.
+"""Where a dense fit begins, if the design is far from the ring that was measured.
 
-Gauss-Newton converges from phase errors of a fraction of a turn. From another working point it
-converges to a ring that matches one plane only. There, focusing and defocusing quadrupoles are
-scanned together, and the fit starts at the best match.
+Rounds that follow slopes bring phases home that are off by a fraction of a turn. Of a lattice with
+another working point, which no orbit resembles any more, they find a ring that one plane agrees
+with and the other does not. There, focusing and defocusing quadrupoles are tried in steps, all of
+them together, and the fit begins at what resembles the readings most.
 """
 
 import logging
@@ -14,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.families.steps import Trial
 from tmlattice.diagnosis.response.state import State, allow, begin
 from tmlattice.errors import UnstableRingError
 from tmlattice.lattice.supplies import magnets
@@ -27,35 +28,36 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 FAR = 0.25
-"""Share of the typical column's mean square, in the worse plane, from which on the design is far:
-half of its size. Usual rings leave a tenth of that."""
+"""Share of the typical column's mean square, in the worse plane, that the design leaves of it with
+a kick of its own where it is far: half of its size. Rings as they are leave a tenth of that."""
 BETTER = 0.5
-"""Largest ratio of that share at another start to that of the design."""
+"""Of that share, at most, is left at another beginning: else the design is as good a one."""
 STEPS = np.arange(-3, 4) * 0.01
 """Relative changes that are tried."""
 
 
-def begun(design: State, families: Sequence[Family]) -> State:
-    """Return the design, or the better matching ring, with a number for each quadrupole's gradient.
+def begun(design: State, trials: Sequence[Trial]) -> State:
+    """The design, or the ring that resembles the readings more, with each quadrupole's gradient a
+    number of its own from the first: one of no family would else go back to nothing.
 
     Args:
         design: with no families yet.
-        families: that will be fitted; without quadrupoles' gradients it is the design.
+        trials: that will be fitted; without quadrupoles' gradients it is the design.
     """
     family = QuadrupoleGradient()
-    if not any(own.name == family.name for own in families):
+    if not any(own.name == family.name for trial in trials for own in trial.families):
         return design
     guess = first_guess(design)
     return design if guess is None else allow(replace(design, values=guess.values), [family])
 
 
 class Guess(NamedTuple):
-    """A start that matches the readings better than the design.
+    """Where the readings are resembled more than by the design.
 
     Attributes:
         focusing, defocusing: relative change of all such quadrupoles.
         values: the same, by variable.
-        left: share of the typical column's mean square that is unexplained there.
+        left: share of the typical column's mean square that is left there.
     """
 
     focusing: float
@@ -65,14 +67,14 @@ class Guess(NamedTuple):
 
 
 def elsewhere(data: ResponseData) -> Guess | None:
-    """The first guess by all readings."""
+    """The first guess by all that was measured."""
     nobody, everybody = (np.full(data.shape, own) for own in (False, True))
     split = Split(held=nobody[:, 0], inner=nobody[:, 0], half=everybody, inner_rf=nobody[0])
     return first_guess(begin(data, split))
 
 
 def first_guess(design: State) -> Guess | None:
-    """Return the start of a fit; None where the design is near enough, or nothing is better.
+    """Where a fit is to begin; None where the design is near enough, or nothing better.
 
     Args:
         design: with no families yet.
@@ -99,12 +101,12 @@ def first_guess(design: State) -> Guess | None:
 
 
 def strange(state: State, least: int = 1) -> float:
-    """Return the unexplained share of the typical column's mean square, each with its own kick, of
-    the worse plane.
+    """Share of the typical column's mean square that is left with a kick of its own, in its plane,
+    of the worse plane.
 
     Args:
         state: what the model makes of the readings.
-        least: columns of a plane required for the typical one.
+        least: columns of a plane that it takes to say what is typical.
     """
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]

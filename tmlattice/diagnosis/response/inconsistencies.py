@@ -1,13 +1,13 @@
-"""Inconsistency of the gradients from the RF's orbit and from the correctors' responses.
+"""Whether the RF's orbit and the correctors' responses ask for the same gradients.
 
->>> found = inconsistencies(fit.state)
+>>> found = pulled_apart(fit.state)
 >>> found.missed, found.known, [(own.name, own.correctors, own.with_rf) for own in found.pulls]
 
-Gradients are fitted to both. The estimate from the correctors alone predicts the RF's orbit, unless
-kicks of the closed orbit contribute. Where the prediction fails, the common fit biases the
-gradients. Hausman's test (Econometrica 46, 1978) finds which ones: the covariance of the difference
-of two estimates, one of which is efficient, is the difference of their covariances. All of it is
-linear about the fit, with its weights and without the kicks.
+Gradients are fitted to both. What the correctors alone say of them predicts the RF's orbit, if
+nothing else makes it: kicks of the closed orbit do. Where the prediction fails, gradients that have
+to make that orbit too are drawn away from what the correctors ask for; which, Hausman's test says
+(Econometrica 46, 1978): by chance alone two estimates of which one knows more differ by what it
+knows more. All of it linear about the fit, by its weights, without the kicks.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear
+from tmlattice.diagnosis.response.rf_by_others import rf_fitted
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.normal import Normal, solve
@@ -29,19 +29,19 @@ from tmlattice.lattice.supplies import magnets, supplied_alike
 Array = NDArray[np.float64]
 
 CLEAR = 5.0
-"""Standard deviations from which on gradients are reported."""
+"""Standard deviations, from which on gradients are told."""
 ROUNDING = 1e-6
-"""Share of a variance below which a difference of two counts as zero."""
+"""Share of a variance below which a difference of two is none."""
 
 
 @dataclass(frozen=True)
 class Pull:
-    """An inconsistent gradient.
+    """A gradient that the two disagree about.
 
     Attributes:
         name: of a family of quadrupoles, or of one of them.
-        correctors, correctors_sigma: estimate by the correctors' responses, relative to the design.
-        with_rf, with_rf_sigma: estimate with the RF's orbit fitted, too.
+        correctors, correctors_sigma: what the correctors' responses say, relative to the design.
+        with_rf, with_rf_sigma: what they say where gradients have to make the RF's orbit, too.
         pull: the difference, in standard deviations of it.
     """
 
@@ -55,13 +55,14 @@ class Pull:
 
 @dataclass(frozen=True)
 class Inconsistency:
-    """The inconsistency of the two estimates.
+    """That the two disagree.
 
     Attributes:
-        missed: residual of the RF's orbit with gradients by the correctors alone, rms, m.
-        known: its expectation, rms, m, by their errors and the readings'.
+        missed: by how much gradients by the correctors alone miss the RF's orbit, rms, m.
+        known: by how much they would, rms, m: by their errors and the readings', as many of which
+            the fit takes for independent.
         chi2, readings: of the RF's orbit, with the errors of that prediction.
-        pulls: inconsistent gradients, the strongest first: of families, of magnets.
+        pulls: gradients that stand out, the strongest first: of families, of magnets.
     """
 
     missed: float
@@ -71,20 +72,20 @@ class Inconsistency:
     pulls: tuple[Pull, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
+        """As it stands in the diagnosis."""
         return {**vars(self), "pulls": [dict(vars(own)) for own in self.pulls]}
 
 
 def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> Inconsistency | None:
-    """Return the inconsistency; None where the estimates agree, no gradients were fitted, or no
-    RF's orbit was read.
+    """What the two disagree about; None where they agree, no gradients were fitted or no RF's orbit
+    was read.
 
     Args:
-        state: of the fit.
-        false_alarm: probability of a finding in consistent data.
+        state: where the fit stands.
+        false_alarm: chance that two are said to disagree that do not.
     """
     single = QuadrupoleGradient()
-    read, weights, left = _rf_fitted(state)
+    read, weights, left = rf_fitted(state)
     if single.variable not in state.values or not read.size:
         return None
     there, column = linear(state, 0), len(state.data.plane) - 1
@@ -121,22 +122,11 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
     )
 
 
-def _rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
-    """The BPMs at which the RF's orbit is fitted, the inverse covariance of these readings, 1/m2,
-    and their residual, m."""
-    column = len(state.data.plane) - 1
-    own = weight(state, 0)[column]
-    read = np.flatnonzero(own > 0)
-    common = taken(state, 0)[column, read]
-    inverse = np.diag(own[read]) - common @ common.T
-    return read, inverse, state.data.pick(state.at.left)[column, read]
-
-
 def _pulls(
     names: list[str], alone: Array, wide: Array, both: Array, narrow: Array, families: int
 ) -> tuple[Pull, ...]:
-    """Inconsistent families, then single magnets."""
-    more = np.maximum(wide - narrow, ROUNDING * wide)  # the information of the RF's orbit
+    """Families that stand out, then single magnets."""
+    more = np.maximum(wide - narrow, ROUNDING * wide)  # what the RF's orbit adds to know
     pulls = np.where(more > 0, (both - alone) / np.sqrt(np.where(more > 0, more, 1.0)), 0.0)
     order = sorted(range(len(names)), key=lambda i: (i >= families, -abs(pulls[i])))
     return tuple(

@@ -1,16 +1,17 @@
-"""The diagnosis of an orbit response, with validation on held-out data.
+"""Which errors close how much of a measured orbit response's gap, step by step, on held-out data.
 
-One fifth of the correctors is held out. For each held-out corrector the kick is estimated from a
-random half of the BPMs, and the prediction is scored on the other half. The RF's orbit is fitted on
-half of the BPMs and scored on the other half. An inner validation set of other correctors selects
-families, so that the outer scores select nothing.
+A fifth of the correctors is never fitted. Of each of them only the kick is taken, from a random
+half of the monitors, and the other half judges; the RF's orbit is fitted on half of the monitors
+and judged on the other half. Which families of errors are kept is decided on other correctors, held
+out from the rest, so that the figures of the steps judge and choose nothing.
 
 >>> result = diagnose_response(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
 
-Gain and calibration are degenerate in scale without the dispersion, and neighbouring quadrupoles
-are correlated. Priors resolve both: a family of correctors or quadrupoles (one kind of magnet, or
-one supply) shares an error, its members scatter about it, and the scatter is learnt.
+Gain and calibration are degenerate in scale but for the dispersion; neighbouring quadrupoles can
+pull against one another. Priors settle both: a family of correctors or quadrupoles (one kind of
+magnet, or one supply) shares an error, its members scatter about it, and how much is learnt from
+the data.
 """
 
 import time
@@ -24,8 +25,8 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.assessment import combined_p_value
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
-from tmlattice.diagnosis.families.family import Family, StatedCause
-from tmlattice.diagnosis.families.steps import FAMILIES
+from tmlattice.diagnosis.families.family import StatedCause
+from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
     least_certain,
@@ -38,23 +39,23 @@ from tmlattice.diagnosis.response.common_factors import explain_gradients
 from tmlattice.diagnosis.response.detected_faults import detected_faults, given_faults
 from tmlattice.diagnosis.response.first_guess import FAR, strange
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
-from tmlattice.diagnosis.response.hierarchical import HierarchicalFit, fit_chi2, fit_families
 from tmlattice.diagnosis.response.inconsistencies import inconsistencies
 from tmlattice.diagnosis.response.label_findings import label_findings
 from tmlattice.diagnosis.response.misplaced import Misplaced, misplaced
 from tmlattice.diagnosis.response.missing_effects import weigh
-from tmlattice.diagnosis.response.outliers import messages, without, without_gross
+from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
+from tmlattice.diagnosis.response.odd_steps import beside
 from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
-from tmlattice.diagnosis.response.swaps import (
-    Swaps,
-    labels_corrected,
-    mislabelled,
-    planes_back,
-    swapped_planes,
+from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_chi2, fit_steps
+from tmlattice.diagnosis.response.swaps import Swaps, labels_corrected, planes_back, swapped_planes
+from tmlattice.diagnosis.response.unlike_model import (
+    ODD,
+    RejectedChannels,
+    reversed_ones,
+    unlike_model,
 )
-from tmlattice.diagnosis.response.unlike_model import RejectedChannels, reversed_ones, unlike_model
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
@@ -73,18 +74,14 @@ from tmlattice.optics import ring_tunes
 
 Array = NDArray[np.float64]
 
-FINDINGS = 14
-"""Findings at most."""
 PATTERNS = 8
-"""Number of the strongest patterns of the residual."""
+"""The strongest patterns of what is left."""
 LARGE = 60_000
-"""Most readings for the search for single faults among distributed errors, which refits
-everything."""
-TOO_LARGE = (
-    "single faults among the distributed errors were not sought: there are too many readings"
-)
+"""Readings up to which single faults among small errors are sought: every number is fitted anew
+for each of them."""
+TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
 TYPICAL = 6
-"""Columns of a plane required for the typical one."""
+"""Columns of a plane that say what a design leaves of the typical one."""
 
 
 def diagnose_response(
@@ -93,25 +90,25 @@ def diagnose_response(
     *,
     holdout: float = 0.2,
     effects: Sequence[str] | None = None,
-    max_effects: int = FINDINGS,
+    max_effects: int = len(STEPS),
     false_alarm: float = DEFAULT.false_alarm,
     missing: bool = False,
     assume: Sequence[str] = (),
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> Diagnosis:
-    """Diagnose an orbit response: all families of errors, sparse solutions and single faults.
+    """Correctors and families, monitors, single gradients, then what couples the planes.
 
     Args:
         ring: the design.
-        measured: with an RF step, if possible, and the noise of its readings; else that is
+        measured: with an RF step, if it can be, and the noise of its readings; else that is
             learnt.
         holdout: share of the correctors that is never fitted.
         effects: only families of these are tried; else all.
-        max_effects: findings at most.
-        false_alarm: probability of a finding in the readings of a faultless ring.
-        missing: also compare effects that may be missing.
-        assume: what is recorded wrongly everywhere, see `measurement.assume`; it is corrected
+        max_effects: steps that are kept at most.
+        false_alarm: chance that the readings of a faultless ring are said to have an error.
+        missing: weigh too which effect the result still lacks.
+        assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone
             first.
         seed: of the split.
         progress: called with the name of each stage.
@@ -124,23 +121,22 @@ def diagnose_response(
     begun = time.perf_counter()
     estimated = measured.noise is None
     measured = corrected_data(ring, measured, assume)
-    families, data = families_of(effects), response_data(ring, measured)
-    said = [*data_checks(ring, measured), *assumed_of(measured, data)]
+    trials, data = trials_of(effects), response_data(ring, measured)
+    messages = [*data_checks(ring, measured), *assumed_of(measured, data)]
     measured = replace(data.measured, noise=data.noise) if estimated else measured
     measured, gross = without_gross(measured, data)
     if gross:
-        said, data = said + gross, response_data(ring, measured)
+        messages, data = messages + gross, response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
-    # with overstated noise any sparse set of causes explains the data
-    if sparse is None or overstated(ring, data.measured):
-        whole = _families(ring, measured, families, holdout, seed, progress)
+    if sparse is None or overstated(ring, data.measured):  # to such a noise a few explain anything
+        whole = _families(ring, measured, trials, holdout, max_effects, seed, progress)
         sparse = None if sparse is None or outperforms(whole[0], sparse.fit) else sparse
     rejected: tuple[tuple[str, str | None], ...] = ()
     if sparse is None:
         fit, measured, unlike, swaps = whole
-        said += unlike if measured.response.size <= LARGE else [*unlike, TOO_LARGE]
+        messages += unlike if measured.response.size <= LARGE else [*unlike, TOO_LARGE]
         rejected = tuple(swaps.rejected)
         fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
         found, supports, degenerate, correlated, covariance = fitted_causes(fit.state)
@@ -162,7 +158,7 @@ def diagnose_response(
         verdict=verdict,
         findings=with_consequences(ring, findings, causes),
         warnings=(
-            *said, *(reversed_ones(fit.state) if sparse is None else sparse.messages),
+            *messages, *(reversed_ones(fit.state) if sparse is None else sparse.messages),
             *_warnings(fit),
         ),
         degenerate=degenerate,
@@ -180,27 +176,28 @@ def diagnose_response(
 def _families(
     ring: Ring,
     measured: OrbitResponse,
-    families: Sequence[Family],
+    trials: Sequence[Trial],
     holdout: float,
+    most: int,
     seed: int,
     progress: Callable[[str], Any],
-) -> tuple[HierarchicalFit, OrbitResponse, list[str], Swaps]:
-    """The fit without rejected channels; the fitted data and the messages about them; and the
-    swaps."""
-    said: list[str] = []
+) -> tuple[StepwiseFit, OrbitResponse, list[str], Swaps]:
+    """The dense fit of what resembles the model; what was fitted, and what was done to it; and
+    what is exchanged."""
+    messages: list[str] = []
     known = Swaps([], {}, {}, [])
-    fit: HierarchicalFit | None = None
+    fit: StepwiseFit | None = None
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
         state = begin(data, split) if fit is None else fit.state
         unlike = unlike_model(state)
-        others = set() if fit is None else mislabelled(state)
+        others = set() if fit is None else _anothers(state)
         far = fit is None and _far(state, unlike)
         right = None if far else labels_corrected(state, measured, known, unlike, others)
         if right is not None:
             measured, fit = right[0], None
-            said.append(right[1])
+            messages.append(right[1])
             continue
         crossed = [name for name in swapped_planes(state) if name not in known.planes]
         if crossed:
@@ -208,33 +205,39 @@ def _families(
             measured, fit = planes_back(measured, crossed), None
             continue
         if unlike.any:
-            said += unlike.messages
+            messages += unlike.messages
             known.rejected.extend([*unlike.monitors, *((name, None) for name in unlike.correctors)])
             measured = unlike.without(measured)
             data = response_data(ring, measured)
             split = split_columns(data, holdout, np.random.default_rng(seed))
         elif fit is not None:
-            return fit, measured, [*said, *fit.messages], known
-        fit = fit_families(data, split, families, progress)
+            return fit, measured, [*messages, *fit.messages], known
+        fit = fit_steps(data, split, trials, most, progress)
 
 
 def _far(state: State, unlike: RejectedChannels) -> bool:
-    """Whether the ring is fitted before swaps are sought: in a design far from the ring, swapped
-    columns match by chance."""
+    """Whether the ring is to be fitted before columns are exchanged: in a design that is far off
+    they fit in each other's place by chance."""
     gone = {name for name, _ in unlike.monitors}
     good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
     return strange(replace(state, good=good), TYPICAL) > FAR
 
 
+def _anothers(state: State) -> set[str]:
+    """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
+    leaves far more of them than of the others."""
+    return {*(own.name for own in misplaced(state)), *unlike_model(state, ODD).correctors}
+
+
 def _faults(
-    fit: HierarchicalFit,
+    fit: StepwiseFit,
     swaps: Swaps,
     effects: Sequence[str] | None,
     most: int,
     judgement: Judgement,
     progress: Callable[[str], Any],
-) -> tuple[HierarchicalFit, tuple[Finding, ...]]:
-    """Single faults among distributed errors, and the fit given them."""
+) -> tuple[StepwiseFit, tuple[Finding, ...]]:
+    """What is wrong alone among small errors, and the fit beside it."""
     state = fit.state
     ring = state.data.ring
     found = [swap_of(state, name, judgement) for name in swaps.planes
@@ -253,25 +256,25 @@ def _faults(
 
 
 def _without(state: State, far: Sequence[Misplaced]) -> State:
-    """The state without steps of explained columns, which are evidence for no single fault."""
+    """As if these had not been stepped: what they leave is explained, and no single fault's."""
     gone = np.zeros(state.data.orbits.shape, dtype=bool)
     gone[[own.column for own in far]] = True
-    return without(state, gone)
+    return beside(state, gone)
 
 
 def as_diagnosis(
     ring: Ring,
-    fit: HierarchicalFit,
+    fit: StepwiseFit,
     within: Sequence[Cause],
     found: Sequence[StatedCause],
     **fields: Any,
 ) -> Diagnosis:
-    """Return the diagnosis of a fit of a response.
+    """What a fit of a response says, as a diagnosis.
 
     Args:
         ring: the design.
         fit: with its steps.
-        within: errors of the estimated ring.
+        within: what the ring as found has.
         found: causes with their errors.
         fields: further ones of the diagnosis.
     """
@@ -319,14 +322,14 @@ def as_diagnosis(
     )
 
 
-def _view(fit: HierarchicalFit) -> ResponseView:
+def _view(fit: StepwiseFit) -> ResponseView:
     state, data = fit.state, fit.state.data
     design, model = fit.design.at.read, state.at.read
     return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
 
 
 def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
-    """The provenance of a diagnosis."""
+    """What made a diagnosis."""
     from tmlattice.version import __version__
 
     return {
@@ -339,44 +342,41 @@ def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dic
     }
 
 
-def families_of(
-    effects: Sequence[str] | None, families: Sequence[Family] = FAMILIES
-) -> list[Family]:
-    """Families of some effects; None: all.
-
-    Raises:
-        MeasurementError: none of the effects acts on an orbit response.
-        UnknownNameError: an effect that does not exist.
-    """
+def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> list[Trial]:
+    """Steps of families that may be tried."""
     if effects is None:
-        return list(families)
+        return list(steps)
     wanted = set(names(effects))
-    known = {effect for family in families for effect in family.effects}
+    kept = [
+        replace(trial, families=tuple(f for f in trial.families if wanted & set(f.effects)))
+        for trial in steps
+    ]
+    known = {effect for trial in steps for family in trial.families for effect in family.effects}
     known |= {name for name in names() if find(name).responds}
     if not known & wanted:
         raise MeasurementError(
             f"an orbit response does not see {', '.join(sorted(wanted)) or 'no effect'}; it sees "
             f"{', '.join(sorted(known))}"
         )
-    return [family for family in families if wanted & set(family.effects)]
+    return [trial for trial in kept if trial.families]
 
 
-def _verdict(fit: HierarchicalFit, false_alarm: float) -> str:
-    """`none` where the design leaves only noise, fitted and held out, in both planes and of the RF;
-    else `distributed`."""
-    said = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
-    chances = [chi2.sf(own.total, own.readings) for own in said if own.readings]
+def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
+    """`nothing` where the design leaves noise alone, in the fit and held out, in both planes and in
+    the RF's response; else `distributed`: many small errors."""
+    messages = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
+    chances = [chi2.sf(own.total, own.readings) for own in messages if own.readings]
     return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
-def _warnings(fit: HierarchicalFit) -> tuple[str, ...]:
-    """Warnings of the diagnosis."""
-    said = dispersion_by_kicks(fit.state.values, fit.state.data)
-    return (*said, *messages(fit.state))
+def _warnings(fit: StepwiseFit) -> tuple[str, ...]:
+    """What a reader should know."""
+    messages = dispersion_by_kicks(fit.state.values, fit.state.data)
+    return (*messages, *odd_readings(fit.state))
 
 
-def _misfit(fit: HierarchicalFit, read: Array) -> Misfit:
-    """The misfit of the fitted correctors' readings in their own plane."""
+def _misfit(fit: StepwiseFit, read: Array) -> Misfit:
+    """Of the fitted correctors' readings in their own plane."""
     data, good = fit.state.data, fit.state.good
     rows = np.flatnonzero(~fit.state.split.held[:-1])
     miss = data.pick(data.orbits - read)[rows][:, good]
@@ -384,7 +384,7 @@ def _misfit(fit: HierarchicalFit, read: Array) -> Misfit:
     return Misfit(float(np.sqrt(np.nanmean(miss**2))), float(np.nanmean(pull**2)))
 
 
-def _gap(fit: HierarchicalFit) -> Gap:
+def _gap(fit: StepwiseFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
     # in units of each reading's noise: the planes differ in it
     before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
@@ -394,8 +394,8 @@ def _gap(fit: HierarchicalFit) -> Gap:
     return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, seen.readings)
 
 
-def _patterns(fit: HierarchicalFit) -> dict[str, Any]:
-    """The remaining residual of the fitted correctors: chi-square per reading, and the share of the
+def _patterns(fit: StepwiseFit) -> dict[str, Any]:
+    """What stays of the fitted correctors' readings: chi-square per reading, and the share of the
     strongest patterns in each plane."""
     state, data = fit.state, fit.state.data
     shares = []

@@ -1,4 +1,4 @@
-"""The residual of a fit of an orbit response, compared with its expected covariance.
+"""What a fit of an orbit response leaves, compared with what it predicts of the readings.
 
 Fitted readings are compared with their noise, and the numbers that were fitted count as lost
 degrees of freedom. Held-out readings are compared with the posterior predictive covariance (Gelman
@@ -19,7 +19,6 @@ from tmlattice.diagnosis.assessment import Block
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_sizes
-from tmlattice.diagnosis.response.weights import FREEDOM, patterns
 from tmlattice.inference.normal import Posterior, solve
 
 Array = NDArray[np.float64]
@@ -27,13 +26,10 @@ Indices = NDArray[np.int64]
 
 BLOCKS = ("in-plane", "coupling", "RF")
 
-OUTLIER = (FREEDOM + 1) / (FREEDOM + 5.0**2)
-"""Student weight of a reading at five standard deviations."""
-
 
 def remainder(state: State) -> tuple[Block, ...]:
-    """Return fitted and held-out readings of a converged state: in-plane, coupling, and the RF's
-    orbit; without those that have no reading.
+    """Fitted and held-out readings of a state that has settled: in-plane, coupling, and the RF's
+    orbit; those without a reading are left out.
 
     Args:
         state: with its priors as learnt.
@@ -64,7 +60,7 @@ def _blocks(state: State) -> Iterator[Block]:
 
 
 def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, Array | None]:
-    """The fit of a block, and roots of the covariance by unknown prior scales."""
+    """The fit of a block, and roots of what unknown prior scales add to its covariance."""
     if not state.of_block(block):
         return None, None, None
     there = linear(state, block)
@@ -73,16 +69,16 @@ def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, 
 
 
 def _numbers(found: Posterior | None) -> float:
-    """Effective number of parameters: 1 for each that the data determine, 0 for each that its prior
-    determines."""
+    """Effective number of parameters: 1 of each that the data determine, 0 of each that its prior
+    holds."""
     if found is None:
         return 0.0
     return float(len(found.prior) - np.trace(found.covariance))
 
 
 class _Sum:
-    """Return chi-square of readings column by column, in the covariance of their noise and, of
-    held-out ones, of the fit's posterior (by Woodbury's identity).
+    """Chi-square of readings column by column, in the covariance of their noise and, of held-out
+    ones, of the fit's posterior (by Woodbury's identity).
 
     Args:
         state, block: of the readings.
@@ -101,16 +97,18 @@ class _Sum:
         self.there, self.found, self.more = there, found, more
         data = state.data
         self.left = data.pick(state.at.left, block)
-        # outliers have a larger noise in the fit, and here
-        share = state.noise.share[block]
-        self.noise = data.noise_of(block) / np.sqrt(np.where(share < OUTLIER, share, 1.0))
-        self.modes = patterns(state, block)
+        # outliers count in the fit, and here, as if their noise were larger
+        share = np.ones_like(self.left) if state.share is None else state.share[block].copy()
+        if state.rf_share is not None:
+            share[-1] *= state.rf_share[block]
+        with np.errstate(divide="ignore"):
+            self.noise = data.noise_of(block) / np.sqrt(share)
         self.square, self.readings = 0.0, 0
         size = 0 if found is None or more is None else len(found.prior) + more.shape[1]
         self.vector, self.matrix = np.zeros(size), np.eye(size)
 
     def add(self, column: int, monitors: NDArray[np.bool_], free: bool = False) -> None:
-        """The readings of a column at some BPMs; with its kick free or fixed."""
+        """The readings of a column at some monitors; with its kick free or as it is."""
         read = np.flatnonzero(
             monitors & np.isfinite(self.left[column]) & np.isfinite(self.noise[column])
         )
@@ -119,8 +117,8 @@ class _Sum:
         sigma = self.noise[column, read]
         rows = np.column_stack([self.left[column, read], *self._slopes(column, read)])
         rows /= sigma[:, None]
-        orbits = self.modes[column][:, read].T / sigma[:, None]
-        if orbits.any():
+        if self.state.jitter is not None:
+            orbits = self.state.jitter[self._plane(column)][:, read].T / sigma[:, None]
             lower = np.linalg.cholesky(np.eye(len(read)) + orbits @ orbits.T)
             rows = solve_triangular(lower, rows, lower=True)
         if free:
@@ -137,7 +135,7 @@ class _Sum:
         self.matrix += slopes.T @ slopes
 
     def _plane(self, column: int) -> int:
-        """The plane of the block's readings of a column."""
+        """In which the block's readings of a column are."""
         return int(self.state.data.plane_of(self.block)[column])
 
     def _slopes(self, column: int, read: Indices) -> list[Array]:
@@ -150,7 +148,7 @@ class _Sum:
 
     @property
     def chi2(self) -> float:
-        """The sum over all readings."""
+        """Of all readings together."""
         if not len(self.vector):
             return self.square
         return self.square - float(self.vector @ np.linalg.solve(self.matrix, self.vector))

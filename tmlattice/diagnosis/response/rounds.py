@@ -1,13 +1,10 @@
-"""The rounds of a hierarchical fit: one damped Gauss-Newton of all parameters, in which the prior
-scales of the families and the variance components of the readings are learnt.
+"""Rounds of Gauss and Newton of a dense fit, and the evidence of what they leave.
 
 >>> state = settle(bend(jump(allow(state, families))))
->>> state.outcome
-<Outcome.CONVERGED: 'converged'>
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,124 +12,96 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
-from tmlattice.diagnosis.response.state import Outcome, State
-from tmlattice.diagnosis.response.weights import (
-    Spent,
-    learnt,
-    log_likelihood,
-    patterns,
-    weight,
-)
-from tmlattice.errors import TmlatticeError
-from tmlattice.inference.common import common, times_precision
-from tmlattice.inference.normal import Posterior, inverse_of_lower, solve
+from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.weights import log_scale, look, weighed, weight
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.priors import Group
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 40
-"""Rounds of a fit at most."""
-GAIN = 1e-4
-"""Relative gain of a round below which a fit has converged: half a unit in 5000 readings. Prior
-scales and weak directions converge last, and contribute some ten units."""
+ROUNDS = 12
+"""Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
+GAIN = 3e-3
+"""Share of the cost that a round has to gain for another one."""
 EACH = 4
-"""Fisher steps of the prior scales in a round of the fit."""
-RETRIES, SHORTER, LONGER, LONGEST = 6, 4.0, 2.0, 8.0
-"""Repetitions of a step that raised the cost; factors by which the step bounds fall then and grow
-otherwise, and their largest value."""
+"""Rounds of EM for the priors in a round of the fit."""
+LEARN = 10
+"""Rounds of EM where evidence counts: the priors of what is not there fall slowly."""
+RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
+"""How often a round that went astray is repeated; by what trust falls then and grows else, and to
+how much at most."""
 CORRECTED, CORRECTS = 6, 1e-3
-"""Corrections of a round's step by the residuals at its end, with the derivatives of its start; and
-the least gain for another one. Correlated numbers move along a narrow, bent valley, and a tangent
-step leaves it."""
+"""How often a round corrects its step by what the readings say where it led, with the slopes of its
+start; and what share of the cost that has to gain to be repeated. Numbers that pull against one
+another go far in a valley that is narrow and bent: a step along its tangent leads up its wall."""
 HELD = 4
-"""Repetitions of the solution with numbers held at their bounds."""
-
-Weights = tuple[Array, Array]
+"""How often numbers that would be lower than they can be are held, and the rest solved again."""
 
 
 class Moved(NamedTuple):
-    """A state after a round, the cost before and after, and each block's solution."""
+    """A state after a round, and the cost that the round was to lessen, before and after."""
 
     state: State
     before: float
     after: float
-    found: Mapping[int, Posterior]
 
 
-def one_round(state: State, blocks: Mapping[int, Linear], bold: float = 1.0) -> Moved:
-    """Solve the readings of both blocks, and take the step.
+def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Moved:
+    """Solve the readings of one block, and move.
 
     Args:
-        state: the start.
-        blocks: `linear` of each block that has families.
-        bold: factor of every step bound: small after rounds that raised the cost.
+        state: where it stands.
+        block: 0 in-plane, 1 coupling.
+        there: `linear` of that block where it stands.
+        bold: factor of every trusted change: small where the last rounds went astray.
     """
-    found = {block: _within(there, bold) for block, there in blocks.items()}
-    groups = {group.name: group for own in found.values() for group in own.groups}
-    learnt_priors = replace(state, groups={**state.groups, **groups})
-    weights = {block: _weights(state, block) for block in (0, 1)}
+    found = _within(there, bold)
+    groups = {group.name: group for group in found.groups}
+    learnt = replace(state, groups={**state.groups, **groups})
+    weights = weight(state, block)
 
     def cost(at: State) -> float:
-        total = 0.0
-        for block, own in weights.items():
-            left = np.where(own[0] > 0, state.data.pick(at.at.left, block), 0.0)
-            total += float(np.sum(left * times_precision(*own, left)))
-        for block, there in blocks.items():
-            for name, rows in there.where.items():
-                priors = [g for g in found[block].groups if g.basis[rows].any()]
-                total += _penalty(priors, rows, at.values[name])
-        return total
+        left = np.where(weights > 0, state.data.pick(at.at.left, block), 0.0)
+        penalty = sum(
+            _penalty([g for g in found.groups if g.basis[rows].any()], rows, at.values[name])
+            for name, rows in there.where.items()
+        )
+        return float(np.sum(left * weighed(state, block, left))) + penalty
 
-    best = Moved(learnt_priors, cost(state), np.inf, found)
-    aims = {block: own.values for block, own in found.items()}
+    best, aim = Moved(learnt, cost(state), np.inf), found.values
     for _ in range(CORRECTED + 1):
-        values = dict(state.values)
-        for block, there in blocks.items():
-            values |= {
-                name: np.maximum(aims[block][at], there.lowest[at])
-                for name, at in there.where.items()
-            }
+        values = {name: np.maximum(aim[at], there.lowest[at]) for name, at in there.where.items()}
+        then = learnt.moved({**state.values, **values})
         try:
-            then = learnt_priors.moved(values)
             after = cost(then)
-        except (TmlatticeError, np.linalg.LinAlgError):  # no beam is stored there
+        except UnstableRingError:  # astray: nothing is stored there
             break
         last = best.after
         if after <= last:
             best = best._replace(state=then, after=after)
-        if not after <= (1 - CORRECTS) * last:
+        if after > (1 - CORRECTS) * last:
             break
-        aims = {
-            block: _corrected(then, block, there, found[block], weights[block], bold)
-            for block, there in blocks.items()
-        }
+        # what the readings say there, as if the ring were linear with the slopes of the start
+        moved = np.zeros_like(there.start)
+        for name, at in there.where.items():
+            moved[at] = values[name] - there.start[at]
+        left = state.data.pick(then.at.left, block)
+        messages = gathered(there, state.data.plane_of(block), weighed(state, block, left))
+        messages += there.normal.matrix @ moved
+        aim, before = _aim(there, found, bold * there.trust, messages), aim
+        further = aim - before
+        if further @ there.normal.matrix @ further < CORRECTS * after:
+            break  # as straight as the step took it for
     return best
 
 
-def _weights(state: State, block: int) -> Weights:
-    """Weights of the readings, and their reduction by common modes."""
-    own = weight(state, block)
-    return own, common(own, patterns(state, block))[0]
-
-
-def _corrected(
-    then: State, block: int, there: Linear, found: Posterior, weights: Weights, bold: float
-) -> Array:
-    """Values by the residuals at the end of a step, with the derivatives of its start."""
-    moved = np.zeros_like(there.start)
-    for name, at in there.where.items():
-        moved[at] = then.values[name] - there.start[at]
-    data = then.data
-    left = times_precision(*weights, data.pick(then.at.left, block))
-    vector = gathered(there, data.plane_of(block), left) + there.normal.matrix @ moved
-    bounds = bold * there.trust
-    return found.solved(vector + there.normal.matrix @ there.start + there.start / bounds**2)
-
-
 def _within(there: Linear, bold: float) -> Posterior:
-    """The step, with numbers that would exceed their bounds held there."""
+    """The step, those that it would make lower than they can be left where they are lowest."""
     groups, trust = there.groups, bold * there.trust
     for _ in range(HELD):
         found = solve(there.normal, groups, there.start, trust, rounds=EACH)
@@ -144,9 +113,15 @@ def _within(there: Linear, bold: float) -> Posterior:
     return found
 
 
+def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:
+    """Values that another vector leads to, from the same start with the same priors and trust."""
+    whole = vector + there.normal.matrix @ there.start + there.start / trust**2
+    return found.solved(whole)
+
+
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
-    """The prior's gradient for the values of one variable; its priors add up."""
-    if not groups:  # the ring has no such numbers
+    """What the priors of one variable, which add up, ask for its values."""
+    if not groups:  # of numbers that a ring has none of
         return 0.0
     each, shared = np.zeros(len(values)), []
     for group in groups:
@@ -156,11 +131,11 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
             each += np.abs(spread).sum(axis=1)
         else:
             shared.append(spread)
-    free = each > 0  # held numbers are skipped
+    free = each > 0  # one that is held is not asked for
     if not free.any():
         spread = np.concatenate(shared, axis=1)
         return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
-    # after shared ones, each number's own prior has the rest
+    # a few that are shared, each number's own takes the rest
     rest, scale = values[free] / each[free], each[free, None]
     few = np.concatenate([np.zeros((len(rest), 0)), *(own[free] / scale for own in shared)], axis=1)
     asked = np.concatenate([rest, np.zeros(few.shape[1])])
@@ -176,76 +151,122 @@ def _of_each(spread: Array) -> bool:
 
 def settle(
     state: State,
+    blocks: Sequence[int] = (1, 0),
     most: int = ROUNDS,
     gain: float = GAIN,
     possible: Callable[[State], bool] = lambda state: True,
-    alike: bool = False,
+    look_at_monitors: bool = True,
 ) -> State:
-    """Repeat rounds until none gains; none of them raises the cost.
+    """Rounds until none gains any more, none of which may make things worse.
 
-    As Levenberg and Marquardt have it, but that the bound of a step is a change of each number by
-    itself: a round that raised the cost is taken back and repeated with shorter steps.
+    As Levenberg and Marquardt have it, but that what is trusted is a change of each number by
+    itself: a round that went astray is taken back and repeated with less trust.
 
     Args:
-        state: the start.
-        most: rounds.
+        state: where it stands.
+        blocks: that move, in this order.
+        most: rounds of each block.
         gain: share of the cost that a round has to gain for another one.
         possible: whether a state is one that is sought; rounds end at one that is not.
-        alike: all columns, and all monitors, have the same misfit, see `weights.learnt`.
+        look_at_monitors: whether those that are bad are set aside after each round.
     """
-    bold, outcome = 1.0, Outcome.ROUNDS
+    good = state.good
+    bold = dict.fromkeys(blocks, 1.0)
     for turn in range(most):
-        blocks = {block: linear(state, block) for block in (0, 1) if state.of_block(block)}
-        kept = {name: own for there in blocks.values() for name, own in there.kept.items()}
-        state = replace(state, kept={**state.kept, **kept})
-        for _ in range(RETRIES):
-            moved = one_round(state, blocks, bold)
-            if moved.after <= moved.before:
-                break
-            bold /= SHORTER
-        else:
-            outcome = Outcome.STUCK
-            break
-        bold = min(LONGER * bold, LONGEST)
-        gained = (moved.before - moved.after) / max(moved.after, 1e-300)
-        spent = {block: _spent(state, block, there, moved.found[block])
-                 for block, there in blocks.items()}  # fmt: skip
-        state = learnt(moved.state, spent, alike)
-        log.info("round %d gained %.3g of %.4g, misfit %s m", turn, gained, moved.after,
-                 np.sqrt(np.median(state.noise.column, axis=1)))  # fmt: skip
+        gained = 0.0
+        for block in blocks:
+            if not state.of_block(block):
+                continue
+            there = linear(state, block)
+            state = replace(state, kept={**state.kept, **there.kept})
+            for _ in range(RETRIES):
+                moved = one_round(state, block, there, bold[block])
+                if moved.after <= moved.before:
+                    break
+                bold[block] /= ASTRAY
+            if moved.after > moved.before:
+                continue
+            bold[block] = min(BOLDER * bold[block], BOLDEST)
+            gained = max(gained, (moved.before - moved.after) / max(moved.after, 1e-300))
+            state = moved.state
+            for seen in (0, 1):
+                if state.of_block(seen):
+                    state = look(state, seen)
+                    state = state if look_at_monitors else replace(state, good=good)
+        log.info(
+            "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
+        )
         if gained < gain or not possible(state):
-            outcome = Outcome.CONVERGED
             break
-    return replace(state, outcome=outcome)
+    return state
 
 
-def _spent(state: State, block: int, there: Linear, found: Posterior) -> Spent:
-    """Degrees of freedom of the parameters, and those of the RF's orbit."""
-    half = inverse_of_lower(found.factor)
-    total = len(found.prior) - float(np.sum(half**2))
-    column = len(state.data.plane) - 1
-    own = weight(state, block)[[column]]
-    seen = np.flatnonzero(own[0])
-    if not len(seen):
-        return Spent(total, 0.0)
-    rows = there.of_column(column, seen, int(state.data.plane_of(block)[column])) @ found.spread
-    return Spent(total, float(np.sum((rows @ half.T) ** 2, axis=1) @ own[0, seen]))
-
-
-def log_evidence(state: State) -> float:
-    """The log evidence of the fitted readings (Laplace), up to a constant of the data.
+def linear_evidence(
+    there: Linear, gone: Collection[str] = (), rounds: int = LEARN
+) -> tuple[float, dict[str, Array], Posterior | None]:
+    """Log evidence that priors and readings have of one block where the fit stands, linear about
+    it, up to a constant; the values that are the likeliest; and the fit, if there is one.
 
     Args:
-        state: converged; states that are compared use the same monitors.
+        there: where the fit stands.
+        gone: priors of families that are not there, by name.
+        rounds: of EM for the priors.
     """
-    total = 0.0
-    for block in (0, 1):
-        total += log_likelihood(state, block)
+    left = [group for group in there.groups if group.name not in gone]
+    found = solve(there.normal, left, there.start, rounds=rounds) if left else None
+    nothing = np.zeros_like(there.start)
+    moved = (nothing if found is None else found.values) - there.start
+    total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
+    if found is None:
+        return total, {name: nothing[rows] for name, rows in there.where.items()}, None
+    total += found.occam
+    for rows in there.where.values():
+        groups = [g for g in found.groups if g.basis[rows].any()]
+        if groups:
+            total -= 0.5 * _penalty(groups, rows, found.values[rows])
+    return total, {name: found.values[rows] for name, rows in there.where.items()}, found
+
+
+class Evidence(NamedTuple):
+    """What the readings say for a state.
+
+    Attributes:
+        log: its logarithm, of both blocks.
+        state: with the weights that it was taken with.
+        in_plane: linear where it stands; None where nothing is fitted there.
+        found: the fit of that.
+    """
+
+    log: float
+    state: State
+    in_plane: Linear | None
+    found: Posterior | None
+
+
+def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evidence:
+    """Evidence of what is fitted, of the readings of some monitors, both blocks, what the model
+    lacks and the priors at their likeliest; up to a constant of the data.
+
+    Args:
+        state: that is weighed.
+        good: the monitors.
+        shares: of the readings that are independent: the same for states that are compared.
+    """
+    total, in_plane, found = 0.0, None, None
+    for block in (block for block in (1, 0) if state.reads(block)):
+        state = replace(look(state, block), good=good, independent=shares)
+        left = np.where(weight(state, block) > 0, state.data.pick(state.at.left, block), 0.0)
+        total += 0.5 * log_scale(state, block)
+        total -= 0.5 * float(np.sum(left * weighed(state, block, left)))
         if state.of_block(block):
             there = linear(state, block)
-            found = solve(there.normal, there.groups, there.start, rounds=0)
-            total += found.occam - 0.5 * sum(
-                _penalty([g for g in there.groups if g.basis[rows].any()], rows, state.values[name])
-                for name, rows in there.where.items()
-            )
-    return total
+            more, _, last = linear_evidence(there)
+            total += more
+            if block == 0:
+                in_plane, found = there, last
+    return Evidence(total, state, in_plane, found)
+
+
+def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
+    """That of `evidence_of`."""
+    return evidence_of(state, good, shares).log

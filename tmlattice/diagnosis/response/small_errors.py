@@ -1,12 +1,12 @@
-"""All usual distributed errors of a ring in an orbit response, with their prior scales.
+"""All usual small errors of a ring as an orbit response shows them, with their sizes.
 
 >>> state = small_errors(data, split, fit.state)
 >>> sizes_in(linear(state, 0))
 
-They are the background model of a fault: the families of a hierarchical fit, and the closed orbit
-by kicks (`orbit_modes`). All readings are fitted; of held-out correctors the half of the BPMs that
-determines their kicks. Priors are Gaussian, and the largest number of a family is omitted from its
-scale, because it may be the fault.
+What a fault is weighed against. Beside the families of a dense fit there is the closed orbit that
+kicks make (`orbit_modes`). Everything that was read is fitted, of held-out correctors the half of
+the monitors that gives their kicks. Sizes are those of Gauss, and the largest number of a family
+does not count: it may be the fault.
 """
 
 import logging
@@ -26,10 +26,10 @@ from tmlattice.diagnosis.families.steps import (
     MonitorGain,
     MonitorRoll,
 )
-from tmlattice.diagnosis.response.hierarchical import ROUGH, fit_chi2
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import State, allow, begin, bend, jump
+from tmlattice.diagnosis.response.stepwise import ROUGH, fit_chi2
 from tmlattice.effects import find
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.normal import solve
@@ -47,36 +47,34 @@ USUAL: tuple[Family, ...] = (
     CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), MonitorRoll(),
     CorrectorRoll(), SkewGradient(),
 )  # fmt: skip
-"""Families of every ring."""
+"""Families that a ring always has."""
 ANEW = 20_000
-"""Most readings for a second fit from the design: a fit that diverged may have converged to a wrong
-ring."""
+"""Readings up to which everything is also fitted from the design on: where the families alone went
+astray, they hide what they made up."""
 EXPLAINED = 1.5
-"""Chi-square per reading of each plane below which one start is sufficient."""
+"""Chi-square per reading of each plane at which one start is enough."""
 SIZES = 12
-"""Rounds of EM for the prior scales."""
+"""Rounds of EM for the sizes."""
 SHARED = {
     "vertical_focusing": "vertical_focusing",
     "quadrupole_gradient of families": "quadrupole_gradient",
     "corrector_calibration of families": "corrector_calibration",
 }
-"""Groups of few numbers, whose usual scale counts as `COUNTS` of them."""
+"""Groups of a few numbers, and whose usual size counts as much as `COUNTS` of them."""
 COUNTS = 4
 
 
 def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
-    """Fit the distributed errors to all readings outside the validation set.
+    """Fitted to all that may be fitted.
 
     Args:
-        data, split: the data, and the validation split.
-        fitted: a hierarchical fit of the data.
+        data, split: what was measured, and who judges.
+        fitted: a dense fit of it.
     """
     data = _near(data, split)
     nobody = np.zeros_like(split.held)
     everybody = Split(nobody, nobody, _halves(split), np.zeros_like(split.inner_rf))
     design = replace(begin(data, everybody), good=fitted.good, exploring=False)
-    noise = replace(design.noise, kinds=fitted.noise.kinds)
-    design = replace(design, noise=noise)
     families = _families(design, fitted.families)
     beside = _from(design, families, fitted)
     few = data.orbits.size <= ANEW
@@ -85,17 +83,17 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
         try:
             state = settle(jump(bend(start), beyond=1.0), gain=ROUGH)
             state = settle(bend(state))
-        except (TmlatticeError, np.linalg.LinAlgError):  # diverged
+        except (TmlatticeError, np.linalg.LinAlgError):  # astray
             continue
-        found.append((log_evidence(state), state))
-        log.info("distributed errors: evidence %.1f", found[-1][0])
+        found.append((log_evidence(state, state.good), state))
+        log.info("small errors: evidence %.1f", found[-1][0])
         if all(own.per_reading < EXPLAINED for own in fit_chi2(state)[:2]):
             break
     return max(found, key=lambda one: one[0])[1] if found else beside
 
 
 def _near(data: ResponseData, split: Split) -> ResponseData:
-    """The data without the validation readings of held-out correctors."""
+    """Without the readings of held-out correctors that judge."""
     far = split.held[:-1, None] & ~split.half[:-1]
     orbits = data.orbits.copy()
     orbits[:-1][far] = np.nan
@@ -103,8 +101,8 @@ def _near(data: ResponseData, split: Split) -> ResponseData:
 
 
 def _halves(split: Split) -> Flags:
-    """BPMs that determine a corrector's kick, the others validate it; of held-out correctors half
-    of the remaining ones."""
+    """Monitors that give a corrector its kick while the others say whether it is that; of held-out
+    ones half of those that are read here."""
     half = split.half.copy()
     for column in np.flatnonzero(split.held):
         half[column, np.flatnonzero(half[column])[::2]] = False
@@ -112,7 +110,7 @@ def _halves(split: Split) -> Flags:
 
 
 def _families(design: State, more: Sequence[Family]) -> list[Family]:
-    """Usual families, and those accepted in the fit."""
+    """Usual ones, and those that a fit wanted beside them."""
     known = [*USUAL, *orbit_families(design.data.ring, design.at.model)]
     names = [family.name for family in known]
     known += [family for family in more if family.name not in names]
@@ -120,20 +118,20 @@ def _families(design: State, more: Sequence[Family]) -> list[Family]:
 
 
 def _from(design: State, families: Sequence[Family], fitted: State) -> State:
-    """The state of the hierarchical fit."""
+    """Where the families' fit stands."""
     at = Predicted(design.data, Errors.none(design.data), fitted.at.bent)
-    state = replace(design, at=at, noise=fitted.noise, groups=fitted.groups)
+    state = replace(design, at=at, lacking=fitted.lacking, groups=fitted.groups)
     state = allow(state, families)
     return state.moved({**state.values, **{k: v for k, v in fitted.values.items()
                                            if k in state.values}})  # fmt: skip
 
 
-# --- prior scales ---------------------------------------------------------------------------
+# --- how large they are ---------------------------------------------------------------------------
 def sizes_in(there: Linear) -> tuple[Group, ...]:
-    """The priors with scales from all numbers but each family's largest.
+    """The priors with sizes from all numbers but each family's largest.
 
     Args:
-        there: of the fit.
+        there: where the fit stands.
     """
     groups = [replace(group, each=None, freedom=np.inf) for group in there.groups]
     pull = there.normal.vector + there.normal.matrix @ there.start
@@ -150,7 +148,7 @@ def sizes_in(there: Linear) -> tuple[Group, ...]:
 
 
 def _sized(group: Group, squares: Array) -> Group:
-    """The mean square without the largest, corrected for that omission."""
+    """Of all but the largest, as much larger as that makes them smaller by chance."""
     n = len(squares)
     if group.fixed or not n:
         return group
@@ -160,7 +158,7 @@ def _sized(group: Group, squares: Array) -> Group:
     elif n < 3:
         mean = float(squares.mean())
     else:
-        expected = float(ndtri(0.5 / n)) ** 2  # expectation of the largest of n
+        expected = float(ndtri(0.5 / n)) ** 2  # of the largest of n
         without = (squares.sum() - squares.max()) / max(n - expected, 1.0)
         mean = min(float(squares.mean()), float(without))
     return replace(group, rms=max(float(np.sqrt(mean)), SMALLEST))

@@ -1,13 +1,12 @@
-"""The state of a hierarchical fit of an orbit response, and functions that return another one.
+"""The state of a dense fit of an orbit response, and what may happen to it.
 
-Everything that is fitted is one frozen `State`, the noise model included: `bend`, `allow`, `jump`
-and `rounds.settle` return a new one.
+Everything that is fitted is one frozen `State`; what happens to it is a function that gives another
+one: `bend`, `allow`, `jump`, `settle`, `look`.
 """
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -26,15 +25,15 @@ Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 ALONE = 0.3
-"""Ratio to which a column's misfit falls by its own number if it has no other significant error."""
+"""A column whose misfit falls to this share by its own number has no other error to speak of."""
 FEW = 3
-"""Readings required to check the gain of a BPM."""
+"""Readings that it takes to judge the gain of a monitor."""
 
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """Numbers of one variable with a common single fault: a prior of their own, apart from their
-    family's, whose scale it does not change.
+    """Numbers of one variable that are wrong together and alone: a prior of their own, beside that
+    of their family, which so learns nothing from them.
 
     Attributes:
         cause: effect and place.
@@ -52,20 +51,12 @@ class Apart:
 
     @property
     def name(self) -> str:
-        """The name of its prior."""
+        """Of its prior."""
         return f"alone: {self.cause[0]} {self.cause[1]}"
 
 
-class Outcome(Enum):
-    """The outcome of a fit."""
-
-    CONVERGED = "converged"
-    ROUNDS = "the fit ran out of rounds while it still gained"
-    STUCK = "no step lessened the cost, however short"
-
-
 class Kept(NamedTuple):
-    """Derivatives of the readings by the ring's numbers of one variable, and their point."""
+    """What the ring's numbers of one variable do to the readings, and where that was taken."""
 
     rows: Array  # [number, column, monitor]
     gain: Array  # [column, monitor]
@@ -73,119 +64,58 @@ class Kept(NamedTuple):
     at: Mapping[str, Array]
 
 
-WAVES = 4
-"""Closed-orbit waves of each step: two give any phase of a betatron oscillation, the others the
-differences between places of kicks."""
-KINDS = {
-    "waves": slice(0, WAVES),
-    "drift": slice(WAVES, WAVES + 1),
-    "place": slice(WAVES + 1, None),
-}
-"""Common modes of a step, by their patterns: beam jitter (in the plane that is not kicked: in the
-kicked plane it would absorb what gradients and the energy explain), a drift of the energy, and the
-field of the corrector at another place (in the kicked plane)."""
-DRIFT = 1e-4
-"""First guess of the rms drift of the energy within a step, in RF steps."""
-PLACE = 3e-3
-"""First guess of the rms distance of a corrector's field from its nominal place, m."""
-
-
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """Variance components of the readings about the model.
-
-    The variance of a reading is that of its noise, plus the misfit of its column, plus the misfit
-    of its monitor, over its Student weight. Amounts of the common modes of each column are Gaussian
-    and integrated out.
-
-    Attributes:
-        column: misfit of each column, m^2, [block, column].
-        monitor: misfit of each monitor, m^2, [block, plane that is read, monitor].
-        share: Student weight of each reading, 1 or less, [block, column, monitor].
-        size: prior rms of the amount of each common mode, [block, column, pattern].
-        scale: of the kinds of common modes, [block, plane that is read, kind].
-        waves: orbits of unit rms, [plane that is read, pattern, monitor].
-        kinds: of common modes that are admitted, names of `KINDS`; waves by validation alone.
-    """
-
-    column: Array
-    monitor: Array
-    share: Array
-    size: Array
-    scale: Array
-    waves: Array
-    kinds: tuple[str, ...] = ("drift", "place")
-
-    @classmethod
-    def first(cls, at: Predicted, left: Array) -> "Noise":
-        """The first guess: all columns alike, in-plane and coupling.
-
-        Args:
-            at: the design.
-            left: typical misfit of each block, m, [block].
-        """
-        data = at.data
-        columns, monitors = data.shape
-        waves = np.zeros((2, WAVES, monitors))
-        for plane in (0, 1):
-            own = data.plane[:-1] == plane
-            if not own.any():
-                continue
-            orbits = at.straight[:-1][own][:, :, plane] / data.kicks[:-1][own, None]
-            shapes = np.linalg.svd(orbits, full_matrices=False)[2][:WAVES]
-            waves[plane, : len(shapes)] = shapes * np.sqrt(monitors)
-        scale = np.tile([float(np.median(data.noise)), DRIFT, PLACE], (2, 2, 1))
-        size = np.zeros((2, columns, WAVES + 2))
-        for kind, which in enumerate(KINDS.values()):
-            size[:, :, which] = scale[0, 0, kind]
-        column = np.repeat(np.square(left)[:, None], columns, axis=1)
-        return cls(column, np.zeros((2, 2, monitors)), np.ones((2, columns, monitors)), size,
-                   scale, waves)  # fmt: skip
-
-
 @dataclass(frozen=True, eq=False)
 class State:
-    """The state of the fit.
+    """Everything that is fitted.
 
     Attributes:
-        data, split: the data, and the validation split.
-        at: the model's readings with the values.
-        noise: variance components of the readings.
-        good: monitors that are used, [monitor].
-        families: that are open.
+        data, split: what was measured, and who judges.
+        at: what the model reads with the values.
+        lacking: what the model lacks in-plane and across in each column, m: it lessens weights as
+            noise does, so that one corrector whose field is not where the model has it spoils no
+            magnet; [block, column].
+        good: monitors that are not bad, [monitor].
+        families: that are allowed.
         values: by variable.
-        groups: the families' priors with the scales that they have learnt, by name.
-        exploring: the inner correctors validate, and are not fitted.
-        kept: rows of the ring's variables, reused until the ring has moved.
-        apart: numbers of single faults.
-        guessed: rms of the logarithm of a family's scale about its first guess.
-        rejected: families that the validation set, or physics, rejects: their numbers are taken
-            for zero, and stated errors know that they may not be (those of the ring, where they are
-            few).
-        outcome: how the last fit ended.
+        groups: the families' priors with what they have learnt, by name.
+        exploring: the inner correctors choose, and are not fitted.
+        kept: rows of the ring's variables, that stand until the ring has moved.
+        share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
+        rf_share: by which the RF's readings count, [block, monitor]; None: all alike.
+        apart: numbers that are wrong alone.
+        independent: share of the readings that tell something of their own, see `independent`,
+            [block, plane that is read]; None: all are taken to.
+        jitter: closed orbits that each step has an unknown amount of, as large as they typically
+            are, m, [plane that is read, pattern, monitor]; None: the beam stood still.
+        guessed: rms of the logarithm of a family's size about its first guess.
+        unneeded: families that were tried: their numbers are taken for zero, and stated errors know
+            that they may not be (those of the ring, where they are few).
     """
 
     data: ResponseData
     split: Split
     at: Predicted
-    noise: Noise
+    lacking: Array
     good: Flags
     families: tuple[Family, ...] = ()
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
+    share: Array | None = None
+    rf_share: Array | None = None
     apart: tuple[Apart, ...] = ()
+    independent: Array | None = None
+    jitter: Array | None = None
     guessed: float = SCALE_SPREAD
-    rejected: tuple[Family, ...] = ()
-    outcome: Outcome | None = None
+    unneeded: tuple[Family, ...] = ()
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""
         return tuple(family for family in self.families if family.block == block)
 
     def reads(self, block: int) -> bool:
-        """Whether fitted correctors have readings of a block."""
+        """Whether correctors that are fitted have readings of a block."""
         orbits = self.data.pick(self.data.orbits, block)
         return bool(np.isfinite(orbits[self.fitted][:, self.good]).any())
 
@@ -195,12 +125,12 @@ class State:
 
     @property
     def fitted(self) -> Flags:
-        """Fitted correctors, [column]; the RF's BPMs are split instead."""
+        """Correctors that are, [column]; the RF's monitors are split instead."""
         out = self.split.held | (self.split.inner & self.exploring)
         return np.asarray(~out & (np.arange(len(out)) < len(out) - 1))
 
     def moved(self, values: Mapping[str, Array]) -> "State":
-        """The state with other values, and the model's readings with them."""
+        """With other values, and what the model reads with them."""
         errors = Errors.none(self.data)
         for family in {f.variable: f for f in self.families}.values():
             errors = family.put(errors, values[family.variable], self.data)
@@ -208,19 +138,18 @@ class State:
 
 
 def begin(data: ResponseData, split: Split) -> State:
-    """The state of the design."""
+    """The design."""
     at = Predicted(data, Errors.none(data))
-    left = np.zeros(2)
-    for block in (0, 1):
-        gap = data.pick(at.left, block)[:-1][~split.held[:-1]]
-        if np.isfinite(gap).any():
-            left[block] = float(np.nanmedian(np.abs(gap))) / 0.6745
-    return State(data, split, at, Noise.first(at, left), np.ones(data.shape[1], dtype=bool))
+    gap = data.pick(at.left)[~split.held]
+    size = float(np.nanmedian(np.abs(gap))) / 0.6745
+    return State(
+        data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
+    )
 
 
 def bend(state: State) -> State:
-    """The state with the third order of the steps; unchanged where the ring stores no beam with
-    such a step."""
+    """With the third order of the steps where the fit stands. A ring that stores no beam with such
+    a step is far from the one that was measured, and keeps what it has."""
     try:
         return replace(state, at=state.at.bend())
     except UnstableRingError:
@@ -228,7 +157,7 @@ def bend(state: State) -> State:
 
 
 def allow(state: State, families: Sequence[Family]) -> State:
-    """The state with more families, at zero or at given values; present ones are unchanged."""
+    """With more families, at zero or where they are to begin; those that are there stay."""
     values = {f.variable: np.zeros(f.size(state.data)) for f in families}
     begun = any(state.values.get(name, new).any() for name, new in values.items())
     begun &= not {f.variable for f in state.families} >= set(values)
@@ -236,25 +165,25 @@ def allow(state: State, families: Sequence[Family]) -> State:
     more = [family for family in families if not state.allows(family.name)]
     state = replace(
         state, families=(*state.families, *more), values={**values, **state.values},
-        rejected=tuple(family for family in state.rejected if family.name not in names),
+        unneeded=tuple(family for family in state.unneeded if family.name not in names),
     )  # fmt: skip
     return state.moved(state.values) if begun else state
 
 
 def forbid(state: State, families: Sequence[Family]) -> State:
-    """The state without some families; numbers of no other family return to zero."""
+    """Without some families; numbers that no other family moves go back to zero."""
     names = [family.name for family in families]
     gone = {group.name for family in families for group in family.groups(state.data)}
     left = tuple(family for family in state.families if family.name not in names)
     values = {f.variable: state.values[f.variable] for f in left}
     groups = {name: group for name, group in state.groups.items() if name not in gone}
-    rejected = (*state.rejected, *families)
-    return replace(state, families=left, groups=groups, rejected=rejected).moved(values)
+    unneeded = (*state.unneeded, *families)
+    return replace(state, families=left, groups=groups, unneeded=unneeded).moved(values)
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
-    """Return each column's own estimate of its number, from its near BPMs: with the third order of
-    its step, or without it where that agrees better.
+    """What each column alone says of its own number, from its near monitors: with the third order
+    of its step, or without it where that agrees better (it was taken at a kick twice too large).
 
     Returns:
         The change of the number, and the far readings' mean squares in units of the noise, without
@@ -284,8 +213,8 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
 
 
 def by_monitors(state: State) -> Array:
-    """Each BPM's own estimate of its gains relative to the present ones, x and y of each, [2 x
-    monitor]: from half of the fitted columns, where the other half agrees; else 1."""
+    """What each monitor alone says of its gains, over those that it has, x and y of each, [2 x
+    monitor]: from half of the columns that are fitted, where the other half agrees; else 1."""
     model, orbits = (state.data.pick(own) for own in (state.at.read, state.data.orbits))
     gains = np.ones((len(state.data.at), 2))
     for p in (0, 1):
@@ -304,17 +233,17 @@ def by_monitors(state: State) -> Array:
 
 
 def jump(state: State, beyond: float | None = None) -> State:
-    """The state with large numbers of single columns at their own estimates.
+    """Start large numbers of single columns at what the column alone says.
 
     Args:
-        state: whose column families are checked.
-        beyond: limits of the changes; None: `Family.gross`.
+        state: whose column families are looked at.
+        beyond: trusted changes; None: what is gross.
     """
     values = dict(state.values)
     for family in state.families:
         if family.per == "monitor" and not np.isinf(family.gross):
             gains = by_monitors(state)
-            far = np.abs(gains - 1) > family.gross  # a gain of zero has no estimate
+            far = np.abs(gains - 1) > family.gross  # of a gain of zero nothing can be made
             moved = np.where(far, (1 + values[family.variable]) * (gains - 1), 0.0)
             values[family.variable] = values[family.variable] + moved
         limit = family.gross if beyond is None else beyond * family.trust
@@ -328,19 +257,26 @@ def jump(state: State, beyond: float | None = None) -> State:
 
 
 def rms_of(parts: Iterable[Array]) -> float:
-    """The mean over all entries; NaN without any."""
+    """Over all of them; NaN where there is none."""
     values = np.concatenate(list(parts))
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-def amplitudes(patterns: Array, data: Array, near: Flags, far: Flags) -> tuple[Array, Array]:
-    """Amplitudes of patterns [monitor, pattern] from near readings, and the residual of far ones.
+def amplitudes(
+    patterns: Array, data: Array, near: Flags, far: Flags, held: Array | None = None
+) -> tuple[Array, Array]:
+    """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss.
 
     Args:
         patterns, data: m, [monitor, pattern] and [monitor].
         near, far: [monitor].
+        held: by priors about zero, noise of a reading over the amplitude's rms, [pattern]; 0: free.
     """
     size = np.abs(patterns[near]).max(axis=0)
     size[size == 0] = 1
-    amounts = np.linalg.lstsq(patterns[near] / size, data[near], rcond=None)[0] / size
+    rows, right = patterns[near] / size, data[near]
+    if held is not None:
+        rows = np.concatenate([rows, np.diag(held / size)])
+        right = np.concatenate([right, np.zeros(len(held))])
+    amounts = np.linalg.lstsq(rows, right, rcond=None)[0] / size
     return amounts, data[far] - patterns[far] @ amounts

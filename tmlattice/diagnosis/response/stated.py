@@ -1,4 +1,4 @@
-"""The stated errors of a hierarchical fit's numbers.
+"""The errors of a dense fit's numbers as they are told.
 
 >>> there = linear(state, 0)
 >>> posterior = solve(there.normal, there.groups, there.start, rounds=0)
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 class Stated(NamedTuple):
-    """Stated errors of the numbers of one block, in the order of `linear`.
+    """What is stated of the numbers of one block, in the order of `linear`.
 
     Attributes:
         sigma: standard errors, [parameter].
@@ -38,18 +38,18 @@ class Stated(NamedTuple):
 
 
 def unwidened(posterior: Posterior) -> Stated:
-    """Posterior errors without widening."""
+    """The posterior's own."""
     prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     return Stated(posterior.sigma, prior, covariance)
 
 
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Stated:
-    """Return posterior errors, widened by common-mode noise of the readings (`of_readings`), by
-    unknown prior scales (`of_sizes`), and by possible single faults (`heavy_tails`).
+    """Posterior errors, widened by what readings share (`of_readings`), by what the sizes of
+    families are unknown by (`of_sizes`), and by members that may be faulty (`heavy_tails`).
 
     Args:
-        state: of the fit.
+        state: where the fit stands.
         block: 0 in-plane, 1 coupling.
         there: `linear` of that block.
         posterior: solved from it.
@@ -57,7 +57,7 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
     square = of_readings(state, block, there, posterior) ** 2
     square += np.sum(of_sizes(state, block, there) ** 2, axis=1)
     tails = moments(there.normal, there.groups, there.start)
-    # mean square about the stated numbers, beyond the posterior's
+    # mean square about the numbers as they are stated, beyond the posterior's
     off = np.diag(tails.covariance) + (tails.mean - posterior.values) ** 2
     square += np.maximum(off - posterior.sigma**2, 0.0)
     prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
@@ -65,32 +65,33 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
 
 
 def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
-    """Posterior errors, widened for columns or BPMs that contradict all others; see `stated`."""
+    """Posterior errors, widened where single columns, or monitors, contradict all others; see
+    `stated`."""
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     found = LinearFit.of(there.normal.matrix, covariance)
     return _widened(state, block, there, posterior, found)
 
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
-    """What unknown prior scales add to the covariance, rejected families included: F, of F F^T,
-    [parameter, direction]; see `stated`."""
+    """What sizes of families add to the covariance that are unknown, of those too that were tried
+    and not needed: F, of F F^T, [parameter, direction]; see `stated`."""
     tried = [
         family
-        for family in state.rejected
+        for family in state.unneeded
         if family.block == block and family.per == "ring" and family.size(state.data) <= MAX_MEMBERS
     ]
     whole = linear(allow(state, tried), block) if tried else there
     gone = [group.name for family in tried for group in family.groups(state.data)]
     more = scale_uncertainty.scale_covariance(whole.normal, whole.groups, whole.start, gone)
-    return more[: len(there.start)]  # rejected families follow
+    return more[: len(there.start)]  # what was tried comes after
 
 
 def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> float:
-    """The factor by which the variance of a single fault's amount grows by this.
+    """By how much the variance of the amount of what is wrong alone grows so, as a factor.
 
     Args:
         state, there, posterior: as in `stated`; its block is that of the cause.
-        one: has its own prior in them.
+        one: has a prior of its own in them.
     """
     ends = np.cumsum([group.basis.shape[1] for group in posterior.groups])
     at = int(ends[[group.name for group in posterior.groups].index(one.name)]) - 1
@@ -109,7 +110,7 @@ def _widened(
     rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.by_ring)
     weights = weight(state, block)
     left = np.where(weights > 0, data.pick(state.at.left, block), 0.0)
-    moved = posterior.values - there.start  # rounds end before full precision
+    moved = posterior.values - there.start  # rounds end before the last digit
     for column in np.flatnonzero(weights.any(axis=1)):
         seen = np.flatnonzero(weights[column])
         left[column, seen] -= rows.times(np.full(len(seen), column), seen, moved[:, None])[:, 0]

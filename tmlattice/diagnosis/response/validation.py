@@ -1,8 +1,8 @@
-"""The validation of a hierarchical fit of an orbit response, on correctors that were not fitted.
+"""Who judges a dense fit of an orbit response: correctors that were not fitted.
 
-For each of them the kick is estimated from half of the BPMs, and the prediction is scored on the
-other half. The outer validation set (`score`) selects nothing. The inner one (`inner`) selects
-families, with standard errors, because it may have only four correctors.
+Of each of them only the kick is taken, from half of the monitors; the other half judges. Those that
+are held out for good (`score`) choose nothing; those that choose among families (`inner`) say too
+how well they know it, for they may be four.
 """
 
 from dataclasses import dataclass, replace
@@ -17,33 +17,32 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
-"""Weights of the log rms of held-out correctors (in-plane, coupling, RF: one reading a BPM), and
-the largest fall of their sum without an accepted step. The marginal likelihood alone would take
-model discrepancy for noise, and fit it."""
-CORRECTORS = np.array([1.0, 1.0, 0.0])
-"""The same, of correctors alone: all BPMs share the jitter of the RF's orbit."""
+"""How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: one
+reading a monitor), and by how much their sum may fall without a step that stays all the same:
+evidence takes what the model lacks for noise, and gladly fits it."""
 FLOOR = np.array([0.1, 0.1, 1.0])
-"""Share of the noise that is added to the residuals in-plane, across and of the RF, so that
-residuals below it count alike."""
-SURELY = 1.0
-"""Standard errors of a fall from which on it counts."""
+"""Of the noise, beside what is left in-plane, across and of the RF: what is left of nothing (a
+model's own orbit) is no better for being less."""
+SURELY, WORTH = 1.0, 0.05
+"""Standard errors of a fall from which on it counts; and how much one is at least that refuses what
+most of the readings ask for."""
 
 
 class Chi2(NamedTuple):
-    """A sum of squares in units of the noise, with the number of readings."""
+    """A sum of squares in units of the noise, and of how many readings."""
 
     total: float
     readings: int
 
     @property
     def per_reading(self) -> float:
-        """Chi-square per reading; 1 is noise."""
+        """1 is noise."""
         return self.total / max(self.readings, 1)
 
 
 @dataclass(frozen=True)
 class Score:
-    """Validation scores: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
+    """What the judges say: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
 
     in_plane: float
     coupling: float
@@ -55,7 +54,7 @@ class Score:
 
 
 class _Missed(NamedTuple):
-    """Residuals of the far readings of held-out correctors, m, column by column.
+    """What the far readings of correctors that were not fitted miss, m, column by column.
 
     Attributes:
         inside: in-plane.
@@ -81,8 +80,15 @@ class _Missed(NamedTuple):
     rf_monitors: Flags
 
 
-def _missed(state: State, validation: Flags, rf: Flags | None = None) -> _Missed:
-    """Validation scores of held-out correctors; see `score`."""
+def _missed(
+    state: State, validation: Flags, rf: Flags | None = None, jitter: Array | None = None
+) -> _Missed:
+    """What correctors that were not fitted say; see `score`.
+
+    Args:
+        state, judges, rf: as there.
+        jitter: orbits that a step may have some of, see `State`, which near monitors tell too.
+    """
     data, at, half = state.data, state.at, state.split.half
     read = at.seen(at.beam)
     straight, across = data.pick(read), data.pick(read, 1)
@@ -93,37 +99,53 @@ def _missed(state: State, validation: Flags, rf: Flags | None = None) -> _Missed
     variance, variance_across = (data.noise_of(block) ** 2 for block in (0, 1))
     inside, jumped, outside, rolled, squares, spread = [], [], [], [], [], []
     cross = []
+    moving = np.zeros((2, 0, data.shape[1])) if jitter is None else jitter
+    typical = np.median(data.noise, axis=0)
+
+    def still(left: Array, near: Flags, plane: int) -> Array:
+        """Without the jitter that near monitors tell."""
+        orbits = moving[plane].T
+        held = np.full(orbits.shape[1], typical[plane])
+        amounts, _ = amplitudes(orbits, left, near, near, held)
+        return np.asarray(left - orbits @ amounts)
+
     for c in np.flatnonzero(validation):
         seen = np.isfinite(orbits[c]) & state.good
         near, far = seen & half[c], seen & ~half[c]
         if not (near.any() and far.any()):
             continue
-        # all alike: model discrepancy is not the readings' noise
-        kick, miss = amplitudes(straight[c][:, None], orbits[c], near, far)
+        # all alike: what the model lacks is not the readings' noise
+        moved = moving[data.plane[c]].T
+        held = np.append(0.0, np.full(moved.shape[1], typical[data.plane[c]]))
+        kick, miss = amplitudes(np.column_stack([straight[c], moved]), orbits[c], near, far, held)
         inside.append(miss)
         squares.append(miss**2 / variance[c, far])
-        # the kick's error adds to the reading's
+        # the kick's own error stands beside the reading's
         spread.append(1 + straight[c, far] ** 2 / np.sum(straight[c, near] ** 2))
         jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
         left = orbits_across[c] - kick[0] * across[c]
         there = np.isfinite(left)
+        if moving.size and (near & there).any():
+            left = still(left, near & there, 1 - data.plane[c])
         outside.append(left[far & there])
         cross.append(outside[-1] ** 2 / variance_across[c, far & there])
         if rolls[c].any() and (near & there).any():
             rolled.append(amplitudes(rolls[c][:, None], left, near & there, far & there)[1])
     judge = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
-    of_rf = (orbits[-1] - straight[-1])[judge]
+    left = orbits[-1] - straight[-1]
+    near = state.good & np.isfinite(left) & half[-1] & ~judge
+    of_rf = (still(left, near, 0) if moving.size and near.any() else left)[judge]
     return _Missed(inside, outside, jumped, rolled, squares, cross, spread, of_rf,
                    of_rf**2 / variance[-1, judge], judge)  # fmt: skip
 
 
 def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
-    """Return the validation scores; each corrector's kick is estimated from its near BPMs.
+    """What correctors that were not fitted say; each has its kick from its near monitors.
 
     Args:
-        state: that is validated.
-        judges: the correctors of the validation set, [column].
-        rf: monitors that validate the RF's response; None: those that did not fit it.
+        state: that is judged.
+        judges: the correctors that judge, [column].
+        rf: monitors that judge the RF's response; None: those that did not fit it.
     """
     missed = _missed(state, validation, rf)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
@@ -143,7 +165,7 @@ def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
 
 
 class Validated(NamedTuple):
-    """Residuals of the inner validation set: sums of squares, m^2, and counts of readings.
+    """What those who choose are left with: sums of squares, m^2, and counts of readings.
 
     Attributes:
         columns: of each corrector, in-plane and across, [column, 2, (sum, count)].
@@ -155,7 +177,7 @@ class Validated(NamedTuple):
 
     @property
     def logs(self) -> Array:
-        """Log rms, in-plane, across and of the RF; NaN without readings."""
+        """Logarithms of rms, in-plane, across and of the RF; NaN of what nobody read."""
         return _logs(np.concatenate([self.columns.sum(axis=0), self.rf.sum(axis=0)[None]]))
 
 
@@ -164,17 +186,28 @@ def _logs(sums: Array) -> Array:
         return np.asarray(0.5 * np.log(sums[..., 0] / sums[..., 1]))
 
 
-def inner(state: State) -> Validated:
-    """In-plane, coupling and dispersion residuals of the inner correctors; each half of their BPMs
-    determines the kick once."""
+def inner(state: State, by_others: Array | None = None) -> Validated:
+    """In-plane, coupling and dispersion readings of correctors held out for it; each half of their
+    monitors gives the kick once, and a jitter of the beam that the state has: else one that the
+    judges have themselves would hide what is better.
+
+    Args:
+        state: that is judged.
+        by_others: what fitted monitors leave of the RF's orbit, `rf_by_others`: they judge too.
+    """
     other = replace(state, split=replace(state.split, half=~state.split.half))
-    said = [_missed(one, state.split.inner, state.split.inner_rf) for one in (state, other)]
+    said = [
+        _missed(one, state.split.inner, state.split.inner_rf, state.jitter)
+        for one in (state, other)
+    ]
     sums = [
         np.array([[[np.sum(own**2), len(own)] for own in pair]
                   for pair in zip(one.inside, one.outside, strict=True)])
         for one in said
     ]  # fmt: skip
     rf = np.zeros((len(state.good), 2))
+    if by_others is not None:
+        rf = np.stack([np.nan_to_num(by_others) ** 2, np.isfinite(by_others)], axis=1)
     rf[said[0].rf_monitors] = np.stack([said[0].rf ** 2, np.ones(len(said[0].rf))], axis=1)
     floor = (FLOOR * float(np.median(state.data.noise))) ** 2
     columns = sums[0] + sums[1]
@@ -183,19 +216,14 @@ def inner(state: State) -> Validated:
     return Validated(columns, rf)
 
 
-def lost(without: Validated, within: Validated, counts: Array = JUDGES) -> tuple[float, float]:
-    """The rise of the validation score, and its standard error by the jackknife over correctors and
-    BPMs of the RF's orbit. Entries without readings are omitted.
-
-    Args:
-        without, within: the two residuals.
-        counts: weights of in-plane, across and RF readings.
-    """
-    whole = float(np.nansum(counts * (without.logs - within.logs)))
+def lost(without: Validated, within: Validated) -> tuple[float, float]:
+    """By how much the judges' figures rise, and its standard error: by the jackknife, each
+    corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing."""
+    whole = float(np.nansum(JUDGES * (without.logs - within.logs)))
     variance = 0.0
     for now, then, weights in (
-        (within.columns, without.columns, counts[:2]),
-        (within.rf[:, None], without.rf[:, None], counts[2:]),
+        (within.columns, without.columns, JUDGES[:2]),
+        (within.rf[:, None], without.rf[:, None], JUDGES[2:]),
     ):
         judged = now[:, 0, 1] > 0
         if judged.sum() > 1:
@@ -205,6 +233,11 @@ def lost(without: Validated, within: Validated, counts: Array = JUDGES) -> tuple
     return whole, float(np.sqrt(variance))
 
 
-def against(said: tuple[float, float]) -> bool:
-    """Whether the validation score is better without, by the result of `lost`."""
-    return said[0] < -max(VETO, SURELY * said[1])
+def against(said: tuple[float, float], least: float = VETO) -> bool:
+    """Whether the judges would rather be without, by what `lost` says, and by so much at least."""
+    return said[0] < -max(least, SURELY * said[1])
+
+
+def in_favour(said: tuple[float, float]) -> bool:
+    """Whether they would rather be with, likewise."""
+    return against((-said[0], said[1]))

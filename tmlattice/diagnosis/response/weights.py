@@ -1,269 +1,217 @@
-"""Weights of the readings of a hierarchical fit, and the variance components that make them.
+"""For how much each reading of a dense fit counts: what the model lacks, and monitors that are bad.
 
->>> state = learnt(state, spent)
+>>> state = look(state, 0)
 >>> weight(state, 0)                               # 1 / variance, [column, monitor]
-
-Readings have Student's distribution about the model. Their variance is that of their noise, of the
-misfit of their column and of the misfit of their BPM. Each column also has amounts of common modes:
-waves of the closed orbit (beam jitter), a drift of the energy (the RF's orbit) and the place of its
-corrector's field. They are integrated out, see `inference.common`. All scales are learnt from the
-residuals.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.state import DRIFT, KINDS, PLACE, State
+from tmlattice.diagnosis.response.independent import independent
+from tmlattice.diagnosis.response.odd_readings import rf_shares, shares
+from tmlattice.diagnosis.response.state import State
 from tmlattice.inference.common import amounts, common, times_precision
-from tmlattice.inference.priors import Group
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-FREEDOM = 6.0
-"""Degrees of freedom of the readings' Student distribution."""
-TAILS = 4.0
-"""Degrees of freedom of the amounts of common modes."""
-COUNT = 10.0
-"""Number of a column's own readings that the typical column's misfit counts as; a misfit of zero
-counts as much for each BPM."""
-LEAST = 0.05
-"""Least misfit of a column, as a share of the noise."""
-DAMPING = 0.7
-"""Share of a step of the misfits that is taken: columns and monitors would else take turns."""
-MEDIAN_SQUARE = 0.455
-"""Median of chi-square of one degree of freedom."""
+BAD = 5.0
+"""A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
+SPARED = 0.1
+"""Of its readings: a monitor is not bad by the few worst of them alone; these are themselves."""
+FEW = 4
+"""Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
+TYPICAL = 10.0
+"""The median misfit of all columns counts as so many readings of each one's own."""
+LEAST = 0.2
+"""Of the noise: what the model lacks at least, and what noise is left beside a jitter."""
+ROUNDED = 1e-6
+"""Of the readings: two equal responses differ by less."""
+DISPERSION = "quadrupole_gradient"
+"""The family that makes the RF's orbit what it is. Before it is there, that orbit is off by many
+times what all others are, and would make the monitors' gains what fits it."""
+COUPLING = "skew_gradient"
+"""The family that makes the other plane's readings what they are."""
 
 
-class Spent(NamedTuple):
-    """Degrees of freedom of a block's parameters in its readings, and in the RF's."""
-
-    all: float
-    rf: float
-
-
-def used(state: State, block: int) -> Flags:
-    """Fitted readings, [column, monitor]."""
+def weight(state: State, block: int) -> Array:
+    """1 / variance of the readings that are fitted, [column, monitor]."""
     data, split = state.data, state.split
     use = np.isfinite(data.pick(data.orbits, block)) & state.good
     use[:-1] &= state.fitted[:-1, None]
     use[-1] &= split.half[-1]
     if state.exploring:
         use[-1] &= ~split.inner_rf
-    return np.asarray(use)
+    variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
+    count = np.array(np.broadcast_to(counts(state, block), use.shape))
+    if state.share is not None:
+        count *= state.share[block]
+    if state.rf_share is not None:
+        count[-1] *= state.rf_share[block]
+    return np.where(use, count / variance, 0.0)
 
 
-def variance(state: State, block: int) -> Array:
-    """Variance of each reading, without common modes and Student weights, m^2, [column,
-    monitor]."""
-    noise, plane = state.noise, state.data.plane_of(block)
-    return np.asarray(
-        state.data.noise_of(block) ** 2 + noise.column[block][:, None] + noise.monitor[block][plane]
-    )
+def taken(state: State, block: int) -> Array | None:
+    """What the beam's jitter takes from the weights, see `inference.common`, [column, monitor,
+    pattern]; None where the beam stood still."""
+    return None if state.jitter is None else _common(state, block)[0]
 
 
-def weight(state: State, block: int) -> Array:
-    """1 / variance of the fitted readings, 0 of the others, [column, monitor]."""
-    return np.where(used(state, block), state.noise.share[block] / variance(state, block), 0.0)
-
-
-def patterns(state: State, block: int) -> Array:
-    """Common modes of each column, with their usual size, m, [column, pattern, monitor]."""
-    data, at, noise = state.data, state.at, state.noise
-    plane = data.plane_of(block)
-    out = np.zeros((data.shape[0], noise.size.shape[2], data.shape[1]))
-    if "waves" in noise.kinds and block == 1:
-        out[:, KINDS["waves"]] = noise.waves[plane]
-    if "drift" in noise.kinds:
-        out[:, KINDS["drift"]] = at.seen(at.beam)[-1].T[plane][:, None]
-    if "place" in noise.kinds and block == 0:
-        kicks = data.kicks * (1 + at.errors.calibration)
-        out[:, KINDS["place"]] = (data.pick(at.seen(at.jumps)) * kicks[:, None])[:, None]
-    out *= noise.size[block][:, :, None]
-    out[-1] = 0.0  # the RF's orbit is one step: nothing is common to it and others
-    return out
-
-
-def taken(state: State, block: int) -> Array:
-    """Reduction of the weights by common modes, see `inference.common`, [column, monitor,
-    pattern]."""
-    return common(weight(state, block), patterns(state, block))[0]
+def _common(state: State, block: int) -> tuple[Array, Array]:
+    """What jitter takes from the weights, and its share of the log evidence."""
+    assert state.jitter is not None
+    count = counts(state, block)
+    alone = weight(state, block) / count
+    own, scale = common(alone, state.jitter[state.data.plane_of(block)])
+    return own * np.sqrt(count)[:, :, None], count[:, 0] * scale
 
 
 def weighed(state: State, block: int, left: Array) -> Array:
-    """Inverse covariance of the fitted readings times the residual, 1/m, [column, monitor]."""
-    return times_precision(weight(state, block), taken(state, block), left)
+    """Inverse covariance of the readings that are fitted times what is left, 1/m, [column,
+    monitor]."""
+    weights, own = weight(state, block), taken(state, block)
+    left = np.where(weights > 0, left, 0.0)
+    return weights * left if own is None else times_precision(weights, own, left)
 
 
-def log_likelihood(state: State, block: int) -> float:
-    """Log density of the residuals, common modes integrated out (Laplace), up to a constant of the
-    data."""
-    use = used(state, block)
-    if not use.any():
-        return 0.0
-    weights, modes = weight(state, block), patterns(state, block)
-    left = np.where(use, state.data.pick(state.at.left, block), 0.0)
-    likely = amounts(weights, modes, left)[0]
-    left, v = left - np.einsum("ck,ckm->cm", likely, modes), variance(state, block)
-    each = (FREEDOM + 1) / 2 * np.log1p(left**2 / (FREEDOM * v)) + 0.5 * np.log(v)
-    total = float(each[use].sum()) + 0.5 * float(np.sum(likely**2))
-    return -total - 0.5 * float(common(weights, modes)[1].sum())
+def log_scale(state: State, block: int) -> float:
+    """Logarithm of the determinant of that inverse covariance."""
+    weights = weight(state, block)
+    use = weights > 0
+    count = np.broadcast_to(counts(state, block), use.shape)[use]
+    total = float(count @ np.log(weights[use] / count))
+    return total if state.jitter is None else total - float(_common(state, block)[1].sum())
 
 
-def learnt(state: State, spent: dict[int, Spent], alike: bool = False) -> State:
-    """The state with variance components from the residuals.
+def _without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array]:
+    """What is left beside the likeliest jitter of each column, and the readings' noise, which
+    stated or learnt has the jitter in it, beside it; m, [column, monitor]."""
+    noise = state.data.noise_of(block)
+    if state.jitter is None:
+        return left, noise
+    patterns = state.jitter[state.data.plane_of(block)]
+    own = amounts(weight(state, block) / counts(state, block), patterns, left)[0]
+    alone = np.maximum(noise**2 - np.sum(patterns**2, axis=1), (LEAST * noise) ** 2)
+    return left - np.einsum("ck,ckm->cm", own, patterns), np.sqrt(alone)
+
+
+def counts(state: State, block: int) -> Array:
+    """As how many readings each one counts, [column, 1]."""
+    plane = state.data.plane_of(block)
+    own = np.ones(len(plane)) if state.independent is None else state.independent[block, plane]
+    return np.asarray(own[:, None])
+
+
+def look(state: State, block: int) -> State:
+    """What the model lacks now; and the monitors that are bad, their own gains apart."""
+    data = state.data
+    use = weight(state, block) > 0
+    left = np.where(use, data.pick(state.at.left, block), np.nan)
+    left, alone = _without_jitter(state, block, left)
+    if state.share is not None:
+        state = replace(state, share=shares(state, block, left[:-1]))
+    typical = float(np.nanmedian(np.abs(left[:-1, state.good]))) / 0.6745
+    noise = float(np.median(data.noise))
+    share = 1.0 if state.share is None else state.share[block]
+    shared = TYPICAL * typical**2 + np.nansum(share * left**2, axis=1)
+    squares = shared / (TYPICAL + use.sum(axis=1))
+    if state.allows(DISPERSION):
+        squares[-1] = typical**2  # it is one column among many, and counts like any
+        state = replace(state, rf_share=rf_shares(state, block, left[-1]))
+    lacking = state.lacking.copy()
+    lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
+    good = state.good & _good_across(state) if block else good_monitors(state)
+    return _independent(replace(state, lacking=lacking, good=good), block, left, alone)
+
+
+def _independent(state: State, block: int, left: Array, noise: Array) -> State:
+    """With the share of independent readings, where that is looked at: not before there are
+    gradients, for all that they make is waves."""
+    if state.independent is None or not state.allows(DISPERSION):
+        return state
+    own, shares = state.independent.copy(), state.share
+    read = left[:-1] if shares is None else left[:-1] * np.sqrt(shares[block, :-1])
+    for p in (0, 1):
+        rows = state.data.plane_of(block)[:-1] == p
+        own[block, p] = independent(read[rows], noise[:-1][rows])
+    return replace(state, independent=own)
+
+
+def good_monitors(state: State, bad: float = BAD) -> Flags:
+    """Those that read, in the plane that is kicked, what the others make likely, [monitor].
 
     Args:
-        state: after a round.
-        spent: degrees of freedom of each block's parameters.
-        alike: all columns and all monitors have the same misfit: which of them are wrong is unknown
-            before convergence.
+        state: that is fitted.
+        bad: so many times the median rms residual, gains fitted, is a bad monitor's.
     """
-    old = state.noise
-    new = replace(
-        old, column=old.column.copy(), monitor=old.monitor.copy(), share=old.share.copy(),
-        size=old.size.copy(), scale=old.scale.copy(),
-    )  # fmt: skip
-    state = replace(state, noise=new)
-    for block in (0, 1):
-        use = used(state, block)
-        if not use.any():
+    data = state.data
+    read, orbits = data.pick(state.at.read), data.pick(data.orbits)
+    ratio = np.zeros(data.shape[1])
+    for p in (0, 1):
+        rows = state.fitted & (data.plane == p)
+        if rows.sum() < FEW:
             continue
-        weights, modes = weight(state, block), patterns(state, block)
-        left = np.where(use, state.data.pick(state.at.left, block), 0.0)
-        likely, covariance = amounts(weights, modes, left)
-        left = left - np.einsum("ck,ckm->cm", likely, modes)
-        kept = np.einsum("ckk->ck", covariance)
-        _learn_modes(state, block, use, likely, kept, alike)
-        own = spent.get(block, Spent(0.0, 0.0))
-        own = own._replace(all=own.all + float(np.sum(1 - kept[use.any(axis=1)])))
-        _learn_misfits(state, block, use, left, own, alike)
-    column, monitor = (
-        before + DAMPING * (after - before)
-        for before, after in ((old.column, new.column), (old.monitor, new.monitor))
-    )
-    return replace(state, noise=replace(new, column=column, monitor=monitor))
+        own = np.full(data.shape[1], np.inf)
+        rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
+        for spared in (0.0, SPARED):
+            rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
+            rms[gain < 0.2] = np.inf  # reversed, until gains come in
+            read_at_all = count > 0  # what was never read says nothing of the other plane
+            typical = max(np.median(rms[read_at_all]), rounded) if read_at_all.any() else np.inf
+            # else the fit is astray, not half of the monitors
+            share = rms / typical if np.isfinite(typical) else np.zeros_like(rms)
+            own = np.minimum(own, np.where(read_at_all, share, 0.0))
+        ratio = np.maximum(ratio, own)
+    return np.asarray(ratio <= bad)
 
 
-def with_waves(state: State) -> State:
-    """Return the state with orbit waves in the plane that is not kicked, as a common mode of each
-    step. Their first size is that of a least-squares fit to the residuals: given discrepancies that
-    contain them already, they would stay at zero."""
-    old, block = state.noise, 1
-    noise = replace(
-        old, kinds=(*old.kinds, "waves"), column=old.column.copy(), size=old.size.copy(),
-        scale=old.scale.copy(),
-    )  # fmt: skip
-    use, plane = used(state, block), state.data.plane_of(block)
-    left = np.where(use, state.data.pick(state.at.left, block), 0.0)
-    likely = np.full((len(use), noise.waves.shape[1]), np.nan)
-    for c in np.flatnonzero(use[:-1].sum(axis=1) > 2 * noise.waves.shape[1]):
-        seen = use[c]
-        modes = noise.waves[plane[c]][:, seen].T
-        likely[c] = np.linalg.lstsq(modes, left[c, seen], rcond=None)[0]
-        rest = np.sum((left[c, seen] - modes @ likely[c]) ** 2) / (seen.sum() - modes.shape[1])
-        square = rest - np.mean(state.data.noise_of(block)[c, seen] ** 2)
-        noise.column[block, c] = min(noise.column[block, c], max(square, _floor(state)))
-    for read in (0, 1):
-        own = likely[plane == read]
-        own = own[np.isfinite(own[:, 0])]
-        if len(own):
-            square = np.mean(np.median(own**2, axis=0))
-            noise.scale[block, read, 0] = float(np.sqrt(max(square, _floor(state))))
-        noise.size[block, plane == read, KINDS["waves"]] = noise.scale[block, read, 0]
-    return replace(state, noise=noise)
+def sound_monitors(state: State) -> Flags:
+    """Those that read what is likely in both planes, [monitor]."""
+    return good_monitors(state) & _good_across(state)
 
 
-def _floor(state: State) -> float:
-    """Least misfit of a column, m^2."""
-    return (LEAST * float(np.median(state.data.noise))) ** 2
+def _good_across(state: State) -> Flags:
+    """Those that read in the other plane what is usual, their own gains apart, once skew gradients
+    and rolls say what that is."""
+    data = state.data
+    good = np.ones(data.shape[1], dtype=bool)
+    if not state.allows(COUPLING):
+        return good
+    read, orbits = data.pick(state.at.read, 1), data.pick(data.orbits, 1)
+    for p in (0, 1):
+        rows = state.fitted & (data.plane == p)
+        if rows.sum() < FEW:
+            continue
+        bad = np.ones(data.shape[1], dtype=bool)
+        for spared in (0.0, SPARED):
+            rms, _, count = _given_own_gain(read[rows], orbits[rows], spared)
+            usual = rms[(count > 0) & state.good]
+            bad &= rms > BAD * np.median(usual) if len(usual) else False
+        good &= ~bad
+    return good
 
 
-def _learn_modes(
-    state: State, block: int, use: Flags, likely: Array, kept: Array, alike: bool
-) -> None:
-    """Update the scales of the common modes, in place.
+def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
+    """What each monitor leaves with a gain of its own, rms, m; the gain, over those that it has;
+    and of how many readings, [monitor].
 
     Args:
-        state, block, use, alike: as in `learnt`.
-        likely: amounts in units of their sizes, [column, pattern].
-        kept: share of each amount's prior variance that the readings leave, [column, pattern].
+        read, orbits: by the model and measured, m, [column, monitor].
+        spared: share of a monitor's readings, its worst ones, that do not count.
     """
-    noise, plane = state.noise, state.data.plane_of(block)
-    first = (float(np.median(state.data.noise)), DRIFT, PLACE)
-    there = np.arange(noise.size.shape[2])
-    for read in (0, 1):
-        mine = np.flatnonzero((use.any(axis=1) & (plane == read))[:-1])
-        for kind, (name, which) in enumerate(KINDS.items()):
-            own = np.ix_(mine, there[which])
-            now = noise.size[block][own]
-            if not now.size or name not in noise.kinds or (name == "waves" and block == 0):
-                continue
-            group = Group(
-                name, np.eye(now.size), noise.scale[block, read, kind],
-                np.inf if alike else TAILS, each=now.ravel(), first=first[kind],
-            )  # fmt: skip
-            group = group.learn(((now * likely[own]) ** 2).ravel(), kept[own].ravel())
-            noise.scale[block, read, kind] = group.rms
-            noise.size[block][own] = group.scale.reshape(now.shape)
+    seen = np.isfinite(orbits)
+    if spared:
+        left = np.abs(orbits - read * _gain(read, orbits, seen))
+        worst_last = np.argsort(np.argsort(np.where(seen, left, np.inf), axis=0), axis=0)
+        seen &= worst_last < np.ceil((1 - spared) * seen.sum(axis=0))
+    gain = _gain(read, orbits, seen)
+    count = seen.sum(axis=0)
+    left = np.where(seen, orbits - gain * read, 0.0)
+    return np.sqrt((left**2).sum(axis=0) / np.maximum(count, 1)), gain, count
 
 
-def _learn_misfits(
-    state: State, block: int, use: Flags, left: Array, spent: Spent, alike: bool
-) -> None:
-    """Update Student weights, and misfits of columns and BPMs by moments, in place.
-
-    Args:
-        state, block, use, alike: as in `learnt`.
-        left: by the fit and the common modes, m, [column, monitor].
-        spent: degrees of freedom.
-    """
-    noise, data, plane = state.noise, state.data, state.data.plane_of(block)
-    count = use.sum(axis=1)
-    share = max(1 - (spent.all - spent.rf) / max(int(count[:-1].sum()), 1), 0.1)
-    free = count * np.append(np.full(len(count) - 1, share), 0.0)
-    free[-1] = max(count[-1] - spent.rf, 0.01 * count[-1])
-    grown = (count / np.maximum(free, 1e-9))[:, None]
-    v = variance(state, block)
-    # a reading is an outlier relative to its column and its BPM, not because
-    # these are outliers
-    usual = v if alike else np.maximum(v, _typical(left, use)[:, None])
-    for read in (0, 1) if not alike else ():
-        rows = plane == read
-        usual[rows] = np.maximum(usual[rows], _typical(left[rows].T, use[rows].T))
-    noise.share[block] = np.where(
-        use, np.minimum((FREEDOM + 1) / (FREEDOM + left**2 * grown / usual), 1.0), 1.0
-    )
-    square = noise.share[block] * left**2 * grown - data.noise_of(block) ** 2
-    floor = _floor(state)
-    before = noise.monitor[block].copy()
-    for _ in range(3):  # columns and monitors explain the same squares
-        rest = np.where(use, square - noise.monitor[block][plane], 0.0).sum(axis=1)
-        rest /= np.maximum(count, 1)
-        fitted = use.any(axis=1)
-        typical = max(float(np.median(rest[fitted])), 0.0)
-        own = (COUNT * typical + free * rest) / (COUNT + free)
-        noise.column[block] = np.maximum(typical if alike else own, floor)
-        noise.column[block, -1] = max(typical, floor)  # a single orbit shows no misfit
-        if alike:
-            return
-        for read in (0, 1):
-            rows = use & (plane == read)[:, None]
-            if not rows.any():
-                continue
-            w = np.where(rows, (v - before[plane]) ** -2.0, 0.0)
-            w /= float(w[rows].mean())
-            excess = np.where(rows, square - noise.column[block][:, None], 0.0)
-            own = (w * excess).sum(axis=0) / (COUNT + w.sum(axis=0))
-            noise.monitor[block, read] = np.maximum(own, 0.0)
-
-
-def _typical(left: Array, use: Flags) -> Array:
-    """Mean square of each row, by the median, m^2, [row]."""
-    out = np.zeros(len(left))
-    for row in np.flatnonzero(use.any(axis=1)):
-        out[row] = np.median(left[row, use[row]] ** 2) / MEDIAN_SQUARE
-    return out
+def _gain(read: Array, orbits: Array, seen: Flags) -> Array:
+    u, d = np.where(seen, read, 0), np.where(seen, orbits, 0)
+    return np.asarray((u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30))
