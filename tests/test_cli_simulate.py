@@ -104,7 +104,7 @@ def test_simulate_as_a_process_is_silent_when_asked_and_ends_with_2(tmp_path):
         (["--effect", "quadrupole_gradient qd::5 nan"], "the amount is nan"),
         (["--effect", "energy_offset qd::5 1e-3"], "leave 'qd::5' out"),
         (["--background", "monitor_rol"], "did you mean 'monitor_roll'"),
-        (["--background", "energy_offset"], "say energy_offset=RMS"),
+        (["--background", "energy_offset"], "give energy_offset=RMS"),
         (["--background", "monitor_roll=much"], "'much' is no rms"),
         (["--background", "all=-1"], "zero or more"),
         (["--shots", "0"], "--shots"),

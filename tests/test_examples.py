@@ -138,7 +138,7 @@ def test_a_machine_file_from_a_lattice_and_a_file_of_data(place, tmp_path, monke
     names = {}
     exec("\n".join(blocks("machine_file.md", "python")), names)
     (finding,) = names["diagnosis"].findings
-    right(finding.remedy)
+    right(finding.recommended_action)
 
 
 def test_what_several_measurements_say_together(place, monkeypatch):

@@ -716,7 +716,7 @@ def test_wide_table(lattice, tmp_path):
         ("corrector,monitor,x,y\ncor_h::0,bpm::0,1e-4,0", "no column 'kick'"),
         ("corrector,monitor,x [furlong],y,kick\ncor_h::0,bpm::0,1e-4,0,1e-4", "furlong"),
         ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,much,0,1e-4", "row 2: 'much' is no number"),
-        ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,1e-4,0", "row 2: 4 fields"),
+        ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,1e-4,0", "line 2: 4 fields"),
         ("corrector,monitor,x,y,kick\nqf::0,bpm::0,1e-4,0,1e-4", "no corrector"),
         ("corrector,monitor,x,y,kick\ncor_h::0,bpm::77,1e-4,0,1e-4", "bpm::77"),
         ("monitor,plane,cor_h::0\nbpm::0,z,1.0", "plane 'z'"),

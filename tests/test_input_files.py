@@ -227,7 +227,7 @@ def test_a_cause_that_stands_twice_in_a_calibration_is_refused(tmp_path, small_r
         if whole:
             assert len(read_calibration(path, small_ring)) == 1
             continue
-        with pytest.raises(Exception, match="stands twice"):
+        with pytest.raises(Exception, match="occurs twice"):
             read_calibration(path, small_ring)
 
 

@@ -121,7 +121,7 @@ def test_what_takes_no_part_is_told(small_ring):
     told = diagnose(small_ring, measured, holdout=0).warnings
     silent, spiked = _names(small_ring)[12], _names(small_ring)[7]
     assert any("no reading" in one and f" {silent}:" in one for one in told)
-    assert any("spikes" in one and one.endswith(f" {spiked}") for one in told)
+    assert any("outliers" in one and one.endswith(f" {spiked}") for one in told)
 
 
 def test_what_is_left_where_nothing_is_explained_is_what_was_there(small_ring):

@@ -79,7 +79,7 @@ def rf_zero(measured, ring):
     ("change", "words"),
     [
         (zeros_across, "no corrector is read in the other plane"),
-        (of_a_model, "is a model's and no measurement"),
+        (of_a_model, "it is simulated, not measured"),
     ],
 )
 def test_it_is_said_and_the_fit_is_as_good(ring, measured, change, words):

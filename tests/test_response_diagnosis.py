@@ -349,7 +349,7 @@ def test_a_cause_s_rows_are_what_it_does_to_the_readings(small_ring, measured, c
 
 def test_what_is_missing_is_said(small_ring, measured):
     sparse = measured.select(monitors=measured.monitors[:4])
-    with pytest.raises(MeasurementError, match="too few columns or monitors tell it: state it"):
+    with pytest.raises(MeasurementError, match="too few columns or monitors determine it: state"):
         diagnose(small_ring, replace(sparse, noise=None))
     with pytest.raises(MeasurementError, match="cannot be split"):
         diagnose(small_ring, measured.select(correctors=measured.correctors[:2]))
@@ -630,7 +630,7 @@ def test_a_family_that_is_doubted_draws_no_other_one_along(small_ring):
     found, without = (fit_steps(data, split, some) for some in (trials, trials[:1] + trials[2:]))
     assert [own.families[0].name for own in trials] == [asked[0], asked[2], asked[1]]
     assert "energy_spread" in [step.effect for step in found.rejected_steps]
-    assert any("an energy spread of" in said for said in found.said)
+    assert any("an energy spread of" in said for said in found.messages)
     assert found.state.values.keys() == without.state.values.keys()
     for name, values in found.state.values.items():
         assert np.abs(values - without.state.values[name]).max() < 1e-5

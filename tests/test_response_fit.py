@@ -105,7 +105,7 @@ def test_trust_shortens_the_step_and_not_the_result(problem):
     group = [Group("all", np.eye(size), 0.2)]
     free = solve(normal, group, rounds=0).values
     trust = np.full(size, 0.002)
-    short = solve(normal, group, trust=trust, rounds=0).values
+    short = solve(normal, group, step_bound=trust, rounds=0).values
     assert np.linalg.norm(short) < 0.9 * np.linalg.norm(free)
     there = normal_equations(*problem)
     moved = there.__class__(there.matrix, there.vector - there.matrix @ free)

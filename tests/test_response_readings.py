@@ -90,7 +90,7 @@ def test_readings_that_went_wrong_are_left_out_by_the_fit_and_their_monitors_sta
     data = response_data(small_ring, replace(clean, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
     fit = fit_steps(data, split, STEPS[:3])
-    (said,) = fit.said
+    (said,) = fit.messages
     assert said.startswith("single readings that differ from the fit by 20 times")
     assert "left out: 12" in said
     assert np.isnan(fit.state.data.orbits).sum() == 12
@@ -111,7 +111,7 @@ def test_a_tenth_of_the_readings_that_a_step_has_are_no_single_ones(
     data = response_data(small_ring, replace(clean, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
     fit = fit_steps(data, split, STEPS[:3])
-    assert any(said.startswith("single readings") for said in fit.said) == alone
+    assert any(said.startswith("single readings") for said in fit.messages) == alone
 
 
 def lagging(response, planes, columns, late):
@@ -131,9 +131,9 @@ def test_steps_that_some_monitors_read_too_early_are_left_out_and_named(small_ri
     late = np.arange(0, clean.response.shape[1], 2)
     wrong = replace(clean, response=lagging(clean.response, clean.planes, columns, late))
     data = response_data(small_ring, wrong)
-    assert not fit_steps(data, split, [STEPS[0], STEPS[2]]).said  # gains may break triples, too
+    assert not fit_steps(data, split, [STEPS[0], STEPS[2]]).messages  # gains may break triples, too
     fit = fit_steps(data, split, STEPS[:3])
-    (said,) = fit.said
+    (said,) = fit.messages
     told_of = said.split("left out: ")[1].split(";")[0].split(", ")
     assert sorted(told_of) == sorted(names[c] for c in columns)
     assert fit.steps[-1].heldout_chi2_per_dof < 1.5
@@ -153,7 +153,7 @@ def test_a_step_whose_calibration_was_a_wrong_guess_is_not_odd(small_ring, clean
     bent[column, ::2] = 0.3 * data.orbits[column, ::2]  # neighbours contradict each other
     far = replace(state, at=Predicted(data, state.at.errors, bent)).moved(values)
     assert inconsistent(far)[column]
-    assert [own.said for own in odd_steps(far)] == [(), ()]
+    assert [own.messages for own in odd_steps(far)] == [(), ()]
 
 
 def test_a_kick_elsewhere_is_an_orbit(small_ring, clean):
@@ -187,7 +187,7 @@ def test_a_larger_step_is_not_odd(small_ring):
     data = response_data(small_ring, replace(measured, response=response, kicks=kicks))
     split = split_columns(data, 0.2, np.random.default_rng(1))
     steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS - {"monitor_roll"}]
-    assert fit_steps(data, split, steps).said == ()
+    assert fit_steps(data, split, steps).messages == ()
 
 
 def test_a_step_with_another_kick_in_it_is_named_and_not_read_in_that_plane(small_ring, clean):
@@ -208,7 +208,7 @@ def test_a_step_with_another_kick_in_it_is_named_and_not_read_in_that_plane(smal
     split = split_columns(data, 0.2, np.random.default_rng(1))
     steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS]
     fit = fit_steps(data, split, steps)
-    (said,) = fit.said
+    (said,) = fit.messages
     assert all(f"{name} (" in said for name in ("v2", "v4"))
     assert said.count(" µrad in ") == 2
     readings = np.isfinite(fit.state.data.orbits[:-1]).any(axis=1)
@@ -273,7 +273,7 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
 
     still, told = found(measured), found(moved)
     assert still.state.jitter is None
-    (said,) = (one for one in told.said if "the beam moved" in one)
+    (said,) = (one for one in told.messages if "the beam moved" in one)
     assert f"rms in {plane} (as from " in said
     assert f"rms in {'xy'[rests]}" not in said
     patterns = told.state.jitter[moves]

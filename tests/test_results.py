@@ -219,7 +219,7 @@ def SMALL_RING():
 
 
 # --- pickles --------------------------------------------------------------------------------------
-def test_every_public_result_is_pickled_and_copied(diagnoses, small_ring, small_network):
+def test_every_public_result_is_pickled_and_copied(diagnoses, small_ring, small_network, tmp_path):
     """What it says of itself, and its JSON, are the same; a class without a case fails."""
     from tmlattice.diagnosis.data_checks import check_data
 
@@ -230,6 +230,8 @@ def test_every_public_result_is_pickled_and_copied(diagnoses, small_ring, small_
     states = small_network.track([[1e-5, 0, 1e-5, 0]], turns=64)
     quick = {"epochs": 3, "progress": False}
     step = tmlattice.RfStep(5e8, 100, 10.0, orbits.orbit[0])
+    machine = tmp_path / "tmlattice.toml"
+    machine.write_text('[lattice]\nfile = "petra3"\n')
     results = [
         small_ring, small_ring.magnets[0], FAULT, *diagnoses.values(), *found.findings,
         measured, response(small_ring), orbits, simulate_tunes(small_ring).measured, step,
@@ -243,6 +245,7 @@ def test_every_public_result_is_pickled_and_copied(diagnoses, small_ring, small_
         tmlattice.simulate(small_ring, [FAULT]), tmlattice.Machine(small_ring),
         check_data(small_ring, measured), tmlattice.compare(small_ring, small_ring),
         tmlattice.import_data(measured.to_dataframe(), ring=small_ring),
+        tmlattice.load_machine_file(machine),
     ]  # fmt: skip
     for one in results:
         for other in (pickle.loads(pickle.dumps(one)), copy.deepcopy(one)):

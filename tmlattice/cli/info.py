@@ -64,11 +64,12 @@ def _facts(ring: "Ring") -> dict[str, Any]:
         "problem": None,
     }
     try:
-        functions = twiss(ring)
+        chain = Chain.from_ring(ring, 6)  # its maps are in the cache
+        functions = twiss(chain)
         facts["tunes"] = functions.total_tunes.tolist()
         facts["beta_max"] = functions.beta.max(axis=0).tolist()
         facts["closed_orbit_max"] = [float(abs(own).max()) for own in (functions.x, functions.y)]
-        energy_effects = off_momentum(Chain.from_ring(ring, 6), ring.length)
+        energy_effects = off_momentum(chain, ring.length)
         # per momentum, not per energy dE / (p0 c) = beta delta; and of the path, not of its time
         beta, lag = (1.0, 0.0) if ring.gamma > 1e3 else (ring.beta, ring.gamma**-2)
         facts["chromaticity"] = (beta * energy_effects.chromaticity).tolist()

@@ -74,7 +74,7 @@ class Weighed:
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in the diagnosis."""
-        return {k: v for k, v in vars(self).items() if k != "unit"}
+        return dict(vars(self))
 
 
 HELPS = 0.98
