@@ -386,7 +386,7 @@ def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):
     assert {own["element"] for own in document["findings"]} == {"qf", "QD::5"}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Since the reference" in page
-    assert "what the reference leaves of it" in page
+    assert "residuals of the reference and of the result" in page
     wrong = CliRunner().invoke(tmlattice, [*words, "--lattice-out", str(tmp_path / "r.json")])
     assert wrong.exit_code == 2
     assert "no meaning for a change since a reference" in wrong.output
