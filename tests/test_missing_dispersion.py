@@ -260,7 +260,7 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
     for row, said in (
         ('{"element": "QF::1", "x": 0, "y": 0}', "is a quadrupole"),
         ('{"element": "v1", "x": 1e999, "y": 0}', "is no number"),
-        ('{"element": "v1", "x": 0, "y": 0}, {"element": "v1", "x": 0, "y": 0}', "stands twice"),
+        ('{"element": "v1", "x": 0, "y": 0}, {"element": "v1", "x": 0, "y": 0}', "occurs twice"),
     ):
         other = tmp_path / "other.json"
         other.write_text(

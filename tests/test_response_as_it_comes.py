@@ -107,7 +107,7 @@ def test_a_noise_of_a_default_is_not_explained_by_a_few_causes(ring, measured):
     wrong = replace(measured, noise=10 * measured.noise)
     result = diagnose(ring, wrong)
     assert left(result) < 2.5
-    assert said(result, "it is too large, or a jitter of the beam")
+    assert said(result, "the stated noise is too large, or includes beam jitter")
     assert not result.findings
 
 

@@ -60,7 +60,7 @@ def of_plane(plane):
     [
         (in_plane_alone, "no corrector is read in the other plane"),
         (of_plane("y"), "no corrector kicks in x"),
-        (y_monitors, "no monitor reads x"),
+        (y_monitors, "no BPM reads x"),
     ],
     ids=["in-plane readings alone", "y alone", "monitors of y alone"],
 )

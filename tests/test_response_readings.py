@@ -305,7 +305,7 @@ def test_an_rf_orbit_that_no_monitor_read_is_left_out(small_ring, clean):
     data = response_data(small_ring, copied)
     assert np.isnan(data.orbits[-1]).all()
     (said,) = assumed_of(copied, data)
-    assert "no measurement" in said
+    assert "not measured" in said
     assert np.isfinite(response_data(small_ring, clean).orbits[-1]).all()
     coarse = replace(  # so are all readings, written down with few digits
         copied, response=np.round(clean.response, 5), rf=replace(clean.rf, orbit=np.round(orbit, 5))
@@ -350,7 +350,7 @@ def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
     (told_of,) = swapped_monitors(fitted(small_ring, wrong), clean.monitors)
     assert sorted(told_of) == sorted(pair)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
-    assert any("monitors that answer each as the other one should" in s for s in found.warnings)
+    assert any("monitors that respond each as the other one should" in s for s in found.warnings)
     assert not any("resemble nothing" in said for said in found.warnings)
     assert found.steps[-1].heldout_chi2_per_dof < 1.5
 
@@ -378,7 +378,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     assert found.verdict == "localised"
     (one,) = found.findings
     assert set(one.elements) == set(pair)
-    assert one.words == f"{what} {' and '.join(one.elements)} answer each as the other one should"
+    assert one.words == f"{what} {' and '.join(one.elements)} respond each as the other one should"
     # chi-square as it was read, less that of sound readings: a free gain has taken some of it
     own = response_data(small_ring, wrong)
     model = Predicted(own, Errors.none(own)).read

@@ -83,7 +83,7 @@ def test_a_diagnosis_says_so(small_ring):
     told = found.as_json()["inconsistencies"]
     assert told["chi2"] > 2 * told["readings"]
     assert f"{told['pulls'][0]['name']} " in inconsistency_texts(found)[1]
-    assert "pull gradients apart" in found.report()
+    assert "are inconsistent" in found.report()
 
 
 def test_the_correctors_tell_the_gradients_whatever_the_rfs_orbit_asks_for(small_ring):

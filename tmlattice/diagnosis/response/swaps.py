@@ -120,7 +120,7 @@ def swap_message(pairs: Iterable[Pair], what: str = "correctors") -> str:
     """In words."""
     both = ", ".join(f"{a} and {b}" for a, b in pairs)
     return (
-        f"{what} that answer each as the other one should, taken as exchanged: {both}; look at "
+        f"{what} that respond each as the other one should, taken as swapped: {both}; look at "
         "their cables and at the table of names"
     )
 

@@ -87,14 +87,14 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(small_ring, further
     assert found.response.held[v5] == held
     assert found.verdict == "localised"
     (one,) = found.findings
-    assert one.words.startswith("corrector v5 answers as if it stood 0.2 m upstream")
+    assert one.words.startswith("corrector v5 responds like one 0.2 m upstream")
     assert one.elements == ("v5",)
     assert one.s == small_ring["v5"].s
     assert one.where[0] < one.s < one.where[1]
     document = found.as_json()
     schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
     jsonschema.validate(json.loads(json.dumps(document)), schema)
-    assert document["findings"][0]["to_check"].startswith("Check its place")
+    assert document["findings"][0]["to_check"].startswith("Check its position")
     assert f"LOCALISED: {one.words[0].upper()}{one.words[1:]}." in " ".join(found.report().split())
     assert not any("kicked the beam" in said for said in found.warnings)
     assert (found.steps[-1].heldout_chi2_per_dof > 10) == held
@@ -113,7 +113,7 @@ def test_small_errors_beside_it_are_told_too_and_it_takes_nobody_s_place(small_r
     assert [own.elements for own in found.findings if own.words] == [("v5",)]
     assert [own.element for own in found.findings if own.effect] == ["QD::5"]
     text = " ".join(found.report().split())
-    assert "Small errors all along the ring" in text
+    assert "Distributed errors" in text
     assert "--corrected-out" in text
 
 
