@@ -630,7 +630,7 @@ def test_a_family_that_is_doubted_draws_no_other_one_along(small_ring):
     found, without = (fit_steps(data, split, some) for some in (trials, trials[:1] + trials[2:]))
     assert [own.families[0].name for own in trials] == [asked[0], asked[2], asked[1]]
     assert "energy_spread" in [step.effect for step in found.rejected_steps]
-    assert any("an energy spread of" in said for said in found.messages)
+    assert any("the fitted energy spread is" in said for said in found.messages)
     assert found.state.values.keys() == without.state.values.keys()
     for name, values in found.state.values.items():
         assert np.abs(values - without.state.values[name]).max() < 1e-5
