@@ -240,7 +240,8 @@ def _of_the_ring(fitted: State) -> Iterator[str]:
         sigma = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where[where]]
         if abs(energy) > SEEN * sigma[0]:
             yield (
-                f"its beam differs from the nominal energy by {energy:.2e} ± {sigma[0]:.0e} (relative), "
+                f"its beam differs from the nominal energy by {energy:.2e} ± {sigma[0]:.0e} "
+                "(relative), "
                 "and the tunes are those there"
             )
     yield from dispersion_by_kicks(fitted.values, fitted.data)
