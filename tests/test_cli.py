@@ -74,7 +74,7 @@ def test_tune_fit_has_a_column_for_each_method_and_says_which_to_trust(outcome):
         assert method["orbit_rms"] < 1.1 * result["noise"] < 0.5 * adam["orbit_rms"]
     said = " ".join(done.stdout.split())
     assert "Trust sparse" in said
-    assert f"492 readings do not determine {1519 * (16 + 40):,} weights" in said
+    assert f"492 readings do not determine {1519 * (16 + 40):,} free weights" in said
     assert f"{result['magnet']} -20." in said
     assert "more than the noise of 20 µm" in said
 

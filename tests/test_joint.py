@@ -120,7 +120,7 @@ def test_what_takes_no_part_is_told(small_ring):
     )
     told = diagnose(small_ring, measured, holdout=0).warnings
     silent, spiked = _names(small_ring)[12], _names(small_ring)[7]
-    assert any("no reading" in one and f" {silent}:" in one for one in told)
+    assert any("no usable reading" in one and f" {silent}:" in one for one in told)
     assert any("outliers" in one and one.endswith(f" {spiked}") for one in told)
 
 
