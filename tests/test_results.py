@@ -1,6 +1,7 @@
 """Results that are kept: tables, files that are loaded again, pickles, comparisons, signatures."""
 
 import copy
+import dataclasses
 import inspect
 import json
 import pickle
@@ -380,3 +381,16 @@ def test_an_option_without_meaning_for_the_method_is_refused(small_network, smal
         tmlattice.fine_tune(small_network, measured, method="sparse", epochs=5)
     with pytest.raises(MeasurementError, match="'missing' has no meaning for first turns"):
         tmlattice.diagnose(small_ring, measured, missing=True)
+
+
+def test_a_diagnosis_of_the_command_is_loaded(diagnoses, tmp_path):
+    """With what `diagnose --lattice-out`, a file of readings and --settings add to its source."""
+    found = diagnoses["first turns"]
+    source = {
+        "lattice_out": "found.json",
+        "assumed_of_files": ["readings are in mm"],
+        "applied": [],
+    }
+    made = dataclasses.replace(found, provenance={**found.provenance, **source})
+    saved(made, tmp_path / "result", figures=False)
+    assert Diagnosis.load(tmp_path / "result").provenance == made.provenance
