@@ -19,7 +19,7 @@ from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.response.missing_effects import weigh
-from tmlattice.diagnosis.response.odd_steps import beside
+from tmlattice.diagnosis.response.outlier_steps import beside
 from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause, apply

@@ -13,7 +13,7 @@ from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.missing_effects import control, weigh
-from tmlattice.diagnosis.response.odd_readings import without_gross
+from tmlattice.diagnosis.response.outlier_readings import without_gross
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.diagnosis.response.unlike_model import reversed_ones
 from tmlattice.effects import Cause

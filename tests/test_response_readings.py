@@ -12,10 +12,10 @@ from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.odd_readings import odd_readings
-from tmlattice.diagnosis.response.odd_steps import odd_steps
-from tmlattice.diagnosis.response.other_kicks import other_kicks
+from tmlattice.diagnosis.response.outlier_readings import outlier_readings
+from tmlattice.diagnosis.response.outlier_steps import outlier_steps
 from tmlattice.diagnosis.response.set_aside import taken_back
+from tmlattice.diagnosis.response.spurious_kicks import spurious_kicks
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import fit_steps, one_by_one
 from tmlattice.diagnosis.response.swaps import (
@@ -70,9 +70,9 @@ def test_single_readings_that_stick_out_count_little_and_are_named(small_ring, c
     for c, m in zip(columns, places, strict=True):
         response[c, m, int(clean.planes[c] == "y")] += 2e-7  # of a noise of 2e-8
     best, state = (fitted(small_ring, one) for one in (clean, replace(clean, response=response)))
-    assert not odd_readings(best)
+    assert not outlier_readings(best)
     assert error(state) < 1.05 * error(best)
-    (said,) = odd_readings(state)
+    (said,) = outlier_readings(state)
     assert said.startswith("24 of ")
     assert f"{clean.monitors[6]} (" in said
 
@@ -153,7 +153,7 @@ def test_a_step_whose_calibration_was_a_wrong_guess_is_not_odd(small_ring, clean
     bent[column, ::2] = 0.3 * data.orbits[column, ::2]  # neighbours contradict each other
     far = replace(state, at=Predicted(data, state.at.errors, bent)).moved(values)
     assert inconsistent(far)[column]
-    assert [own.messages for own in odd_steps(far)] == [(), ()]
+    assert [own.messages for own in outlier_steps(far)] == [(), ()]
 
 
 def test_a_kick_elsewhere_is_an_orbit(small_ring, clean):
@@ -218,7 +218,7 @@ def test_a_step_with_another_kick_in_it_is_named_and_not_read_in_that_plane(smal
     # the kick that is told makes the orbit that was added, with its sign
     whole = replace(fit.state, data=data, at=Predicted(data, fit.state.at.errors))
     model, added = whole.at.model, 0.1 * measured.response[source, :, 1]
-    told = next(own for own in other_kicks(whole) if own.column == inside)
+    told = next(own for own in spurious_kicks(whole) if own.column == inside)
     rows = model.reading_slopes[:, told.plane]
     orbit = orbits_of_kicks(model, [told.layer], model.maps.at, rows, told.plane)[:, 0]
     assert told.plane == 1

@@ -1,9 +1,8 @@
-"""Families of the kicks that a closed orbit has: what they add to the dispersion, see `beam.kicks`.
+"""Families of closed-orbit kicks that change the dispersion, see `beam.kicks`.
 
-Dispersion that no gradient makes would else draw the gradients astray: the RF's orbit is read as
-well as any, and a step of it is large. One kick looks like another one, so the numbers are those of
-patterns: as many as the monitors tell apart, each as large as independent kicks make it. They are
-taken in the design's optics, for what they stand for is not known any better.
+Dispersion from kicks would bias the gradients, because the RF's orbit is fitted too. Single kicks
+are degenerate, so the parameters are amplitudes of patterns of independent kicks, as many as the
+BPMs separate. They are linearised in the design's optics.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,13 +26,13 @@ from tmlattice.observe.response_data import ResponseData
 Array = NDArray[np.float64]
 
 LEAST = 3e-3
-"""Share of the strongest pattern below which a weaker one is left out."""
+"""Share of the strongest pattern below which a weaker one is omitted."""
 USUAL = 1e-4
-"""rad: of the kicks of a ring that was aligned to some tenths of a millimetre."""
+"""Kick rms, rad, of a ring aligned to some tenths of a millimetre."""
 
 
 class Patterns(NamedTuple):
-    """Of independent kicks of one size, the strongest first; none where no RF's orbit was read.
+    """Patterns of independent kicks of one size, the strongest first; none without an RF step.
 
     Attributes:
         rf: of the RF's orbit, m/rad, [pattern, monitor].
@@ -48,7 +47,7 @@ class Patterns(NamedTuple):
 
 
 def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
-    """What independent kicks of one size make of the dispersion, as many as monitors tell apart."""
+    """The dispersion patterns of independent kicks of one size, as many as the BPMs separate."""
     data, model = at.data, at.model
     if not np.isfinite(data.orbits[-1, :, plane]).any():
         return Patterns(*(np.zeros((0, n)) for n in (len(data.at), len(data.kicks) - 1, 0)))
@@ -67,11 +66,11 @@ class _Kicks(Family):
 
     @property
     def largest(self) -> float:
-        """Patterns have none: a single kick makes all of them."""
+        """Zero: a pattern has no members."""
         return 0.0
 
     def patterns(self, data: ResponseData) -> Patterns:
-        """In the design."""
+        """The kicks in the design."""
         read = bool(np.isfinite(data.orbits[-1, :, self.plane]).any())
         names = tuple(data.measured.correctors)
         planes = data.plane.tobytes()
@@ -83,15 +82,16 @@ class _Kicks(Family):
         return found
 
     def size(self, data: ResponseData) -> int:
-        """Of the patterns."""
+        """Number of patterns."""
         return len(self.patterns(data).rf)
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of independent kicks."""
+        """The prior of independent kicks."""
         return [Group(self.name, np.eye(self.size(data)), USUAL)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """Of the RF's orbit, and of the correctors' by the energy, see `beam.kicks.by_energy`."""
+        """Responses of the RF's orbit, and of the correctors by the energy, see
+        `beam.kicks.by_energy`."""
         data, model, patterns = at.data, at.model, self.patterns(at.data)
         names = data.measured.correctors
         read = data.plane_of(self.block)[:-1]
@@ -102,7 +102,7 @@ class _Kicks(Family):
         kicks = data.kicks[:-1] * (1 + at.errors.calibration[:-1])
         out = np.zeros((len(values), *data.shape))
         out[:, -1] = patterns.rf
-        own = np.flatnonzero(read == self.plane)  # whose orbit is read where the kicks act
+        own = np.flatnonzero(read == self.plane)  # their orbit is read in the plane of the kicks
         by_monitors = kicks[own] * energy[own]
         out[:, own] = by_monitors[:, None] * (patterns.rf / data.energy_of_rf)[:, None]
         by_correctors = more * kicks * patterns.at_correctors
@@ -111,7 +111,7 @@ class _Kicks(Family):
         return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """Beside what the ring makes."""
+        """The errors with the kicks' dispersion."""
         patterns = self.patterns(data)
         more = np.zeros((len(data.at), 2))
         more[:, self.plane] = values @ patterns.rf
@@ -124,16 +124,16 @@ class _Kicks(Family):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """Nothing: other kicks make the same dispersion."""
+        """No causes: single kicks are degenerate."""
         return []
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """No effect of the catalogue: kicks that no orbit shows."""
+        """No effect of the catalogue."""
         return [{} for _ in range(self.size(data))]
 
 
 class HorizontalKicks(_Kicks):
-    """What gradients cannot make of the dispersion."""
+    """Horizontal dispersion by kicks, not by gradients."""
 
     name, effects = "horizontal kicks", ("dipole_field",)
     block, variable, plane = 0, "horizontal kicks", 0
@@ -141,7 +141,7 @@ class HorizontalKicks(_Kicks):
 
 
 class VerticalKicks(_Kicks):
-    """What skew gradients cannot make of the vertical dispersion."""
+    """Vertical dispersion by kicks, not by skew gradients."""
 
     name, effects = "vertical kicks", ("dipole_roll",)
     block, variable, plane = 1, "vertical kicks", 1
@@ -160,9 +160,9 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
         if own.any():
             size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2))
             yield (
-                f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} no {gradient} "
-                "makes: kicks of the closed orbit do (errors of bends, displaced quadrupoles, "
-                "correctors), which the data do not tell apart"
+                f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from a "
+                f"{gradient} but from kicks of the closed orbit (errors of bends, quadrupole "
+                "offsets, correctors), which the data do not separate"
             )
 
 
@@ -184,8 +184,8 @@ def fitted_orbit_kicks(at: Predicted) -> Array | None:
 def dispersion_beside(
     values: Mapping[str, Array], data: ResponseData
 ) -> dict[str, tuple[float, float]]:
-    """What was found beside the lattice's dispersion, at all monitors and correctors of the ring, m
-    per relative energy in x and y; empty where nothing was.
+    """Return the fitted additional dispersion at all BPMs and correctors of the ring, m per
+    relative energy in x and y; empty where none was fitted.
 
     Args:
         values: that were found, by variable.
@@ -212,7 +212,8 @@ def dispersion_beside(
 
 
 def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, float]]) -> Errors:
-    """The design with what `dispersion_beside` says, as other correctors and monitors have it."""
+    """The design with the additional dispersion of `dispersion_beside`, for other correctors and
+    BPMs."""
     none = Errors.none(data)
     if not dispersion:
         return none

@@ -1,10 +1,10 @@
-"""Families of errors that a dense fit of an orbit response may have: each is one object.
+"""Families of errors of a hierarchical fit of an orbit response: each is one object.
 
 To add one, write a class with its places, prior, rows, how its values are put among the errors and
 how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`, of the
 beam's energies in `energy`); and name it in `STEPS`, which says when it is tried.
 
-Families that move the same numbers (single gradients, and gradients of whole families) share a
+Families with the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
 """
 
@@ -50,19 +50,19 @@ class _Monitors(Family):
 
 
 class MonitorGain(_Monitors):
-    """Gains, x and y of each monitor: free but for a mean of each plane."""
+    """Gains, x and y of each BPM: free but for a mean of each plane."""
 
     name, effects = "monitor_gain", ("monitor_gain_x", "monitor_gain_y")
     block, variable, trust, gross = 0, "gain", 0.01, 0.5
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Each its own, and those of a plane alike."""
+        """Priors of single BPMs and of all BPMs of a plane."""
         alike = np.zeros((self.size(data), 2))
         alike[0::2, 0] = alike[1::2, 1] = 1
         return [self._own(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """On the diagonals."""
+        """The diagonals of the BPMs' matrices."""
         monitors = errors.monitors.copy()
         monitors[:, [0, 1], [0, 1]] = 1 + values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
@@ -70,7 +70,7 @@ class MonitorGain(_Monitors):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """All of x, then all of y."""
+        """Causes: all of x, then all of y."""
         names, gain = data.measured.monitors, Monitors.of(errors.monitors).gain
         return [
             (Cause(f"monitor_gain_{p}", name, float(gain[i, j])), float(sigma[2 * i + j]))
@@ -79,26 +79,26 @@ class MonitorGain(_Monitors):
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Each its own."""
+        """One number a BPM and plane."""
         return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
 
 
 LEAST_GAIN = 1e-3
-"""Of a monitor that has an angle."""
+"""The rotation of a BPM with an angle."""
 
 
 class MonitorRoll(_Monitors):
-    """What each plane of a monitor reads of the other: roll and coupling."""
+    """The cross-talk of a BPM's planes: roll and coupling."""
 
     name, effects = "monitor_roll", ("monitor_roll", "monitor_coupling")
     block, variable, trust = 1, "mixing", 0.02
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Each its own."""
+        """One number a BPM and plane."""
         return [self._own(data)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """Beside the diagonals."""
+        """The off-diagonals of the BPMs' matrices."""
         monitors = errors.monitors.copy()
         monitors[:, [0, 1], [1, 0]] = values.reshape(-1, 2)
         return replace(errors, monitors=monitors)
@@ -106,7 +106,7 @@ class MonitorRoll(_Monitors):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """Of small ones x reads (coupling + roll) y, y reads (coupling - roll) x."""
+        """For small values x reads (coupling + roll) y, y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
         own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
         spread = np.hypot(*(sigma.reshape(-1, 2) / own).T) / 2
@@ -117,7 +117,7 @@ class MonitorRoll(_Monitors):
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """What x reads of y, and y of x."""
+        """The share of y in x, and of x in y."""
         roll, coupling = self.effects
         return [
             {(roll, name): side / 2, (coupling, name): 0.5}
@@ -127,7 +127,7 @@ class MonitorRoll(_Monitors):
 
 
 LEAST_KICK = 1e-3
-"""Share of what it is told, of a corrector that has an angle to its plane."""
+"""Calibration relative to the stated kick, of a corrector at an angle to its plane."""
 
 
 class _Columns(Family):
@@ -137,10 +137,10 @@ class _Columns(Family):
         return len(data.kicks)
 
     def count(self, data: ResponseData) -> int:
-        return len(data.kicks) - 1  # the RF's step is known
+        return len(data.kicks) - 1  # the RF step is exact
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Each its own; of the RF there is none."""
+        """One number a corrector; none of the RF."""
         own: list[dict[Hypothesis, float]] = [
             {(self.name, name): 1.0} for name in data.measured.correctors
         ]
@@ -155,13 +155,13 @@ class _Columns(Family):
 
 
 class CorrectorCalibration(_Columns):
-    """Each its own, and what correctors of a family share."""
+    """Priors of single correctors and of families."""
 
     name, effects = "corrector_calibration", ("corrector_calibration",)
     block, variable, trust, gross = 0, "calibration", 0.01, 0.3
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each, and of families."""
+        """Numbers of single correctors and of families."""
         kinds = families([*data.measured.correctors, "\0"])[1]
         return [
             Group(self.name, np.eye(self.size(data)), 0.02, TAILS),
@@ -175,13 +175,14 @@ class CorrectorCalibration(_Columns):
         return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """As it stands."""
+        """The calibrations as causes."""
         return replace(errors, calibration=values)
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """Of the whole kick, of which a rolled corrector has a part in the other plane."""
+        """The calibration of the whole kick; a rolled corrector has a part of it in the other
+        plane."""
         return self._causes_of(errors.kick - 1, sigma, data)
 
 
@@ -192,7 +193,7 @@ class CorrectorRoll(_Columns):
     block, variable, trust, gross = 1, "roll", 0.02, 0.1
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Of each."""
+        """One number a corrector."""
         return [Group(self.name, np.eye(self.size(data)), 0.01, TAILS)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
@@ -200,13 +201,13 @@ class CorrectorRoll(_Columns):
         return np.asarray(at.gain(1) * at.data.pick(at.across, 1))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The kick in the other plane, as a share of what the corrector is told."""
+        """The kick in the other plane, as a share of the stated kick."""
         return replace(errors, roll=values)
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """The angle of its kick to its plane: a right one where it has none in that."""
+        """The angle of the kick to the corrector's plane: 90 degrees without a part in it."""
         return self._causes_of(
             errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data
         )

@@ -1,11 +1,12 @@
-"""Diagnosis of an orbit response, whose ring has small errors everywhere.
+"""Diagnosis of an orbit response of a ring with distributed errors.
 
-In the order in which it happens: the data are looked at (`strangers`, `exchanged`, `odd_readings`),
-a fit begins (`first_guess`, `state`), families come in one after another in damped rounds (`dense`,
-`rounds`, `weights`, `jitter`), steps that went wrong are left out (`odd_steps`, `torn_steps`,
-`other_kicks`), each family is judged by evidence and by readings that it was not fitted to
-(`judges`, `rf_by_others`), few causes are sought alone (`few`) or among small errors
-(`singled_out`), and it is told how well things are known (`stated`), which few numbers are behind
-many (`reasons`), and what is missing (`missing`). `procedure` is all of it; `before_after` is that
-of two measurements.
+In the order in which it happens: the data are checked (`unlike_model`, `swaps`), a sparse fit is
+tried (`sparse`), a fit of all errors begins (`first_guess`, `state`), families are added one after
+another in damped rounds (`stepwise`, `rounds`, `weights`, `jitter`), outliers are rejected
+(`outlier_readings`, `outlier_steps`, `inconsistent_steps`, `spurious_kicks`), each family is
+validated by evidence and by readings that it was not fitted to (`validation`, `rf_by_others`), and
+single faults are sought given distributed errors (`detected_faults`). The result has its errors
+(`stated`), the common factors of many numbers (`common_factors`), and missing effects
+(`missing_effects`). `procedure` calls all of it; `before_after` does so for the change between two
+measurements.
 """

@@ -1,16 +1,15 @@
-"""What changed between two orbit responses of one machine, without knowing the machine.
+"""The change between two orbit responses of one machine.
 
 >>> change = diagnose_change(ring, before, after)
 >>> [(own.effect, own.element, own.amount, own.amount_sigma) for own in change.findings]
 
-The ring, its monitors and its correctors are fitted to the first measurement; what that leaves is
-in both and cancels in their difference (`observe.response_change`), which is fitted in turn, in a
-ring that has the first one's dispersion: kicks that make it, and the beam's energy, too. Drifts
-of monitors and correctors, whose sizes are learnt, are nuisances. Magnets scatter, too: how far
-those of one supply differ in their change is learnt, and is in the error of every amount, as is
-what the fit of the first leaves open (`left_open`). Findings are supplies (magnets whose names
-begin alike), single magnets, gradients in sextupoles and wigglers (of the orbit there), and
-insertion devices: by evidence, see `inference.levels`.
+The ring, its BPMs and its correctors are fitted to the first measurement. The residual is in both
+measurements and cancels in their difference (`observe.response_change`), which is fitted in turn,
+with the dispersion and the energy of the first fit. Drifts of BPMs and correctors are nuisances
+whose scales are learnt. The scatter of the magnets of one supply in their change is learnt, and is
+in the error of every amount; so are undetermined errors of the first fit (`undetermined`). Findings
+are supplies (magnets whose names begin alike), single magnets, gradients in sextupoles and wigglers
+(of the orbit there), and insertion devices, by the marginal likelihood, see `inference.levels`.
 """
 
 import time
@@ -64,13 +63,13 @@ from tmlattice.observe.split import Split, split_columns
 Array = NDArray[np.float64]
 
 ANY = 6.0
-"""rms of the logarithm of a change's size about its first guess: most families did not change."""
+"""rms of the logarithm of a change's scale about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
-"""Relative scatter of magnets from which a change of all of them is told though none stands out."""
+"""Relative scatter of magnets from which on it is reported without a single detected change."""
 SEEN = 3.0
-"""Standard deviations from which an energy of the reference is told."""
+"""Standard deviations from which on an energy offset of the reference is reported."""
 LEAST_NOISE = 0.2
-"""Share of the stated noise that two measurements differ by at least."""
+"""Least noise of the difference of two measurements, as a share of the stated noise."""
 
 
 def diagnose_change(
@@ -86,17 +85,17 @@ def diagnose_change(
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> Diagnosis:
-    """What changed from one response to the other.
+    """Diagnose the change from one response to the other.
 
     Args:
         ring: the design.
-        before, after: of the same machine; correctors and monitors that one of them lacks are left
+        before, after: of the same machine; correctors and monitors of only one of them are left
             out.
-        holdout: share of the correctors that judge the gap; amounts are fitted to all of them.
+        holdout: share of the correctors that validate the gap; amounts are fitted to all of them.
         effects: only changes of these are looked for.
         max_effects: findings at most.
-        false_alarm: chance that two measurements of an unchanged machine are said to differ.
-        assume: what was written down wrongly everywhere in both, see `measurement.assume`.
+        false_alarm: probability of a finding in two measurements of an unchanged machine.
+        assume: what is recorded wrongly everywhere in both, see `measurement.assume`.
         seed: of the split.
         progress: called with the name of each stage.
 
@@ -156,7 +155,7 @@ def diagnose_change(
             noise_estimated=False,
             provenance=provenance(ring, options, seed, started),
         )  # fmt: skip
-    progress("what changed")
+    progress("changes")
     whole = settle(_all_columns(fit.state))
     changed, scatter = changed_supplies(whole, judgement, open_)
     changed += outstanding(whole, judgement)
@@ -184,8 +183,8 @@ def diagnose_change(
 
 
 def changes() -> list[str]:
-    """Names of what changes between two measurements: every usual effect, and supplies of families,
-    which one measurement alone does not ask for all of."""
+    """Effects that may change between two measurements: every usual one, and all supplies of
+    families."""
     families = [name for name, effect in CATALOGUE.items() if isinstance(effect, FamilyEffect)]
     return list(dict.fromkeys([*modelled(), *families]))
 
@@ -204,7 +203,7 @@ def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
 
 # --- the fits -------------------------------------------------------------------------------------
 def _not_validated(split: Split) -> Split:
-    """All correctors are fitted, and all of the RF's orbit."""
+    """A split in which all correctors, and all of the RF's orbit, are fitted."""
     nobody, half = np.zeros_like(split.held), split.half.copy()
     half[-1] = True
     return Split(nobody, nobody, half, np.zeros_like(split.inner_rf))
@@ -220,8 +219,8 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 def _reference(
     data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
 ) -> tuple[State, list[str]]:
-    """What a lattice can have wrong, as one measurement has it, then fitted to all of the first.
-    The design where that goes astray. And what is to be said of it."""
+    """The errors of the lattice, fitted to the first measurement, and messages. The design where
+    the fit diverges."""
     nothing = replace(begin(data, _not_validated(split)), exploring=False)
     if not steps:
         return nothing, []
@@ -233,7 +232,7 @@ def _reference(
 
 
 def _of_the_ring(fitted: State) -> Iterator[str]:
-    """What no list of causes shows of the ring that changed."""
+    """Messages about the ring of the reference that no list of causes shows."""
     energy, where = fitted.at.errors.energy, EnergyOffset.variable
     if energy:
         there = linear(fitted, EnergyOffset.block)
@@ -250,8 +249,8 @@ def _of_the_ring(fitted: State) -> Iterator[str]:
 def _by_good_monitors(
     ring: Ring, fitted: State, before: OrbitResponse, after: OrbitResponse, messages: list[str]
 ) -> tuple[ResponseData, ResponseData, Errors]:
-    """Both measurements, and what is wrong with the first, without monitors that are bad in it, and
-    without its odd readings; which ones goes to what is `said`."""
+    """Both measurements, and the errors of the first, without BPMs and outliers that are bad in it;
+    messages go to `said`."""
     errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     if not fitted.good.all():
         names = np.array(fitted.data.measured.monitors)
@@ -287,8 +286,8 @@ def _fit_change(
 
 
 def _learnt_noise(state: State) -> State:
-    """With less noise where two measurements agree better than is stated; where they agree worse,
-    every column's own lack says so."""
+    """Data with less noise where two measurements agree better than stated; the misfit of each
+    column covers the opposite."""
     scales = []
     data = state.data
     for block in (0, 1):
@@ -307,11 +306,11 @@ def _with_noise(state: State, noise: Array) -> State:
 
 
 def _all_columns(state: State) -> State:
-    """To be fitted to the held-out correctors too."""
+    """The fit with held-out correctors included."""
     return replace(state, split=_not_validated(state.split))
 
 
-# --- what is told ---------------------------------------------------------------------------------
+# --- messages ---------------------------------------------------------------------------------
 def _sparse_or_all(
     data: ResponseData,
     split: Split,
@@ -343,7 +342,7 @@ def _verdict(state: State) -> str:
 def _messages(
     data: ResponseData, fit: StepwiseFit, state: State, scatter: Mapping[str, float]
 ) -> list[str]:
-    """How well two measurements agree, and by how much magnets, and supplies, scatter."""
+    """Messages on the agreement of two measurements, and the scatter of magnets and supplies."""
     left = data.pick(state.at.left)[:-1][:, state.good]
     agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
     stated = 1e6 * float(np.median(data.noise))
@@ -355,7 +354,7 @@ def _messages(
         size = scatter[QuadrupoleGradient.name]
         messages.append(
             f"magnets of one supply differ in their change by {size:.1g} (rms, relative), which is "
-            f"in the errors; changes below {REPRODUCED:g} are taken for none"
+            f"in the errors; changes below {REPRODUCED:g} are ignored"
         )
     if size := scatter.get(FamilyGradient.name, 0.0):
         messages.append(

@@ -1,12 +1,12 @@
-"""Single faults of an orbit response among small errors everywhere.
+"""Single faults of an orbit response among distributed errors.
 
->>> found = singled_out(data, split, fit.state, hypotheses, judgement)
+>>> found = detected_faults(data, split, fit.state, hypotheses, judgement)
 >>> [(one.cause, one.sigma, one.statistic) for one in found.faults]
 
-One cause after another is given a prior of its own beside all usual small errors
-(`small_errors`), whose sizes are learnt again without it, and everything settles anew, not
-linearised. It is a fault where it stands out by five standard deviations of what its family does,
-and by more than chance among so many causes and families of so many members.
+One cause after another is given a prior of its own together with all usual distributed errors
+(`small_errors`). Their scales are learnt again without it, and everything is fitted again, not
+linearised. A cause is detected at five standard deviations of its family's scatter, and above the
+chance level of so many causes and families.
 """
 
 import logging
@@ -49,36 +49,36 @@ log = logging.getLogger(__name__)
 
 ORBITS = (HorizontalOrbit.name, VerticalOrbit.name)
 FAULTS = 8
-"""At most: more are a family."""
+"""Faults at most: more are a family."""
 WORTH, HIDDEN = 15.0, 8.0
-"""Statistic, with sizes not yet learnt without it, from which on a cause is tried: of one number of
-a family, and of others, which make all patterns of an orbit larger."""
+"""Least statistic of a candidate, with scales not yet learnt without it: for one number of a
+family, and for other causes, which increase the scales of all patterns of an orbit."""
 TRIES = 3
-"""Causes that are tried at a step; one alone in a response of many readings."""
+"""Candidates that are tried at a step; one in a response of many readings."""
 NEAR, SHARE = 8.0, 0.1
-"""Log evidence by which another one may be behind the likeliest to be tried beside it, and what of
-the statistic adds to it: the linear model errs by a share of that."""
+"""Log evidence by which an alternative may be behind and still be tried; and the error of the
+linear model, as a share of the statistic."""
 BEHIND = 2.0
-"""Log evidence by which a rival has to be ahead, where a cause was put in, to be tried instead."""
+"""Log evidence by which an alternative must be ahead to replace an accepted cause."""
 LISTED = 24
-"""Rivals of a fault that are told apart."""
+"""Alternatives of a fault that are compared."""
 BEYOND = 1.5
-"""Times the largest fault: a larger amount is none."""
+"""Ratio to the largest fault above which an amount is implausible."""
 LACKS = 2.0
-"""Chi-square per reading of each plane beside small errors, up to which faults are sought in any
-case."""
+"""Chi-square per reading of each plane, with distributed errors, up to which faults are always
+sought."""
 WORSE = 1.02
-"""What held-out correctors may be left more with the faults than without, at most."""
+"""Largest ratio of held-out residuals with and without the faults."""
 MEMBERS = 16
-"""As many as an orbit's patterns, where there are none."""
+"""Assumed number of orbit patterns, where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
 class DetectedFaults:
-    """What stands out.
+    """The detected faults.
 
     Attributes:
-        state: small errors, and beside them the faults.
+        state: distributed errors together with the faults.
         faults: by falling statistic.
     """
 
@@ -95,19 +95,19 @@ def detected_faults(
     judgement: Judgement,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> DetectedFaults:
-    """Faults one after another, each beside those before it.
+    """Detect faults one after another, each given those before it.
 
     Args:
-        data, split: what was measured, and who judges.
-        fitted: a dense fit of it.
-        hypotheses: what may be wrong alone.
+        data, split: the data, and the validation split.
+        fitted: a hierarchical fit of the data.
+        hypotheses: possible single faults.
         most: faults at most.
         judgement: thresholds.
-        progress: told what is being done.
+        progress: called with the name of each stage.
     """
-    progress("small errors")
+    progress("distributed errors")
     search = _Search(small_errors(data, split, fitted), hypotheses, judgement)
-    progress("what stands out")
+    progress("detected faults")
     seen_before: list[set[Hypothesis]] = []
     while not search.drowned() and len(search.state.apart) < min(most, FAULTS):
         state = search.next()
@@ -115,7 +115,7 @@ def detected_faults(
             break
         search.state = state
         chosen = {one.cause for one in state.apart}
-        log.info("stands out: %s", chosen)
+        log.info("detected: %s", chosen)
         if chosen in seen_before:
             break
         seen_before.append(chosen)
@@ -139,21 +139,22 @@ class _Search:
         )  # fmt: skip
 
     def drowned(self) -> bool:
-        """Whether far more than noise is left, and no single cause makes most of that: the model
-        lacks something, and what stands out may be that."""
+        """Whether the residual far exceeds the noise, and no single cause explains most of it:
+        model discrepancy could be detected as a fault."""
         planes = fit_chi2(self.state)[:2]
         worst = max((0, 1), key=lambda plane: planes[plane].per_reading)
         own = planes[worst]
         if own.per_reading <= LACKS or self.state.apart:
             return False
-        # by the noise alone: what one cause leaves in a column takes that column's weight
+        # by the noise alone: a large residual of a column reduces its weight
         left = [self.left_beside(*leader)[worst].total for leader in self.leaders()]
         return min(left, default=np.inf) > (own.total + own.readings) / 2
 
     def left_beside(
         self, cause: Hypothesis, amount: float, information: Array
     ) -> tuple[Chi2, Chi2, Chi2]:
-        """Chi-square with one cause more, nothing else moved; infinite where no beam is stored."""
+        """Chi-square with one more cause, nothing else changed; infinite where no beam is
+        stored."""
         state, suspect = _as_number(self.state, cause, information)
         assert suspect.members is not None
         values = state.values[suspect.variable] + amount * suspect.members
@@ -163,7 +164,7 @@ class _Search:
             return (Chi2(np.inf, 1),) * 3
 
     def seen(self, state: State) -> Seen:
-        """All suspects there."""
+        """All suspects, linearised at the state."""
         return Seen(state, suspects_of(state, self.hypotheses))
 
     def evidence(self, seen: Seen, own: Weighed) -> Array:
@@ -178,7 +179,7 @@ class _Search:
         return np.where(possible, messages, -np.inf)
 
     def next(self) -> State | None:
-        """With one cause more, the likeliest that stands out; None: none does."""
+        """The state with the most probable further cause, if it is detected; else None."""
         tried: list[tuple[float, State]] = []
         for cause, _, information in self.leaders():
             state = self.put(self.state, cause, information)
@@ -191,8 +192,8 @@ class _Search:
         return None
 
     def leaders(self) -> list[tuple[Hypothesis, float, Array]]:
-        """What is tried: the likeliest by the linear model, one of each action; its amount, and
-        what each block knows of it."""
+        """Candidates: the most probable by the linear model, one of each action, with amount and
+        information of each block."""
         ring = self.state.data.ring
         seen = self.seen(self.state)
         if not seen.suspects:
@@ -214,7 +215,7 @@ class _Search:
         return list(found.values())
 
     def put(self, state: State, cause: Hypothesis, information: Array) -> State | None:
-        """Settled beside one cause more; None where no beam is stored.
+        """The converged state with one more cause; None where no beam is stored.
 
         Args:
             state: without.
@@ -224,7 +225,7 @@ class _Search:
         return _settled(_apart(_as_number(state, cause, information)[0], cause))
 
     def better(self, state: State, one: Apart) -> State:
-        """Another cause in the place of one, where that explains more."""
+        """The state with an alternative in the place of a cause, where it explains more."""
         seen = self.seen(state)
         own = seen.beside(one.name)
         evidence = self.evidence(seen, own)
@@ -243,8 +244,8 @@ class _Search:
         return other if gained > 0 else state
 
     def revised(self, state: State) -> State:
-        """Each earlier cause held against its rivals again, and without those that the others make
-        needless."""
+        """The state with each cause compared with its alternatives again, without redundant
+        ones."""
         for one in state.apart[:-1]:
             state = self.better(state, one)
         while len(state.apart) > 1:
@@ -260,8 +261,8 @@ class _Search:
         return state
 
     def members(self, state: State, one: Apart) -> int:
-        """Numbers that the size of errors rests on which the statistic has: of the family, or the
-        patterns of the orbit."""
+        """Number of amounts that determine the scale in the statistic: of the family, or of the
+        orbit patterns."""
         if one.variable not in (kind.variable for kind in KINDS):
             return max(len(one.members) - 1, 1)
         orbit = [len(state.values[f.variable]) for f in state.of_block(one.block)
@@ -269,13 +270,13 @@ class _Search:
         return max(min(orbit, default=MEMBERS) - 1, 1)
 
     def p_value(self, seen: Seen, statistic: float, one: Apart) -> float:
-        """Chance that the largest of so many errors stands out like this."""
+        """Probability that the largest of so many errors reaches this statistic by chance."""
         members = self.members(seen.state, one)
         own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), members))
         return min(1.0, own * len(self.hypotheses))
 
     def clear(self, seen: Seen, one: Apart) -> bool:
-        """Whether it stands out."""
+        """Whether the cause is detected."""
         statistic, cause, _ = _shown(seen, one)
         if not abs(cause.amount) < BEYOND * find(cause.effect).largest:
             return False
@@ -284,7 +285,7 @@ class _Search:
         )
 
     def fault(self, seen: Seen, one: Apart) -> Fault:
-        """With its amount, its error and its rivals."""
+        """The fault with its amount, error and alternatives."""
         own = seen.beside(one.name)
         evidence = self.evidence(seen, own)
         here = _place(seen, one)
@@ -302,7 +303,8 @@ class _Search:
 
 
 def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Suspect]:
-    """With a number of the fit for a cause, of the block that knows more of it, and which it is."""
+    """The state with a number for the cause, in the block that is more sensitive, and that
+    number."""
     (suspect,) = suspects_of(state, [cause])
     if suspect.block is None:
         state = with_number(state, cause, int(np.argmax(information)))
@@ -311,7 +313,7 @@ def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[Sta
 
 
 def _apart(state: State, cause: Hypothesis) -> State:
-    """With a prior of its own for a number of the fit."""
+    """The state with a separate prior for a number of the fit."""
     (suspect,) = suspects_of(state, [cause])
     assert suspect.block is not None
     assert suspect.members is not None
@@ -324,21 +326,22 @@ def _place(seen: Seen, one: Apart) -> int:
 
 
 def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
-    """Of what is wrong alone: by how much it stands out, its amount and its error, where single
-    columns or monitors that contradict all others count."""
+    """Statistic, amount and error of each cause; columns and BPMs that contradict all others
+    count."""
     own, here = seen.beside(one.name), _place(seen, one)
     it = seen.blocks[one.block]
     posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
     wider = doubt(seen.state, one, it.there, posterior)
     amount, variance = float(own.amount[here]), float(own.sigma[here]) ** 2 * wider
-    # a small error multiplies with the fault: of a kick three times as strong it is three times
+    # a distributed error multiplies with the fault: of a kick three times as strong it is three
+    # times
     share = max(abs(find(one.cause[0]).joined(amount, 1.0) - amount), 1.0)
     variance += (share**2 - 1) * _scatter(it.there, it.sizes, one) ** 2
     return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))
 
 
 def _scatter(there: Linear, sizes: Sequence[Group], one: Apart) -> float:
-    """rms of the amount by the small errors of its family."""
+    """rms of the amount by the distributed errors of its family."""
     along = np.zeros(len(there.start))
     along[there.where[one.variable]] = one.members / float(one.members @ one.members)
     return float(np.sqrt(sum(np.sum((along @ group.basis * group.scale) ** 2)
@@ -346,14 +349,14 @@ def _scatter(there: Linear, sizes: Sequence[Group], one: Apart) -> float:
 
 
 def _without(state: State, one: Apart) -> State:
-    """Not settled anew: the next step takes its number back."""
+    """The state without a cause, not converged: the next step takes its number back."""
     return replace(state, apart=tuple(other for other in state.apart if other is not one))
 
 
 def _settled(state: State) -> State | None:
-    """Everything, from as far as the linear model goes, or from where it is; None where no beam is
-    stored, or an amount has gone beyond what a fault can have. Sizes are learnt anew: one that fell
-    to nothing beside a fault would not grow."""
+    """The state after convergence from the linear estimate or from the present one. None where no
+    beam is stored, or where an amount is implausible. Scales are learnt anew, because a scale that
+    vanished would not grow again."""
     state = replace(state, groups={})
     for begin in (_stepped, replace):
         try:
@@ -365,7 +368,7 @@ def _settled(state: State) -> State | None:
 
 
 def _possible(state: State) -> bool:
-    """Whether what is wrong alone, with what its family has of it, is no more than a fault."""
+    """Whether each amount, with its family's part, is a plausible fault."""
     amounts = [
         float(state.values[one.variable] @ one.members / (one.members @ one.members))
         for one in state.apart
@@ -374,7 +377,7 @@ def _possible(state: State) -> bool:
 
 
 def _stepped(state: State) -> State:
-    """By one step of Gauss and Newton as far as it goes, with sizes as of what is not alone."""
+    """The state after one bounded Gauss-Newton step, with scales learnt without the causes."""
     values, groups = dict(state.values), dict(state.groups)
     for block in (block for block in (0, 1) if state.of_block(block)):
         there = linear(state, block)

@@ -1,6 +1,6 @@
-"""What monitors and correctors do otherwise on the second of two days.
+"""Changes of BPMs and correctors on the second of two days.
 
-Everybody drifts a little; who changed far more than the others is a finding.
+All of them drift a little; an outlier among them is a finding.
 """
 
 import numpy as np
@@ -20,8 +20,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.normal import solve
 
 DRIFT, OUTSTANDING = 0.03, 8.0
-"""A monitor or a corrector is told where it changed by more than this, and by so many times as much
-as others do."""
+"""Least change of a BPM or a corrector that is reported, and its least ratio to those of others."""
 
 
 def drifts(state: State) -> list[tuple[StatedCause, Support]]:
@@ -39,7 +38,7 @@ def drifts(state: State) -> list[tuple[StatedCause, Support]]:
 
 
 def outstanding(state: State, judgement: Judgement) -> list[Finding]:
-    """Monitors and correctors whose change is another thing than everybody's drift."""
+    """Findings: BPMs and correctors whose change is an outlier of the usual drift."""
     changes = [row for row, _ in drifts(state)]
     found = []
     for effect in dict.fromkeys(cause.effect for cause, _ in changes):

@@ -1,9 +1,8 @@
-"""Where a dense fit begins, if the design is far from the ring that was measured.
+"""The start of a hierarchical fit, if the design is far from the ring.
 
-Rounds that follow slopes bring phases home that are off by a fraction of a turn. Of a lattice with
-another working point, which no orbit resembles any more, they find a ring that one plane agrees
-with and the other does not. There, focusing and defocusing quadrupoles are tried in steps, all of
-them together, and the fit begins at what resembles the readings most.
+Gauss-Newton converges from phase errors of a fraction of a turn. From another working point it
+converges to a ring that matches one plane only. There, focusing and defocusing quadrupoles are
+scanned together, and the fit starts at the best match.
 """
 
 import logging
@@ -28,10 +27,10 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 FAR = 0.25
-"""Share of the typical column's mean square, in the worse plane, that the design leaves of it with
-a kick of its own where it is far: half of its size. Rings as they are leave a tenth of that."""
+"""Share of the typical column's mean square, in the worse plane, from which on the design is far:
+half of its size. Usual rings leave a tenth of that."""
 BETTER = 0.5
-"""Of that share, at most, is left at another beginning: else the design is as good a one."""
+"""Largest ratio of that share at another start to that of the design."""
 STEPS = np.arange(-3, 4) * 0.01
 """Relative changes that are tried."""
 
@@ -52,12 +51,12 @@ def begun(design: State, trials: Sequence[Trial]) -> State:
 
 
 class Guess(NamedTuple):
-    """Where the readings are resembled more than by the design.
+    """A start that matches the readings better than the design.
 
     Attributes:
         focusing, defocusing: relative change of all such quadrupoles.
         values: the same, by variable.
-        left: share of the typical column's mean square that is left there.
+        left: share of the typical column's mean square that is unexplained there.
     """
 
     focusing: float
@@ -67,14 +66,14 @@ class Guess(NamedTuple):
 
 
 def elsewhere(data: ResponseData) -> Guess | None:
-    """The first guess by all that was measured."""
+    """The first guess by all readings."""
     nobody, everybody = (np.full(data.shape, own) for own in (False, True))
     split = Split(held=nobody[:, 0], inner=nobody[:, 0], half=everybody, inner_rf=nobody[0])
     return first_guess(begin(data, split))
 
 
 def first_guess(design: State) -> Guess | None:
-    """Where a fit is to begin; None where the design is near enough, or nothing better.
+    """Return the start of a fit; None where the design is near enough, or nothing is better.
 
     Args:
         design: with no families yet.
@@ -101,12 +100,12 @@ def first_guess(design: State) -> Guess | None:
 
 
 def strange(state: State, least: int = 1) -> float:
-    """Share of the typical column's mean square that is left with a kick of its own, in its plane,
-    of the worse plane.
+    """Return the unexplained share of the typical column's mean square, each with its own kick, of
+    the worse plane.
 
     Args:
         state: what the model makes of the readings.
-        least: columns of a plane that it takes to say what is typical.
+        least: columns of a plane required for the typical one.
     """
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]

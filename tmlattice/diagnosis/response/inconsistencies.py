@@ -1,13 +1,13 @@
-"""Whether the RF's orbit and the correctors' responses ask for the same gradients.
+"""Inconsistency of the gradients from the RF's orbit and from the correctors' responses.
 
->>> found = pulled_apart(fit.state)
+>>> found = inconsistencies(fit.state)
 >>> found.missed, found.known, [(own.name, own.correctors, own.with_rf) for own in found.pulls]
 
-Gradients are fitted to both. What the correctors alone say of them predicts the RF's orbit, if
-nothing else makes it: kicks of the closed orbit do. Where the prediction fails, gradients that have
-to make that orbit too are drawn away from what the correctors ask for; which, Hausman's test says
-(Econometrica 46, 1978): by chance alone two estimates of which one knows more differ by what it
-knows more. All of it linear about the fit, by its weights, without the kicks.
+Gradients are fitted to both. The estimate from the correctors alone predicts the RF's orbit, unless
+kicks of the closed orbit contribute. Where the prediction fails, the common fit biases the
+gradients. Hausman's test (Econometrica 46, 1978) finds which ones: the covariance of the difference
+of two estimates, one of which is efficient, is the difference of their covariances. All of it is
+linear about the fit, with its weights and without the kicks.
 """
 
 from dataclasses import dataclass
@@ -29,19 +29,19 @@ from tmlattice.lattice.supplies import magnets, supplied_alike
 Array = NDArray[np.float64]
 
 CLEAR = 5.0
-"""Standard deviations, from which on gradients are told."""
+"""Standard deviations from which on gradients are reported."""
 ROUNDING = 1e-6
-"""Share of a variance below which a difference of two is none."""
+"""Share of a variance below which a difference of two counts as zero."""
 
 
 @dataclass(frozen=True)
 class Pull:
-    """A gradient that the two disagree about.
+    """An inconsistent gradient.
 
     Attributes:
         name: of a family of quadrupoles, or of one of them.
-        correctors, correctors_sigma: what the correctors' responses say, relative to the design.
-        with_rf, with_rf_sigma: what they say where gradients have to make the RF's orbit, too.
+        correctors, correctors_sigma: estimate by the correctors' responses, relative to the design.
+        with_rf, with_rf_sigma: estimate with the RF's orbit fitted, too.
         pull: the difference, in standard deviations of it.
     """
 
@@ -55,14 +55,14 @@ class Pull:
 
 @dataclass(frozen=True)
 class Inconsistency:
-    """That the two disagree.
+    """The inconsistency of the two estimates.
 
     Attributes:
         missed: by how much gradients by the correctors alone miss the RF's orbit, rms, m.
         known: by how much they would, rms, m: by their errors and the readings', as many of which
             the fit takes for independent.
         chi2, readings: of the RF's orbit, with the errors of that prediction.
-        pulls: gradients that stand out, the strongest first: of families, of magnets.
+        pulls: inconsistent gradients, the strongest first: of families, of magnets.
     """
 
     missed: float
@@ -72,17 +72,17 @@ class Inconsistency:
     pulls: tuple[Pull, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {**vars(self), "pulls": [dict(vars(own)) for own in self.pulls]}
 
 
 def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> Inconsistency | None:
-    """What the two disagree about; None where they agree, no gradients were fitted or no RF's orbit
-    was read.
+    """Return the inconsistency; None where the estimates agree, no gradients were fitted, or no
+    RF's orbit was read.
 
     Args:
-        state: where the fit stands.
-        false_alarm: chance that two are said to disagree that do not.
+        state: of the fit.
+        false_alarm: probability of a finding in consistent data.
     """
     single = QuadrupoleGradient()
     read, weights, left = rf_fitted(state)
@@ -125,8 +125,8 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
 def _pulls(
     names: list[str], alone: Array, wide: Array, both: Array, narrow: Array, families: int
 ) -> tuple[Pull, ...]:
-    """Families that stand out, then single magnets."""
-    more = np.maximum(wide - narrow, ROUNDING * wide)  # what the RF's orbit adds to know
+    """Inconsistent families, then single magnets."""
+    more = np.maximum(wide - narrow, ROUNDING * wide)  # the information of the RF's orbit
     pulls = np.where(more > 0, (both - alone) / np.sqrt(np.where(more > 0, more, 1.0)), 0.0)
     order = sorted(range(len(names)), key=lambda i: (i >= families, -abs(pulls[i])))
     return tuple(

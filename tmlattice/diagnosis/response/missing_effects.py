@@ -1,13 +1,12 @@
-"""Which effect a fitted orbit response still lacks: each hypothesis weighed on held-out readings.
+"""Effects missing from a fitted orbit response: each hypothesis is scored on held-out readings.
 
 >>> fit = fit_steps(data, split)
 >>> for row in weigh(fit.state): print(row.effect, row.amount, row.amount_sigma, row.judgement)
 
-A hypothesis is a set of patterns: what the readings would change by for one unit of each of its
-parameters. Patterns are fitted together with everything that the fit already has, linearly about
-it, to the same correctors; the held-out ones judge. What every corrector has of its own (its place,
-the machine's drift while it was stepped) is taken from a held-out corrector's near monitors, as its
-kick is.
+A hypothesis is a set of patterns, the derivatives of the readings by its parameters. They are
+fitted together with the parameters of the fit, linearised, to the same correctors; held-out ones
+are the validation set. The parameters of single correctors (place, drift during the step) are
+estimated from half of a held-out corrector's BPMs, like its kick.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -29,18 +28,18 @@ Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array
 
 FREE = 30.0
-"""Prior rms of a parameter that stands alone, of the largest sensible amount: none to speak of."""
+"""Prior rms of a single parameter, in units of the largest plausible amount: nearly flat."""
 FEW = 6
-"""So many amounts stand alone."""
+"""Most amounts of a hypothesis with such a prior."""
 CONTROL = 17
-"""Seed of the random parameters that patterns of single columns are held against."""
+"""Seed of the random parameters of the control."""
 SPARSE = 0.1
-"""Patterns are kept sparse where fewer of their readings are not zero."""
+"""Share of non-zero readings below which patterns are sparse."""
 
 
 @dataclass(frozen=True)
 class Weighed:
-    """A hypothesis and what held-out readings say of it.
+    """A hypothesis and its scores on held-out readings.
 
     Attributes:
         effect, unit, expected: see `Hypothesis`.
@@ -48,14 +47,14 @@ class Weighed:
         amount: the parameter, or the rms of several.
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
-        on_top_in_plane, on_top_position: with it and all others that are wanted together, m.
+        on_top_in_plane, on_top_position: with it and all accepted ones, m.
         evidence: by which the log evidence of the fitted readings grows with it alone: the misfit
             that it explains, less what its parameters cost.
         control_in_plane: with as many random parameters in its stead, m; None where columns have no
             amounts of their own. See `control`.
-        judgement: "helps", on top of all that help more; "helps, not on top", where those leave it
-            nothing; "as random ones do" (no more than its control); "unphysical" (it would help, by
-            more than physics allows); "excluded" (held-out readings do not want it).
+        judgement: "helps" (on top of all better ones); "helps, not on top"; "as random ones do" (no
+            more than its control); "unphysical" (improves with an implausible amount); "excluded"
+            (does not improve held-out readings).
     """
 
     effect: str
@@ -78,7 +77,7 @@ class Weighed:
 
 
 HELPS = 0.98
-"""Held-out rms falls to this share at least where a hypothesis helps."""
+"""Largest ratio of the held-out rms where a hypothesis improves."""
 
 
 def weigh(
@@ -86,10 +85,10 @@ def weigh(
     wanted: Iterable[str] | None = None,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> list[Weighed]:
-    """Every hypothesis alone and on top of the others; the first row is the fit without any.
+    """Score every hypothesis alone and on top of the others; the first row is the fit without any.
 
-    Those that physics allows are taken together, the best first, as long as each lowers the
-    held-out rms on top of those before it; then every other is weighed once more beside them.
+    Those that physics allows are accepted one by one, the best first, as long as each lowers the
+    held-out rms given those before; then every other is scored once more given them.
 
     Args:
         state: after the fit.
@@ -102,7 +101,7 @@ def weigh(
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
         hypothesis = HYPOTHESES[name](state)
-        # nothing where the ring has no such places, or no reading that is fitted would move
+        # nothing without such places, or without sensitive fitted readings
         if hypothesis is not None and fitted.sees(hypothesis):
             found.append(hypothesis)
     alone = [fitted.weigh([hypothesis]) for hypothesis in found]
@@ -111,7 +110,7 @@ def weigh(
     together, chosen = base, list[int]()
 
     def take(candidates: list[int]) -> None:
-        """The best of them, as long as it helps on top of those that were taken."""
+        """The best hypotheses, as long as each improves given those before."""
         nonlocal together
         left = list(candidates)
         while left:
@@ -175,11 +174,10 @@ def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:
 
 
 def control(hypothesis: Hypothesis) -> Hypothesis:
-    """As many parameters of the same size and as smooth along the ring, that have nothing to do
-    with their columns: each column's patterns, carried on by a random number of monitors.
+    """Random parameters as many, as large and as smooth along the ring, unrelated to their columns.
 
-    What columns have of their own is taken from half of a held-out one's monitors: a few smooth
-    orbits, whatever they are, describe the other half better than none.
+    Parameters of single columns are estimated from half of a held-out one's BPMs, so that any
+    smooth orbits improve the other half.
     """
     rng = np.random.default_rng(CONTROL)
     patterns = hypothesis.patterns.copy()
@@ -200,7 +198,7 @@ def _sensible(hypothesis: Hypothesis, answer: "Answer") -> bool:
 
 class Answer(NamedTuple):
     """Amounts of the last hypothesis, their errors, held-out rms without and with a jump, m, and
-    the log evidence of all of them."""
+    the log evidence of all."""
 
     amounts: Array
     sigma: Array
@@ -218,7 +216,7 @@ class Fitted:
         there = linear(state, 0)
         normal, self.start = there.normal, there.start
         self.slopes = there.by_ring
-        # one that does nothing stands there where no family of errors was kept
+        # a dummy without effect where no family was accepted
         basis = np.zeros((len(self.start), 1))
         basis = np.concatenate([basis, *(g.basis for g in there.groups)], axis=1)
         prior = np.concatenate([np.ones(1), *(g.scale for g in there.groups)])
@@ -263,11 +261,11 @@ class Fitted:
         return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
 
     def sees(self, hypothesis: Hypothesis) -> bool:
-        """Whether it would move a reading that is fitted."""
+        """Whether any fitted reading is sensitive to it."""
         return bool(hypothesis.patterns.any() and self._part(hypothesis).flat.shape[0])
 
     def weigh(self, hypotheses: Sequence[Hypothesis]) -> Answer:
-        """What held-out readings say of these hypotheses together."""
+        """The scores of these hypotheses together on held-out readings."""
         if not hypotheses:  # the same linear step as with one: the fit itself may still move
             moved = cho_solve(self.factor, self.vector)
             in_plane, position = self._score(self.change(self.spread @ moved - self.start), None)
@@ -286,7 +284,7 @@ class Fitted:
         C -= B.T @ half
         target = weight * self.target.ravel()
         r = np.concatenate([part.flat @ target for part in parts]) - half.T @ self.vector
-        # one or a few amounts are free; many have the scale that the evidence finds, within physics
+        # single amounts are free; many have the most probable scale, within physics
         owner = np.repeat(np.arange(len(parts)), np.diff(edge))
         many = [len(part.across.T) > FEW for part in parts]
         most = [one.most if m else FREE * min(one.most, 1e3)
@@ -313,7 +311,7 @@ class Fitted:
         return Answer(amounts[last], np.sqrt(variance[last]), rms, jumped, evidence)
 
     def _part(self, hypothesis: Hypothesis) -> "_Part":
-        """Its patterns that fitted readings see."""
+        """Patterns to which fitted readings are sensitive."""
         key = id(hypothesis)
         if key not in self._parts:
             flat = hypothesis.patterns.reshape(len(hypothesis.patterns), -1)
@@ -347,7 +345,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class _Part:
-    """A hypothesis as rows of readings, and what they share with the fit."""
+    """A hypothesis as derivatives of readings, and its products with the fit."""
 
     hypothesis: Hypothesis
     flat: Patterns  # [pattern, reading]
@@ -355,7 +353,7 @@ class _Part:
 
 
 def _scaled(flat: Patterns, by: Array) -> Patterns:
-    """Every reading times a number of its own."""
+    """A parameter for every reading."""
     return csr_array(flat.multiply(by)) if isinstance(flat, csr_array) else flat * by
 
 
@@ -364,7 +362,7 @@ def _dense(values: Patterns) -> Array:
 
 
 def _by_column(patterns: Array) -> csr_array:
-    """One parameter for each column that a pattern is not zero in, [parameter, reading]."""
+    """One parameter for each column in which a pattern is not zero, [parameter, reading]."""
     count, columns, monitors = patterns.shape
     rows = np.repeat(np.arange(count * columns), monitors)
     at = np.tile(np.arange(columns * monitors), count)

@@ -8,10 +8,9 @@ out from the rest, so that the figures of the steps judge and choose nothing.
 >>> result = diagnose_response(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
 
-Gain and calibration are degenerate in scale but for the dispersion; neighbouring quadrupoles can
-pull against one another. Priors settle both: a family of correctors or quadrupoles (one kind of
-magnet, or one supply) shares an error, its members scatter about it, and how much is learnt from
-the data.
+Gain and calibration are degenerate in scale without the dispersion, and neighbouring quadrupoles
+are correlated. Priors resolve both: a family of correctors or quadrupoles (one kind of magnet, or
+one supply) shares an error, its members scatter about it, and the scatter is learnt.
 """
 
 import time
@@ -43,8 +42,8 @@ from tmlattice.diagnosis.response.inconsistencies import inconsistencies
 from tmlattice.diagnosis.response.label_findings import label_findings
 from tmlattice.diagnosis.response.misplaced import Misplaced, misplaced
 from tmlattice.diagnosis.response.missing_effects import weigh
-from tmlattice.diagnosis.response.odd_readings import odd_readings, without_gross
-from tmlattice.diagnosis.response.odd_steps import beside
+from tmlattice.diagnosis.response.outlier_readings import outlier_readings, without_gross
+from tmlattice.diagnosis.response.outlier_steps import beside
 from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
@@ -75,13 +74,15 @@ from tmlattice.optics import ring_tunes
 Array = NDArray[np.float64]
 
 PATTERNS = 8
-"""The strongest patterns of what is left."""
+"""Number of the strongest patterns of the residual."""
 LARGE = 60_000
-"""Readings up to which single faults among small errors are sought: every number is fitted anew
-for each of them."""
-TOO_LARGE = "single faults among the small errors were not sought: there are too many readings"
+"""Most readings for the search for single faults among distributed errors, which refits
+everything."""
+TOO_LARGE = (
+    "single faults among the distributed errors were not sought: there are too many readings"
+)
 TYPICAL = 6
-"""Columns of a plane that say what a design leaves of the typical one."""
+"""Columns of a plane required for the typical one."""
 
 
 def diagnose_response(
@@ -97,11 +98,11 @@ def diagnose_response(
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> Diagnosis:
-    """Correctors and families, monitors, single gradients, then what couples the planes.
+    """Diagnose an orbit response: all families of errors, sparse solutions and single faults.
 
     Args:
         ring: the design.
-        measured: with an RF step, if it can be, and the noise of its readings; else that is
+        measured: with an RF step, if possible, and the noise of its readings; else that is
             learnt.
         holdout: share of the correctors that is never fitted.
         effects: only families of these are tried; else all.
@@ -216,8 +217,8 @@ def _families(
 
 
 def _far(state: State, unlike: RejectedChannels) -> bool:
-    """Whether the ring is to be fitted before columns are exchanged: in a design that is far off
-    they fit in each other's place by chance."""
+    """Whether the ring is fitted before swaps are sought: in a design far from the ring, swapped
+    columns match by chance."""
     gone = {name for name, _ in unlike.monitors}
     good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
     return strange(replace(state, good=good), TYPICAL) > FAR
@@ -256,7 +257,7 @@ def _faults(
 
 
 def _without(state: State, far: Sequence[Misplaced]) -> State:
-    """As if these had not been stepped: what they leave is explained, and no single fault's."""
+    """The state without steps of explained columns, which are evidence for no single fault."""
     gone = np.zeros(state.data.orbits.shape, dtype=bool)
     gone[[own.column for own in far]] = True
     return beside(state, gone)
@@ -269,12 +270,12 @@ def as_diagnosis(
     found: Sequence[StatedCause],
     **fields: Any,
 ) -> Diagnosis:
-    """What a fit of a response says, as a diagnosis.
+    """Return the diagnosis of a fit of a response.
 
     Args:
         ring: the design.
         fit: with its steps.
-        within: what the ring as found has.
+        within: errors of the estimated ring.
         found: causes with their errors.
         fields: further ones of the diagnosis.
     """
@@ -329,7 +330,7 @@ def _view(fit: StepwiseFit) -> ResponseView:
 
 
 def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dict[str, Any]:
-    """What made a diagnosis."""
+    """The provenance of a diagnosis."""
     from tmlattice.version import __version__
 
     return {
@@ -372,7 +373,7 @@ def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
 def _warnings(fit: StepwiseFit) -> tuple[str, ...]:
     """What a reader should know."""
     messages = dispersion_by_kicks(fit.state.values, fit.state.data)
-    return (*messages, *odd_readings(fit.state))
+    return (*messages, *outlier_readings(fit.state))
 
 
 def _misfit(fit: StepwiseFit, read: Array) -> Misfit:

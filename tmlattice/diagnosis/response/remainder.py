@@ -1,4 +1,4 @@
-"""What a fit of an orbit response leaves, compared with what it predicts of the readings.
+"""The residual of a fit of an orbit response, compared with its expected covariance.
 
 Fitted readings are compared with their noise, and the numbers that were fitted count as lost
 degrees of freedom. Held-out readings are compared with the posterior predictive covariance (Gelman
@@ -28,8 +28,8 @@ BLOCKS = ("in-plane", "coupling", "RF")
 
 
 def remainder(state: State) -> tuple[Block, ...]:
-    """Fitted and held-out readings of a state that has settled: in-plane, coupling, and the RF's
-    orbit; those without a reading are left out.
+    """Return fitted and held-out readings of a converged state: in-plane, coupling, and the RF's
+    orbit; without those that have no reading.
 
     Args:
         state: with its priors as learnt.
@@ -60,7 +60,7 @@ def _blocks(state: State) -> Iterator[Block]:
 
 
 def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, Array | None]:
-    """The fit of a block, and roots of what unknown prior scales add to its covariance."""
+    """The fit of a block, and roots of the covariance by unknown prior scales."""
     if not state.of_block(block):
         return None, None, None
     there = linear(state, block)
@@ -69,16 +69,16 @@ def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, 
 
 
 def _numbers(found: Posterior | None) -> float:
-    """Effective number of parameters: 1 of each that the data determine, 0 of each that its prior
-    holds."""
+    """Effective number of parameters: 1 for each that the data determine, 0 for each that its prior
+    determines."""
     if found is None:
         return 0.0
     return float(len(found.prior) - np.trace(found.covariance))
 
 
 class _Sum:
-    """Chi-square of readings column by column, in the covariance of their noise and, of held-out
-    ones, of the fit's posterior (by Woodbury's identity).
+    """Return chi-square of readings column by column, in the covariance of their noise and, of
+    held-out ones, of the fit's posterior (by Woodbury's identity).
 
     Args:
         state, block: of the readings.
@@ -108,7 +108,7 @@ class _Sum:
         self.vector, self.matrix = np.zeros(size), np.eye(size)
 
     def add(self, column: int, monitors: NDArray[np.bool_], free: bool = False) -> None:
-        """The readings of a column at some monitors; with its kick free or as it is."""
+        """The readings of a column at some BPMs; with its kick free or fixed."""
         read = np.flatnonzero(
             monitors & np.isfinite(self.left[column]) & np.isfinite(self.noise[column])
         )
@@ -135,7 +135,7 @@ class _Sum:
         self.matrix += slopes.T @ slopes
 
     def _plane(self, column: int) -> int:
-        """In which the block's readings of a column are."""
+        """The plane of the block's readings of a column."""
         return int(self.state.data.plane_of(self.block)[column])
 
     def _slopes(self, column: int, read: Indices) -> list[Array]:
@@ -148,7 +148,7 @@ class _Sum:
 
     @property
     def chi2(self) -> float:
-        """Of all readings together."""
+        """The sum over all readings."""
         if not len(self.vector):
             return self.square
         return self.square - float(self.vector @ np.linalg.solve(self.matrix, self.vector))

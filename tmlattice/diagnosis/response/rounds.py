@@ -120,8 +120,8 @@ def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:
 
 
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
-    """What the priors of one variable, which add up, ask for its values."""
-    if not groups:  # of numbers that a ring has none of
+    """The prior's gradient for the values of one variable; its priors add up."""
+    if not groups:  # the ring has no such numbers
         return 0.0
     each, shared = np.zeros(len(values)), []
     for group in groups:
@@ -131,11 +131,11 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
             each += np.abs(spread).sum(axis=1)
         else:
             shared.append(spread)
-    free = each > 0  # one that is held is not asked for
+    free = each > 0  # held numbers are skipped
     if not free.any():
         spread = np.concatenate(shared, axis=1)
         return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
-    # a few that are shared, each number's own takes the rest
+    # after shared ones, each number's own prior has the rest
     rest, scale = values[free] / each[free], each[free, None]
     few = np.concatenate([np.zeros((len(rest), 0)), *(own[free] / scale for own in shared)], axis=1)
     asked = np.concatenate([rest, np.zeros(few.shape[1])])

@@ -1,12 +1,12 @@
-"""All usual small errors of a ring as an orbit response shows them, with their sizes.
+"""All usual distributed errors of a ring in an orbit response, with their prior scales.
 
 >>> state = small_errors(data, split, fit.state)
 >>> sizes_in(linear(state, 0))
 
-What a fault is weighed against. Beside the families of a dense fit there is the closed orbit that
-kicks make (`orbit_modes`). Everything that was read is fitted, of held-out correctors the half of
-the monitors that gives their kicks. Sizes are those of Gauss, and the largest number of a family
-does not count: it may be the fault.
+They are the background model of a fault: the families of a hierarchical fit, and the closed orbit
+by kicks (`orbit_modes`). All readings are fitted; of held-out correctors the half of the BPMs that
+determines their kicks. Priors are Gaussian, and the largest number of a family is omitted from its
+scale, because it may be the fault.
 """
 
 import logging
@@ -47,29 +47,29 @@ USUAL: tuple[Family, ...] = (
     CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), MonitorRoll(),
     CorrectorRoll(), SkewGradient(),
 )  # fmt: skip
-"""Families that a ring always has."""
+"""Families of every ring."""
 ANEW = 20_000
-"""Readings up to which everything is also fitted from the design on: where the families alone went
-astray, they hide what they made up."""
+"""Most readings for a second fit from the design: a fit that diverged may have converged to a wrong
+ring."""
 EXPLAINED = 1.5
-"""Chi-square per reading of each plane at which one start is enough."""
+"""Chi-square per reading of each plane below which one start is sufficient."""
 SIZES = 12
-"""Rounds of EM for the sizes."""
+"""Rounds of EM for the prior scales."""
 SHARED = {
     "vertical_focusing": "vertical_focusing",
     "quadrupole_gradient of families": "quadrupole_gradient",
     "corrector_calibration of families": "corrector_calibration",
 }
-"""Groups of a few numbers, and whose usual size counts as much as `COUNTS` of them."""
+"""Groups of few numbers, whose usual scale counts as `COUNTS` of them."""
 COUNTS = 4
 
 
 def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
-    """Fitted to all that may be fitted.
+    """Fit the distributed errors to all readings outside the validation set.
 
     Args:
-        data, split: what was measured, and who judges.
-        fitted: a dense fit of it.
+        data, split: the data, and the validation split.
+        fitted: a hierarchical fit of the data.
     """
     data = _near(data, split)
     nobody = np.zeros_like(split.held)
@@ -83,7 +83,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
         try:
             state = settle(jump(bend(start), beyond=1.0), gain=ROUGH)
             state = settle(bend(state))
-        except (TmlatticeError, np.linalg.LinAlgError):  # astray
+        except (TmlatticeError, np.linalg.LinAlgError):  # diverged
             continue
         found.append((log_evidence(state, state.good), state))
         log.info("small errors: evidence %.1f", found[-1][0])
@@ -93,7 +93,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
 
 
 def _near(data: ResponseData, split: Split) -> ResponseData:
-    """Without the readings of held-out correctors that judge."""
+    """The data without the validation readings of held-out correctors."""
     far = split.held[:-1, None] & ~split.half[:-1]
     orbits = data.orbits.copy()
     orbits[:-1][far] = np.nan
@@ -101,8 +101,8 @@ def _near(data: ResponseData, split: Split) -> ResponseData:
 
 
 def _halves(split: Split) -> Flags:
-    """Monitors that give a corrector its kick while the others say whether it is that; of held-out
-    ones half of those that are read here."""
+    """BPMs that determine a corrector's kick, the others validate it; of held-out correctors half
+    of the remaining ones."""
     half = split.half.copy()
     for column in np.flatnonzero(split.held):
         half[column, np.flatnonzero(half[column])[::2]] = False
@@ -110,7 +110,7 @@ def _halves(split: Split) -> Flags:
 
 
 def _families(design: State, more: Sequence[Family]) -> list[Family]:
-    """Usual ones, and those that a fit wanted beside them."""
+    """Usual families, and those accepted in the fit."""
     known = [*USUAL, *orbit_families(design.data.ring, design.at.model)]
     names = [family.name for family in known]
     known += [family for family in more if family.name not in names]
@@ -118,7 +118,7 @@ def _families(design: State, more: Sequence[Family]) -> list[Family]:
 
 
 def _from(design: State, families: Sequence[Family], fitted: State) -> State:
-    """Where the families' fit stands."""
+    """The state of the hierarchical fit."""
     at = Predicted(design.data, Errors.none(design.data), fitted.at.bent)
     state = replace(design, at=at, lacking=fitted.lacking, groups=fitted.groups)
     state = allow(state, families)
@@ -126,12 +126,12 @@ def _from(design: State, families: Sequence[Family], fitted: State) -> State:
                                            if k in state.values}})  # fmt: skip
 
 
-# --- how large they are ---------------------------------------------------------------------------
+# --- prior scales ---------------------------------------------------------------------------
 def sizes_in(there: Linear) -> tuple[Group, ...]:
-    """The priors with sizes from all numbers but each family's largest.
+    """The priors with scales from all numbers but each family's largest.
 
     Args:
-        there: where the fit stands.
+        there: of the fit.
     """
     groups = [replace(group, each=None, freedom=np.inf) for group in there.groups]
     pull = there.normal.vector + there.normal.matrix @ there.start
@@ -148,7 +148,7 @@ def sizes_in(there: Linear) -> tuple[Group, ...]:
 
 
 def _sized(group: Group, squares: Array) -> Group:
-    """Of all but the largest, as much larger as that makes them smaller by chance."""
+    """The mean square without the largest, corrected for that omission."""
     n = len(squares)
     if group.fixed or not n:
         return group
@@ -158,7 +158,7 @@ def _sized(group: Group, squares: Array) -> Group:
     elif n < 3:
         mean = float(squares.mean())
     else:
-        expected = float(ndtri(0.5 / n)) ** 2  # of the largest of n
+        expected = float(ndtri(0.5 / n)) ** 2  # expectation of the largest of n
         without = (squares.sum() - squares.max()) / max(n - expected, 1.0)
         mean = min(float(squares.mean()), float(without))
     return replace(group, rms=max(float(np.sqrt(mean)), SMALLEST))

@@ -1,8 +1,8 @@
-"""Few causes of an orbit response's gap: the search of trajectories, on the response's rows.
+"""A sparse solution of an orbit response's gap: the search of trajectories, on the response's rows.
 
-A magnet, a corrector or a monitor that is wrong alone is named before families of small errors are
-fitted. Where a few causes do not explain the readings to their noise, this says nothing: errors are
-everywhere, and the dense fit is asked.
+A single faulty magnet, corrector or BPM is identified before families of distributed errors are
+fitted. Where a sparse set of causes leaves more than noise, this returns None, and the hierarchical
+fit follows.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,53 +37,48 @@ from tmlattice.observe.split import Split
 Flags = NDArray[np.bool_]
 
 MOST = 3
-"""More causes are not few: each costs a search of its own."""
+"""Causes of a sparse solution at most: each costs a search of its own."""
 
 RARER = 100.0
-"""Each cause beyond the first is so many times less likely than the one before: what another one of
-them makes is known in part, and what is left of it looks like one more."""
+"""Log prior odds of each further cause: the residual of an inexact cause looks like one more."""
 
 NOISE, REST = 1.5, 0.01
-"""Where what is left is more than noise, a few causes explain a response if they leave less than
-this chi-square per reading, and this share of the gap: a noise stated a little low leaves as much,
-small errors everywhere leave more."""
+"""Chi-square per reading, and share of the gap, below which a sparse solution is accepted although
+it leaves more than noise. Understated noise leaves as much, distributed errors leave more."""
 
 
 PATTERNS, SPARE = 2, 2
-"""A thin error at one place changes each plane's response by the product of a column and a row (it
-kicks by what the corrector does there, and the monitors see that kick): two patterns a cause. What
-a magnet's length and sextupoles add has the spare ones."""
+"""Patterns of a cause: a thin error at one place changes each plane's response by a product of a
+column and a row. Spare patterns are for a magnet's length and sextupoles."""
 
 ROUNDS, SETTLED = 30, 0.99
-"""Of filling in what was not read, at most, and the share of chi-square that another one leaves
-where it is worth no more: of a column that is read by half, a round finds half of the rest."""
+"""Rounds of filling in missing readings, and the least gain of chi-square in a round."""
 
 LESS = 0.98
-"""Of what a few causes leave, both planes' rms multiplied: small errors everywhere have to leave
-less, or the few have it."""
+"""Ratio of both planes' rms, multiplied, to those of the sparse solution below which distributed
+errors are preferred."""
 
 LARGER = 2.0
-"""Times the largest fault: a kick of more is none, and stands for what it does to the tunes by all
-sextupoles."""
+"""Ratio to the largest fault above which a kick is implausible, because it stands for its tune
+shift by sextupoles."""
 
 
 BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12
-"""Readings times what is left open, from which on that is not looked at; searches at most; and
-hypotheses that are weighed among it, before and after one of them is known to explain them."""
+"""Most products of readings and undetermined errors; searches; and hypotheses, before and after one
+of them explains the readings."""
 
 
 @dataclass(frozen=True)
 class SparseFit:
-    """What few causes explain.
+    """A sparse solution.
 
     Attributes:
         fit: the design, the same with the causes, and each of them as a step.
         findings: by falling statistic.
         verdict: the least certain of theirs.
         told: the causes with their errors.
-        said: what a reader should know.
-        noise: whether what they leave is noise, as much as is stated: no more, and no less, for
-            beside less there is room for other causes.
+        said: messages.
+        noise: whether the residual is noise of the stated size, neither more nor less.
     """
 
     fit: StepwiseFit
@@ -96,7 +91,7 @@ class SparseFit:
 
 @dataclass(frozen=True)
 class _Search(Search):
-    """A search for one cause first, and for some more where one is not all.
+    """A search for one cause first, and for more where one is not sufficient.
 
     Attributes:
         stated: chi-square that the stated noise leaves at most.
@@ -115,18 +110,18 @@ def sparse_fit(
     progress: Callable[[str], Any] = lambda stage: None,
     open_: Undetermined | None = None,
 ) -> SparseFit | None:
-    """The few causes of a response, or None where few do not explain it.
+    """Return the sparse solution of a response, or None where it has none.
 
     Args:
         data: what was measured.
-        split: held-out correctors give half of their monitors to the fit: nothing else tells what
-            they do of what they are told.
+        split: held-out correctors give half of their monitors to the fit: it determines their own
+            calibration.
         effects: names of those that may be the cause; None: all usual ones.
         most: findings at most.
         judgement: thresholds.
         seed: of the threshold's simulation.
-        progress: told what is being done.
-        open_: what is not known of the ring, whose response is known nevertheless.
+        progress: called with the name of each stage.
+        open_: undetermined errors of the ring, whose response is known.
     """
     hypotheses = single_causes(data, effects)
     if not hypotheses:
@@ -152,7 +147,7 @@ def sparse_fit(
     )  # fmt: skip
     try:
         found = _explained(search, problem, before, gap)
-    except UnstableRingError:  # a few causes lead to where no beam is stored
+    except UnstableRingError:  # the sparse solution stores no beam
         found = None
     if open_ is not None and open_.root.size and open_.size(problem) <= BLURRED:
         found = _among_open(search, problem, before, found, open_)
@@ -171,12 +166,12 @@ def outperforms(fit: StepwiseFit, sparse: StepwiseFit) -> bool:
 
 
 def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> Explanation | None:
-    """Few causes in the ring as it is known; None where so few do not explain it."""
+    """The sparse solution in the known ring; None where there is none."""
     if _hopeless(problem, search.hypotheses, before, MOST, search.enough):
         return None
     found = explain(search, before)
     if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * MOST):
-        return None  # the strongest of a few would explain its share
+        return None  # the strongest cause would explain its share
     if found.fit.chi2 > search.enough:
         if _hopeless(problem, search.hypotheses, found.fit, MOST - 1, search.enough):
             return None
@@ -185,8 +180,7 @@ def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> E
 
 
 def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
-    """With causes that are seen beside what explains the readings, if what they leave together is
-    noise as it is stated: what stands out of more than that may be anything."""
+    """The solution with further causes, if the residual together is noise of the stated size."""
     try:
         more = explain(replace(search, most=MOST, enough=-np.inf), before, found)
     except UnstableRingError:  # one of them stores no beam
@@ -197,8 +191,8 @@ def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
 def _among_open(
     search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
 ) -> Explanation | None:
-    """The same where what causes do is known no better than the ring is: one cause, and what is
-    seen beside it, where that is likelier than what was found, else what was found."""
+    """The solution given the ring's undetermined errors, where it is more probable; else the
+    previous one."""
     seen = found.first if found else scan(
         plain.metric(before.point), search.hypotheses, before.residual, seed=search.seed
     )  # fmt: skip
@@ -217,7 +211,9 @@ def _among_open(
     if found is not None:
         starts |= {(c.effect, c.element): c.amount for c in found.fit.causes}
     tried = changes.all_of(starts)
-    if tried and tried[0].fit.chi2 <= search.enough:  # its like, among what is open of it
+    if (
+        tried and tried[0].fit.chi2 <= search.enough
+    ):  # similar causes, given the undetermined errors
         about = changes.among(tried[0])
         there = about.at((), about.first)
         again = scan(about.metric(there), search.hypotheses, there.residual, effective=1.0)
@@ -242,8 +238,8 @@ def _among_open(
 
 
 def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
-    """The search repeated among what is open of what was found; and its log evidence, if it still
-    explains the readings there."""
+    """The search repeated given the undetermined errors; and its log evidence, if it still explains
+    the readings."""
     evidence = -np.inf
     for _ in range(AGAIN):
         problem = blur.among(blur.of(found.fit.causes))
@@ -262,11 +258,11 @@ def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanatio
 def _hopeless(
     problem: Response, hypotheses: Sequence[Hypothesis], left: Fit, number: int, enough: float
 ) -> bool:
-    """Whether so few causes more, none beyond all measure, cannot explain what is left to less than
-    enough: quick, where the search for each is not."""
+    """Whether a few further causes cannot reduce the residual below the limit: a quick test before
+    the search."""
     if _beyond(problem, left, PATTERNS * number + SPARE, enough) <= enough:
         return False
-    # a kick, and another energy of the beam, are no pattern of columns by readings
+    # a kick, and an energy offset, are no product of columns and readings
     others = [h for h in hypotheses
               if not find(h[0]).responds or isinstance(find(h[0]), LaunchEffect)]  # fmt: skip
     seen = scan(problem.metric(left.point), others, left.residual, effective=1.0)
@@ -275,9 +271,9 @@ def _hopeless(
 
 
 def _beyond(problem: Response, before: Fit, patterns: int, enough: float) -> float:
-    """Chi-square that the strongest patterns [column] x [monitor, plane] leave: a few causes cannot
-    explain more, whatever they are; quick, where a scan is not. What was not read is filled in by
-    the patterns themselves, until less than `enough` is left or no more comes of it."""
+    """A lower bound of chi-square for sparse solutions: the residual of the strongest patterns
+    [column] x [monitor, plane]. Missing readings are filled in by the patterns, until less than
+    `enough` is left or a round gains nothing."""
     left = problem.left(before.point)[0].reshape(len(problem.used), -1)
     used = problem.used.reshape(left.shape)
     filled, rest = left, np.inf

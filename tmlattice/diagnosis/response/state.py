@@ -25,15 +25,15 @@ Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 ALONE = 0.3
-"""A column whose misfit falls to this share by its own number has no other error to speak of."""
+"""Ratio to which a column's misfit falls by its own number if it has no other significant error."""
 FEW = 3
-"""Readings that it takes to judge the gain of a monitor."""
+"""Readings required to check the gain of a BPM."""
 
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """Numbers of one variable that are wrong together and alone: a prior of their own, beside that
-    of their family, which so learns nothing from them.
+    """Numbers of one variable with a common single fault: a prior of their own, apart from their
+    family's, whose scale it does not change.
 
     Attributes:
         cause: effect and place.
@@ -51,12 +51,12 @@ class Apart:
 
     @property
     def name(self) -> str:
-        """Of its prior."""
+        """The name of its prior."""
         return f"alone: {self.cause[0]} {self.cause[1]}"
 
 
 class Kept(NamedTuple):
-    """What the ring's numbers of one variable do to the readings, and where that was taken."""
+    """Derivatives of the readings by the ring's numbers of one variable, and their point."""
 
     rows: Array  # [number, column, monitor]
     gain: Array  # [column, monitor]
@@ -66,7 +66,7 @@ class Kept(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything that is fitted.
+    """The state of the fit.
 
     Attributes:
         data, split: what was measured, and who judges.
@@ -115,7 +115,7 @@ class State:
         return tuple(family for family in self.families if family.block == block)
 
     def reads(self, block: int) -> bool:
-        """Whether correctors that are fitted have readings of a block."""
+        """Whether fitted correctors have readings of a block."""
         orbits = self.data.pick(self.data.orbits, block)
         return bool(np.isfinite(orbits[self.fitted][:, self.good]).any())
 
@@ -125,12 +125,12 @@ class State:
 
     @property
     def fitted(self) -> Flags:
-        """Correctors that are, [column]; the RF's monitors are split instead."""
+        """Fitted correctors, [column]; the RF's BPMs are split instead."""
         out = self.split.held | (self.split.inner & self.exploring)
         return np.asarray(~out & (np.arange(len(out)) < len(out) - 1))
 
     def moved(self, values: Mapping[str, Array]) -> "State":
-        """With other values, and what the model reads with them."""
+        """The state with other values, and the model's readings with them."""
         errors = Errors.none(self.data)
         for family in {f.variable: f for f in self.families}.values():
             errors = family.put(errors, values[family.variable], self.data)
@@ -138,7 +138,7 @@ class State:
 
 
 def begin(data: ResponseData, split: Split) -> State:
-    """The design."""
+    """The state of the design."""
     at = Predicted(data, Errors.none(data))
     gap = data.pick(at.left)[~split.held]
     size = float(np.nanmedian(np.abs(gap))) / 0.6745
@@ -148,8 +148,8 @@ def begin(data: ResponseData, split: Split) -> State:
 
 
 def bend(state: State) -> State:
-    """With the third order of the steps where the fit stands. A ring that stores no beam with such
-    a step is far from the one that was measured, and keeps what it has."""
+    """The state with the third order of the steps; unchanged where the ring stores no beam with
+    such a step."""
     try:
         return replace(state, at=state.at.bend())
     except UnstableRingError:
@@ -157,7 +157,7 @@ def bend(state: State) -> State:
 
 
 def allow(state: State, families: Sequence[Family]) -> State:
-    """With more families, at zero or where they are to begin; those that are there stay."""
+    """The state with more families, at zero or at given values; present ones are unchanged."""
     values = {f.variable: np.zeros(f.size(state.data)) for f in families}
     begun = any(state.values.get(name, new).any() for name, new in values.items())
     begun &= not {f.variable for f in state.families} >= set(values)
@@ -171,7 +171,7 @@ def allow(state: State, families: Sequence[Family]) -> State:
 
 
 def forbid(state: State, families: Sequence[Family]) -> State:
-    """Without some families; numbers that no other family moves go back to zero."""
+    """The state without some families; numbers of no other family return to zero."""
     names = [family.name for family in families]
     gone = {group.name for family in families for group in family.groups(state.data)}
     left = tuple(family for family in state.families if family.name not in names)
@@ -182,8 +182,8 @@ def forbid(state: State, families: Sequence[Family]) -> State:
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
-    """What each column alone says of its own number, from its near monitors: with the third order
-    of its step, or without it where that agrees better (it was taken at a kick twice too large).
+    """Return each column's own estimate of its number, from its near BPMs: with the third order of
+    its step, or without it where that agrees better.
 
     Returns:
         The change of the number, and the far readings' mean squares in units of the noise, without
@@ -213,8 +213,8 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
 
 
 def by_monitors(state: State) -> Array:
-    """What each monitor alone says of its gains, over those that it has, x and y of each, [2 x
-    monitor]: from half of the columns that are fitted, where the other half agrees; else 1."""
+    """Each BPM's own estimate of its gains relative to the present ones, x and y of each, [2 x
+    monitor]: from half of the fitted columns, where the other half agrees; else 1."""
     model, orbits = (state.data.pick(own) for own in (state.at.read, state.data.orbits))
     gains = np.ones((len(state.data.at), 2))
     for p in (0, 1):
@@ -233,17 +233,17 @@ def by_monitors(state: State) -> Array:
 
 
 def jump(state: State, beyond: float | None = None) -> State:
-    """Start large numbers of single columns at what the column alone says.
+    """The state with large numbers of single columns at their own estimates.
 
     Args:
-        state: whose column families are looked at.
-        beyond: trusted changes; None: what is gross.
+        state: whose column families are checked.
+        beyond: limits of the changes; None: `Family.gross`.
     """
     values = dict(state.values)
     for family in state.families:
         if family.per == "monitor" and not np.isinf(family.gross):
             gains = by_monitors(state)
-            far = np.abs(gains - 1) > family.gross  # of a gain of zero nothing can be made
+            far = np.abs(gains - 1) > family.gross  # a gain of zero has no estimate
             moved = np.where(far, (1 + values[family.variable]) * (gains - 1), 0.0)
             values[family.variable] = values[family.variable] + moved
         limit = family.gross if beyond is None else beyond * family.trust
@@ -257,7 +257,7 @@ def jump(state: State, beyond: float | None = None) -> State:
 
 
 def rms_of(parts: Iterable[Array]) -> float:
-    """Over all of them; NaN where there is none."""
+    """The mean over all entries; NaN without any."""
     values = np.concatenate(list(parts))
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 

@@ -1,4 +1,4 @@
-"""The errors of a dense fit's numbers as they are told.
+"""The stated errors of a hierarchical fit's numbers.
 
 >>> there = linear(state, 0)
 >>> posterior = solve(there.normal, there.groups, there.start, rounds=0)
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 class Stated(NamedTuple):
-    """What is stated of the numbers of one block, in the order of `linear`.
+    """Stated errors of the numbers of one block, in the order of `linear`.
 
     Attributes:
         sigma: standard errors, [parameter].
@@ -38,18 +38,18 @@ class Stated(NamedTuple):
 
 
 def unwidened(posterior: Posterior) -> Stated:
-    """The posterior's own."""
+    """Posterior errors without widening."""
     prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     return Stated(posterior.sigma, prior, covariance)
 
 
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Stated:
-    """Posterior errors, widened by what readings share (`of_readings`), by what the sizes of
-    families are unknown by (`of_sizes`), and by members that may be faulty (`heavy_tails`).
+    """Return posterior errors, widened by common-mode noise of the readings (`of_readings`), by
+    unknown prior scales (`of_sizes`), and by possible single faults (`heavy_tails`).
 
     Args:
-        state: where the fit stands.
+        state: of the fit.
         block: 0 in-plane, 1 coupling.
         there: `linear` of that block.
         posterior: solved from it.
@@ -57,7 +57,7 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
     square = of_readings(state, block, there, posterior) ** 2
     square += np.sum(of_sizes(state, block, there) ** 2, axis=1)
     tails = moments(there.normal, there.groups, there.start)
-    # mean square about the numbers as they are stated, beyond the posterior's
+    # mean square about the stated numbers, beyond the posterior's
     off = np.diag(tails.covariance) + (tails.mean - posterior.values) ** 2
     square += np.maximum(off - posterior.sigma**2, 0.0)
     prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
@@ -65,8 +65,7 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
 
 
 def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
-    """Posterior errors, widened where single columns, or monitors, contradict all others; see
-    `stated`."""
+    """Posterior errors, widened for columns or BPMs that contradict all others; see `stated`."""
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     found = LinearFit.of(there.normal.matrix, covariance)
     return _widened(state, block, there, posterior, found)
@@ -87,11 +86,11 @@ def of_sizes(state: State, block: int, there: Linear) -> Array:
 
 
 def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> float:
-    """By how much the variance of the amount of what is wrong alone grows so, as a factor.
+    """The factor by which the variance of a single fault's amount grows by this.
 
     Args:
         state, there, posterior: as in `stated`; its block is that of the cause.
-        one: has a prior of its own in them.
+        one: has its own prior in them.
     """
     ends = np.cumsum([group.basis.shape[1] for group in posterior.groups])
     at = int(ends[[group.name for group in posterior.groups].index(one.name)]) - 1
@@ -110,7 +109,7 @@ def _widened(
     rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.by_ring)
     weights = weight(state, block)
     left = np.where(weights > 0, data.pick(state.at.left, block), 0.0)
-    moved = posterior.values - there.start  # rounds end before the last digit
+    moved = posterior.values - there.start  # rounds end before full precision
     for column in np.flatnonzero(weights.any(axis=1)):
         seen = np.flatnonzero(weights[column])
         left[column, seen] -= rows.times(np.full(len(seen), column), seen, moved[:, None])[:, 0]

@@ -18,8 +18,8 @@ from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
 from tmlattice.diagnosis.response.linear import Linear, linear
-from tmlattice.diagnosis.response.odd_readings import robust
-from tmlattice.diagnosis.response.odd_steps import beside, odd_steps
+from tmlattice.diagnosis.response.outlier_readings import robust
+from tmlattice.diagnosis.response.outlier_steps import beside, outlier_steps
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others
 from tmlattice.diagnosis.response.rounds import Evidence, evidence_of, linear_evidence, settle
 from tmlattice.diagnosis.response.set_aside import taken_back
@@ -162,16 +162,16 @@ def fit_steps(
     """
     design = begin(data, split)
     stages, state = _in_turn(design, trials, progress)
-    readings, steps_gone = odd_steps(state)
+    readings, steps_gone = outlier_steps(state)
     if readings.messages:  # the families went after them, and what that made of steps is not known
         stages, state = _in_turn(beside(design, readings.unread), trials, progress)
-        more, steps_gone = odd_steps(state)
+        more, steps_gone = outlier_steps(state)
         readings = readings.and_more(more)
     odd = readings.and_more(steps_gone)
     progress("all together")
     state, doubts = _together(beside(state, odd.unread), stages)
     log.info("independent readings: %s", state.independent)
-    odd = odd.and_more(*odd_steps(state))  # what is usual is less now
+    odd = odd.and_more(*outlier_steps(state))  # what is usual is less now
     state, design = beside(state, odd.unread), beside(design, odd.unread)
     state, moving = _beside_jitter(state, progress)
     split = state.split

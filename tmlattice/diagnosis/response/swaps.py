@@ -1,8 +1,9 @@
-"""Correctors whose columns are exchanged: each answers as the other one should.
-Monitors whose readings are; and those whose planes are.
+"""Swapped correctors: each responds as the other one should. Swapped BPMs, and BPMs with swapped
+planes.
 
-A table of names, or two cables, may be wrong in one place. The orbit of such a corrector resembles
-the model's far too well for a stranger: it seems displaced by the way to its neighbour.
+A table of names, or two cables, may be wrong in one place. The orbit of a swapped corrector still
+resembles the model's, so it is not rejected but looks misplaced by the distance to its
+neighbour.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -20,15 +21,14 @@ from tmlattice.measurement import OrbitResponse
 Array = NDArray[np.float64]
 
 SHARE = 0.25
-"""Of the mean square left of each of the two columns, left at most once they are exchanged."""
+"""Largest ratio of the mean square of each of the two columns after and before the swap."""
 
 Pair = tuple[str, str]
 
 
 class Swaps(NamedTuple):
-    """What was exchanged: planes of monitors; pairs of correctors, and of monitors, and by how much
-    chi-square fell once they were put right, with the typical noise. And what was rejected: a
-    monitor with its plane, or a corrector with None."""
+    """Swaps: BPMs with swapped planes; pairs of correctors and of BPMs, with the fall of chi-square
+    at the typical noise. And rejected channels: a BPM with its plane, or a corrector with None."""
 
     planes: list[str]
     correctors: dict[Pair, float]
@@ -43,14 +43,13 @@ def labels_corrected(
     odd: RejectedChannels,
     among: Collection[str],
 ) -> tuple[OrbitResponse, str] | None:
-    """The measurement with pairs exchanged that were not known, and what they are, in words; None
-    where there are none.
+    """The measurement with new swaps corrected, and messages about them; None where there are none.
 
     Args:
-        state: what the model makes of the readings.
-        measured: what they are of.
-        known: pairs that were put right before; new ones are added.
-        odd: what resembles nothing.
+        state: with the model's readings.
+        measured: the measurement.
+        known: pairs that were corrected before; new ones are added.
+        odd: rejected channels.
         among: correctors that may answer as others should.
     """
     pairs = _new(swaps(state, {*odd.correctors, *among}), known.correctors)
@@ -61,20 +60,19 @@ def labels_corrected(
 
 
 def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
-    """Pairs that were not known; they are now."""
+    """New pairs, added to the known ones."""
     new = [pair for pair in found if pair not in known]
     known.update((pair, found[pair]) for pair in new)
     return new
 
 
 def swaps(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
-    """Pairs, and by how much chi-square falls: neighbours of a plane, in beam order, then any two
-    of some that may be exchanged, and any two that move the beam in each other's plane. None
-    stands in two of them.
+    """Swapped pairs with their fall of chi-square: neighbours of a plane, in beam order, then any
+    two of given ones, and any two of different planes. Each corrector is in one pair at most.
 
     Args:
-        state: what the model makes of the readings.
-        among: names of those that may be exchanged with one another anywhere in the ring.
+        state: with the model's readings.
+        among: names of those that may be swapped anywhere in the ring.
     """
     data = state.data
     model, names = state.at.seen(state.at.beam), data.measured.correctors
@@ -102,7 +100,7 @@ def swaps(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
 def _suspects(
     state: State, among: Collection[str]
 ) -> Iterator[tuple[list[int], Iterable[tuple[int, int]]]]:
-    """Columns that may be exchanged, two by two, and the planes in which they tell."""
+    """Columns that may be swapped, two by two, and the planes that show it."""
     data, names = state.data, state.data.measured.correctors
     for p in (0, 1):
         mine = np.flatnonzero(data.plane[:-1] == p)
@@ -117,7 +115,7 @@ def _suspects(
 
 
 def swap_message(pairs: Iterable[Pair], what: str = "correctors") -> str:
-    """In words."""
+    """The message about swapped pairs."""
     both = ", ".join(f"{a} and {b}" for a, b in pairs)
     return (
         f"{what} that respond each as the other one should, taken as swapped: {both}; look at "
@@ -126,7 +124,7 @@ def swap_message(pairs: Iterable[Pair], what: str = "correctors") -> str:
 
 
 def correctors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
-    """The measurement with their columns exchanged."""
+    """The measurement with their columns swapped."""
     order = np.arange(len(measured.correctors))
     for pair in pairs:
         a, b = (measured.correctors.index(name) for name in pair)
@@ -137,13 +135,13 @@ def correctors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResp
 
 
 def swapped_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
-    """Pairs of some monitors, anywhere in the ring, in both planes, whatever their gains, and by
-    how much chi-square falls; none stands in two.
+    """Swapped pairs of some BPMs, anywhere in the ring, in both planes, whatever their gains, with
+    the fall of chi-square; each BPM is in one pair at most.
 
     Args:
         state: what the model makes of the readings.
-        among: those that resemble nothing: of a design with another phase advance many others seem
-            to be read one cell further on.
+        among: rejected channels; with a design of another phase advance many others look
+            shifted by one cell.
     """
     data, read = state.data, state.at.seen(state.at.beam)
     model, orbits = data.pick(read)[:-1], data.pick(data.orbits)[:-1]
@@ -167,7 +165,7 @@ def swapped_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
 
 
 def monitors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResponse:
-    """The measurement with the readings of monitors exchanged, their noise and the RF's too."""
+    """The measurement with the readings of BPMs swapped, their noise and the RF's too."""
     order = np.arange(len(measured.monitors))
     for pair in pairs:
         a, b = (measured.monitors.index(name) for name in pair)
@@ -180,7 +178,7 @@ def monitors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitRespon
 
 
 def swapped_planes(state: State) -> list[str]:
-    """Monitors that read in each plane what the model has in the other one, whatever their gain."""
+    """BPMs whose readings in each plane match the model's other plane, whatever their gain."""
     data, read = state.data, state.at.seen(state.at.beam)
     found = []
     for m, name in enumerate(data.measured.monitors):
@@ -192,14 +190,14 @@ def swapped_planes(state: State) -> list[str]:
 
 
 def _left(measured: Array, model: Array) -> float:
-    """Of readings [column, 2], with a gain of each plane that is not negative."""
+    """The chi-square of readings [column, 2], with a non-negative gain of each plane."""
     gain = np.maximum((measured * model).sum(axis=0), 0.0)
     gain = gain / np.maximum((model**2).sum(axis=0), 1e-300)
     return float(np.sum((measured - gain * model) ** 2))
 
 
 def planes_back(measured: OrbitResponse, monitors: Sequence[str]) -> OrbitResponse:
-    """The measurement with the planes of some monitors exchanged."""
+    """The measurement with the planes of some BPMs swapped."""
     at = [measured.monitors.index(name) for name in monitors]
     response, rf = measured.response.copy(), measured.rf
     response[:, at] = response[:, at, ::-1]

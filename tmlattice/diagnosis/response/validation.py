@@ -1,8 +1,8 @@
-"""Who judges a dense fit of an orbit response: correctors that were not fitted.
+"""The validation of a hierarchical fit of an orbit response, on correctors that were not fitted.
 
-Of each of them only the kick is taken, from half of the monitors; the other half judges. Those that
-are held out for good (`score`) choose nothing; those that choose among families (`inner`) say too
-how well they know it, for they may be four.
+For each of them the kick is estimated from half of the BPMs, and the prediction is scored on the
+other half. The outer validation set (`score`) selects nothing. The inner one (`inner`) selects
+families, with standard errors, because it may have only four correctors.
 """
 
 from dataclasses import dataclass, replace
@@ -29,20 +29,20 @@ most of the readings ask for."""
 
 
 class Chi2(NamedTuple):
-    """A sum of squares in units of the noise, and of how many readings."""
+    """A sum of squares in units of the noise, with the number of readings."""
 
     total: float
     readings: int
 
     @property
     def per_reading(self) -> float:
-        """1 is noise."""
+        """Chi-square per reading; 1 is noise."""
         return self.total / max(self.readings, 1)
 
 
 @dataclass(frozen=True)
 class Score:
-    """What the judges say: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
+    """Validation scores: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
 
     in_plane: float
     coupling: float
@@ -54,7 +54,7 @@ class Score:
 
 
 class _Missed(NamedTuple):
-    """What the far readings of correctors that were not fitted miss, m, column by column.
+    """Residuals of the far readings of held-out correctors, m, column by column.
 
     Attributes:
         inside: in-plane.
@@ -120,7 +120,7 @@ def _missed(
         kick, miss = amplitudes(np.column_stack([straight[c], moved]), orbits[c], near, far, held)
         inside.append(miss)
         squares.append(miss**2 / variance[c, far])
-        # the kick's own error stands beside the reading's
+        # the kick's error adds to the reading's
         spread.append(1 + straight[c, far] ** 2 / np.sum(straight[c, near] ** 2))
         jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
         left = orbits_across[c] - kick[0] * across[c]
@@ -140,12 +140,12 @@ def _missed(
 
 
 def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
-    """What correctors that were not fitted say; each has its kick from its near monitors.
+    """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
     Args:
-        state: that is judged.
-        judges: the correctors that judge, [column].
-        rf: monitors that judge the RF's response; None: those that did not fit it.
+        state: that is validated.
+        judges: the correctors of the validation set, [column].
+        rf: monitors that validate the RF's response; None: those that did not fit it.
     """
     missed = _missed(state, validation, rf)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
@@ -165,7 +165,7 @@ def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
 
 
 class Validated(NamedTuple):
-    """What those who choose are left with: sums of squares, m^2, and counts of readings.
+    """Residuals of the inner validation set: sums of squares, m^2, and counts of readings.
 
     Attributes:
         columns: of each corrector, in-plane and across, [column, 2, (sum, count)].
@@ -177,7 +177,7 @@ class Validated(NamedTuple):
 
     @property
     def logs(self) -> Array:
-        """Logarithms of rms, in-plane, across and of the RF; NaN of what nobody read."""
+        """Log rms, in-plane, across and of the RF; NaN without readings."""
         return _logs(np.concatenate([self.columns.sum(axis=0), self.rf.sum(axis=0)[None]]))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.independent import independent
-from tmlattice.diagnosis.response.odd_readings import rf_shares, shares
+from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference.common import amounts, common, times_precision
 

@@ -150,7 +150,7 @@ def _pulls(state: State, block: int, left: Array) -> Array:
     return np.asarray(left / np.fmax(state.data.noise_of(block)[:-1], typical[:, None]))
 
 
-def odd_readings(state: State) -> list[str]:
+def outlier_readings(state: State) -> list[str]:
     """Sentences of those that stick out of a result, where there are any."""
     if state.share is None:
         return []

@@ -1,7 +1,7 @@
 """Steps of correctors, and single readings, that went wrong, by what a fit leaves of them: they are
 not fitted, and judge nobody.
 
->>> readings, steps = odd_steps(state)
+>>> readings, steps = outlier_steps(state)
 >>> odd = readings.and_more(steps)
 >>> state = beside(state, odd.unread)
 """
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
-from tmlattice.diagnosis.response.odd_readings import gross, told_gross
-from tmlattice.diagnosis.response.other_kicks import OtherKick, left_in_plane, other_kicks
+from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
+from tmlattice.diagnosis.response.spurious_kicks import SpuriousKick, left_in_plane, spurious_kicks
 from tmlattice.diagnosis.response.state import State, bend, jump
 from tmlattice.diagnosis.response.swaps import swaps
 from tmlattice.observe.response_data import ResponseData
@@ -28,7 +28,7 @@ GAINS = "monitor_gain"
 
 
 @dataclass(frozen=True)
-class OddSteps:
+class OutlierSteps:
     """What went wrong.
 
     Attributes:
@@ -39,15 +39,15 @@ class OddSteps:
     unread: Flags
     messages: tuple[str, ...] = ()
 
-    def and_more(self, *others: "OddSteps") -> "OddSteps":
+    def and_more(self, *others: "OutlierSteps") -> "OutlierSteps":
         """With others."""
         unread, messages = self.unread, self.messages
         for own in others:
             unread, messages = unread | own.unread, (*messages, *own.messages)
-        return OddSteps(unread, messages)
+        return OutlierSteps(unread, messages)
 
 
-def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
+def outlier_steps(state: State) -> tuple[OutlierSteps, OutlierSteps]:
     """Single readings that went wrong; and steps whose readings belong to no orbit, and those with
     another kick in them: none where too few are left to fit and to judge.
 
@@ -58,7 +58,7 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
     data, split = state.data, state.split
     nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
-        return OddSteps(nothing), OddSteps(nothing)
+        return OutlierSteps(nothing), OutlierSteps(nothing)
     # beside a far lattice a column may have begun with a calibration that it has not, and with the
     # third order of that
     state = bend(jump(state, beyond=1.0))
@@ -69,12 +69,12 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
     state = beside(state, alone)
     broken = inconsistent(state)
     alone[broken] = False  # among all the others
-    single = OddSteps(alone, tuple(told_gross(data, alone, "the fit")))
+    single = OutlierSteps(alone, tuple(told_gross(data, alone, "the fit")))
     names = data.measured.correctors
     swapped = {name for pair in swaps(state) for name in pair}  # to be put right, not left out
     others = [
         own
-        for own in other_kicks(state)
+        for own in spurious_kicks(state)
         if not broken[own.column] and names[own.column] not in swapped
     ]
     unread = np.zeros((len(data.plane), 2), dtype=bool) | broken[:, None]
@@ -85,9 +85,9 @@ def odd_steps(state: State) -> tuple[OddSteps, OddSteps]:
     unread[left_in_plane(state, [own.column for own in others])] = True
     gone = unread.all(axis=1)
     if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
-        return single, OddSteps(nothing)
+        return single, OutlierSteps(nothing)
     whole = np.broadcast_to(unread[:, None], nothing.shape)
-    return single, OddSteps(whole, (*_torn(data, broken), *_kicked(state, others)))
+    return single, OutlierSteps(whole, (*_torn(data, broken), *_kicked(state, others)))
 
 
 def _beside_own_kick(state: State) -> Array:
@@ -117,7 +117,7 @@ def _torn(data: ResponseData, columns: Flags) -> list[str]:
     ]
 
 
-def _kicked(state: State, others: list[OtherKick]) -> list[str]:
+def _kicked(state: State, others: list[SpuriousKick]) -> list[str]:
     if not others:
         return []
     names, layers = state.data.measured.correctors, state.at.model.maps.layers

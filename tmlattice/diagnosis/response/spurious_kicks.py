@@ -36,7 +36,7 @@ ENOUGH, COLUMNS = 12, 5
 
 
 @dataclass(frozen=True)
-class OtherKick:
+class SpuriousKick:
     """Something that kicked the beam while a corrector was stepped.
 
     Attributes:
@@ -53,7 +53,7 @@ class OtherKick:
     amount: float
 
 
-def other_kicks(state: State) -> list[OtherKick]:
+def spurious_kicks(state: State) -> list[SpuriousKick]:
     """Those that stand out.
 
     Args:
@@ -71,7 +71,7 @@ def left_in_plane(state: State, suspects: Sequence[int]) -> list[int]:
     usual in their own, too.
 
     Args:
-        state: as in `other_kicks`.
+        state: as in `spurious_kicks`.
         suspects: the columns.
     """
     found: list[int] = []
@@ -127,7 +127,7 @@ def _columns(state: State, kicked: int, plane: int) -> list[_Column]:
     return found
 
 
-def _of_planes(state: State, kicked: int, plane: int) -> list[OtherKick]:
+def _of_planes(state: State, kicked: int, plane: int) -> list[SpuriousKick]:
     columns = _columns(state, kicked, plane)
     if len(columns) < COLUMNS:
         return []
@@ -157,7 +157,7 @@ def _of_planes(state: State, kicked: int, plane: int) -> list[OtherKick]:
     return found
 
 
-def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> OtherKick | None:
+def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> SpuriousKick | None:
     """The kick that explains a column, if one does; see the module.
 
     Args:
@@ -188,7 +188,7 @@ def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> OtherKic
     beside_it = missed(patterns[layer])
     if beside_it > SHARE * without or beside_it > HERE * here:
         return None
-    return OtherKick(one.column, plane, layer, amount)
+    return SpuriousKick(one.column, plane, layer, amount)
 
 
 def _beside(state: State, one: _Column, jump: Array) -> Flags:
