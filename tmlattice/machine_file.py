@@ -18,10 +18,10 @@ from tmlattice.correction.knobs import Knob, knobs_of, read_knobs
 from tmlattice.errors import MachineFileError, plain
 from tmlattice.importers import Options, Told, bring_in
 from tmlattice.importers.imported import Imported
-from tmlattice.importers.told import METRES
 from tmlattice.input_files import check_shape, toml_of
 from tmlattice.lattice import Ring, builtin_lattices, load_ring
 from tmlattice.measurement import AnyMeasurement, read_measurement
+from tmlattice.measurement.arrays import METRES
 
 NAME = "tmlattice.toml"
 """Of the file that commands look for in the working directory."""

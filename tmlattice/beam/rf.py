@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from tmlattice.effects import Settings, expected_loss
 from tmlattice.errors import LatticeError
-from tmlattice.lattice import Ring
-from tmlattice.maps import ring_maps
+from tmlattice.lattice import Ring, stated
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 FREQUENCY = 499.65e6
@@ -92,13 +91,7 @@ def stable_phase(ring: Ring, phase: float) -> float:
     """
     if ring.gamma > RELATIVISTIC:
         return phase
-    maps = ring_maps(ring, 6)
-    turn = np.eye(6)
-    for own in (*maps.W1, maps.closing.coefficients[1]):
-        turn = own @ turn
-    dispersion = np.linalg.solve(np.eye(4) - turn[:4, :4], turn[:4, 5])
-    late = turn[4, :4] @ dispersion + turn[4, 5]
-    return phase if late > 0 else float(np.pi) - phase
+    return phase if stated.slip(ring) > 0 else float(np.pi) - phase
 
 
 def speed_of(ring: Ring) -> float:

@@ -42,7 +42,7 @@ class Sections(click.Group):
         own = {
             name: option
             for option in self.params
-            if isinstance(option, click.Option) and option.name != "version"
+            if isinstance(option, click.Option)
             for name in option.opts
         }
         first: list[str] = []

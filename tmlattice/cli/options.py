@@ -378,6 +378,11 @@ class Workers(click.ParamType):  # type: ignore[type-arg]
         return {"jobs": number}
 
 
+epochs_option = click.option(
+    "--epochs", type=click.IntRange(1), default=1000, show_default=True,
+    help="Gradient steps at most.",
+)  # fmt: skip
+
 jobs_option = click.option(
     "--jobs", "workers", type=Workers(), default={},
     help="Local processes (else one a core), or the address of a Dask scheduler.",

@@ -11,6 +11,7 @@ from tmlattice.cli.options import (
     Careful,
     checked_ring,
     console,
+    epochs_option,
     jobs_option,
     json_option,
     quiet_option,
@@ -75,13 +76,7 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     show_default=True,
     help="Relative change of the magnet's strength.",
 )
-@click.option(
-    "--epochs",
-    type=click.IntRange(1),
-    default=1000,
-    show_default=True,
-    help="Gradient steps at most.",
-)
+@epochs_option
 @jobs_option
 @quiet_option
 def tune_fit(
@@ -156,13 +151,7 @@ def tune_fit(
     show_default=True,
     help="Of a measurement; repeat for several.",
 )
-@click.option(
-    "--epochs",
-    type=click.IntRange(1),
-    default=1000,
-    show_default=True,
-    help="Gradient steps at most.",
-)
+@epochs_option
 @json_option
 @quiet_option
 def localisation(

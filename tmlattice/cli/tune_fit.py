@@ -13,6 +13,7 @@ from tmlattice.cli.options import (
     Launch,
     WithDefault,
     console,
+    epochs_option,
     json_option,
     lattice_argument,
     open_ring,
@@ -81,13 +82,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Rms of one reading, m.",
 )
-@click.option(
-    "--epochs",
-    type=click.IntRange(1),
-    default=1000,
-    show_default=True,
-    help="Gradient steps at most.",
-)
+@epochs_option
 @click.option(
     "--seed",
     type=click.IntRange(0),

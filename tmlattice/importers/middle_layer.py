@@ -20,13 +20,13 @@ from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, check_fields, numbers
 from tmlattice.importers.loco import Iteration, bring_loco, conventions
 from tmlattice.measurement import OrbitResponse
+from tmlattice.measurement.arrays import METRES
 from tmlattice.measurement.orbit_response import RfStep
 
 Array = NDArray[np.float64]
 Fields = Mapping[str, Any]
 Device = tuple[int, ...]
 
-METRES = {"mm": 1e-3, "m": 1.0, "meter": 1.0, "metre": 1.0, "um": 1e-6, "micron": 1e-6, "nm": 1e-9}
 RADIANS = {"rad": 1.0, "radian": 1.0, "radians": 1.0, "mrad": 1e-3, "urad": 1e-6}
 FIELDS = {
     "Data": float, "ActuatorDelta": float, "Sigma": float, "dp": float, "DeviceList": float,

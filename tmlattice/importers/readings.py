@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError, unknown_name
 from tmlattice.importers.columns import Column
 from tmlattice.importers.imported import Imported, counted, device_names
-from tmlattice.importers.told import METRES, Told
+from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, TurnByTurn
+from tmlattice.measurement.arrays import METRES
 from tmlattice.measurement.lost_beam import about_sums, no_beam
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.turn_by_turn import FEWEST, MOST

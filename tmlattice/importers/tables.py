@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.importers.columns import SDDS, Column
 from tmlattice.importers.imported import Imported, counted, device_names
-from tmlattice.importers.middle_layer import METRES, RADIANS
+from tmlattice.importers.middle_layer import RADIANS
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
@@ -25,7 +25,7 @@ from tmlattice.measurement import (
     TurnByTurn,
     read_turn_by_turn,
 )
-from tmlattice.measurement.arrays import Unit
+from tmlattice.measurement.arrays import METRES, Unit
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
 from tmlattice.measurement.tables import KINDS

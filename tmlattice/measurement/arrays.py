@@ -11,7 +11,11 @@ from tmlattice.errors import MeasurementError
 Array = NDArray[np.float64]
 Unit = Literal["m", "mm", "um", "nm"]
 
-_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
+METRES = {
+    "m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9,
+    "µm": 1e-6, "micron": 1e-6, "meter": 1.0, "metre": 1.0,
+}  # fmt: skip
+"""Units of a reading, by every name that files give them, in m."""
 
 
 def metres(unit: str) -> float:
@@ -20,9 +24,9 @@ def metres(unit: str) -> float:
     Raises:
         MeasurementError: another unit.
     """
-    if unit not in _METRES:
-        raise MeasurementError(f"no unit '{unit}'; readings are in {', '.join(_METRES)}")
-    return _METRES[unit]
+    if unit not in METRES:
+        raise MeasurementError(f"no unit '{unit}'; readings are in {', '.join(METRES)}")
+    return METRES[unit]
 
 
 def names_of(elements: Iterable[Any]) -> tuple[str, ...]:

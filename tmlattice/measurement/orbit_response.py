@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
+from tmlattice.measurement.checks import keep
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
@@ -128,12 +129,9 @@ class OrbitResponse(Shown):
         return cls(names_of(steered), by_column, sizes, names, response, noise, rf)
 
     def __post_init__(self) -> None:
-        def keep(**values: Any) -> None:
-            for name, value in values.items():
-                object.__setattr__(self, name, value)
-
         kicks, response = (np.asarray(a, dtype=float) for a in (self.kicks, self.response))
         keep(
+            self,
             correctors=tuple(self.correctors),
             planes=tuple(self.planes),
             monitors=tuple(self.monitors),
@@ -169,7 +167,7 @@ class OrbitResponse(Shown):
                     raise MeasurementError(
                         f"the RF step's orbit has the shape {orbit.shape}, not [{monitors}, 2]"
                     )
-                keep(rf=replace(rf, orbit=orbit))
+                keep(self, rf=replace(rf, orbit=orbit))
         if self.energy is not None and not 0 < self.energy < HIGHEST_ENERGY:
             raise MeasurementError(
                 f"an energy of {self.energy:g} GeV cannot be; it is above zero, and in GeV"
@@ -181,7 +179,7 @@ class OrbitResponse(Shown):
             raise MeasurementError("an orbit change is infinite; a missing one is NaN")
         if not any(np.isfinite(a).any() for a in everything):
             raise MeasurementError("every orbit change is missing; nothing can be fitted")
-        keep(noise=noise_table(self.noise, self.monitors))
+        keep(self, noise=noise_table(self.noise, self.monitors))
 
     def in_order_of(self, monitors: Sequence[str]) -> "OrbitResponse":
         """The same with other monitors, such as a ring's: NaN where one was not read.
