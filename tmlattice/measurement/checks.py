@@ -1,7 +1,7 @@
 """What records of a stored beam's measurements have in common: checks, and monitors in order."""
 
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,6 @@ from tmlattice.measurement.trajectory import Settings, check_settings
 
 Array = NDArray[np.float64]
 Values = TypeVar("Values", Array, None, Array | None)
-
-
-def keep(record: Any, **values: Any) -> None:
-    """Set fields of a frozen record, while it is being made."""
-    for name, value in values.items():
-        object.__setattr__(record, name, value)
 
 
 def check_values(values: Array, one: str) -> None:

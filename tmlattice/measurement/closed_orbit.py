@@ -13,7 +13,6 @@ from tmlattice.measurement.checks import (
     check_energy,
     check_values,
     checked_shots,
-    keep,
 )
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.shots import Shots
@@ -87,8 +86,7 @@ class ClosedOrbit(Shots):
         check_values(orbit, "reading")
         check_energy(self.energy)
         shots, settings = checked_shots(self.shots, self.settings, len(orbit), "orbits")
-        keep(
-            self,
+        self._keep(
             orbit=orbit,
             monitors=monitors,
             noise=noise_table(self.noise, monitors),

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.checks import check_energy, check_values, keep, monitor_places, spread
+from tmlattice.measurement.checks import check_energy, check_values, monitor_places, spread
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.orbit_response import RfStep, check_rf
 from tmlattice.measurement.shown import Shown
@@ -92,8 +92,7 @@ class Dispersion(Shown):
         if not steps:
             raise MeasurementError("no step of the RF; dispersion is the orbit change for one")
         check_energy(self.energy)
-        keep(
-            self,
+        self._keep(
             steps=tuple(steps),
             monitors=monitors,
             noise=noise_table(self.noise, monitors),

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.checks import keep
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
@@ -130,8 +129,7 @@ class OrbitResponse(Shown):
 
     def __post_init__(self) -> None:
         kicks, response = (np.asarray(a, dtype=float) for a in (self.kicks, self.response))
-        keep(
-            self,
+        self._keep(
             correctors=tuple(self.correctors),
             planes=tuple(self.planes),
             monitors=tuple(self.monitors),
@@ -167,7 +165,7 @@ class OrbitResponse(Shown):
                     raise MeasurementError(
                         f"the RF step's orbit has the shape {orbit.shape}, not [{monitors}, 2]"
                     )
-                keep(self, rf=replace(rf, orbit=orbit))
+                self._keep(rf=replace(rf, orbit=orbit))
         if self.energy is not None and not 0 < self.energy < HIGHEST_ENERGY:
             raise MeasurementError(
                 f"an energy of {self.energy:g} GeV cannot be; it is above zero, and in GeV"
@@ -179,7 +177,7 @@ class OrbitResponse(Shown):
             raise MeasurementError("an orbit change is infinite; a missing one is NaN")
         if not any(np.isfinite(a).any() for a in everything):
             raise MeasurementError("every orbit change is missing; nothing can be fitted")
-        keep(self, noise=noise_table(self.noise, self.monitors))
+        self._keep(noise=noise_table(self.noise, self.monitors))
 
     def in_order_of(self, monitors: Sequence[str]) -> "OrbitResponse":
         """The same with other monitors, such as a ring's: NaN where one was not read.

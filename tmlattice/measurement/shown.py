@@ -41,6 +41,11 @@ class Shown(Speaks):
         "Return the measurement of an xarray Dataset or DataArray.",
     )
 
+    def _keep(self, **values: Any) -> None:
+        """Set fields of the frozen record, while it is being made."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
     def __eq__(self, other: object) -> bool:
         """Whether both are of one kind and hold the same values; NaN equals NaN."""
         return type(self) is type(other) and same(vars(self), vars(other))

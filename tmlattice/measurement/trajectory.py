@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError, first_of, unknown_name
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.checks import keep
 from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
 from tmlattice.measurement.shown import Shown
 
@@ -152,7 +151,7 @@ class Measurement(Shown):
             sigma = _five(self.launch_sigma, number, "launch_sigma")
             if not (sigma >= 0).all():
                 raise MeasurementError("a launch_sigma is negative or NaN; it is an rms, or inf")
-            keep(self, launch_sigma=sigma)
+            self._keep(launch_sigma=sigma)
         settings = tuple(self.settings)
         if settings and len(settings) != number:
             raise MeasurementError(f"{len(settings)} settings for {number} shots; one a shot")
@@ -162,8 +161,7 @@ class Measurement(Shown):
             )
         for shot, changed in zip(shots, settings, strict=False):
             check_settings(shot, changed)
-        keep(
-            self,
+        self._keep(
             launches=launches,
             readings=readings,
             monitors=monitors,

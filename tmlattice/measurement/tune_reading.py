@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement.checks import check_energy, checked_shots, keep
+from tmlattice.measurement.checks import check_energy, checked_shots
 from tmlattice.measurement.shown import Shown
 from tmlattice.measurement.trajectory import Settings
 
@@ -64,8 +64,7 @@ class TuneReading(Shown):
             raise MeasurementError("errors of chromaticities need chromaticities; add them")
         check_energy(self.energy)
         shots, settings = checked_shots(self.shots, self.settings, len(tune), "tunes")
-        keep(
-            self,
+        self._keep(
             tune=tune,
             tune_error=_rms("tune", self.tune_error, tune),
             chromaticity=chromaticity,

@@ -13,7 +13,6 @@ from tmlattice.measurement.checks import (
     check_energy,
     check_values,
     checked_shots,
-    keep,
 )
 from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.shots import Shots
@@ -100,8 +99,7 @@ class TurnByTurn(Shots):
         check_values(readings, "reading")
         check_energy(self.energy)
         shots, settings = checked_shots(self.shots, self.settings, len(readings), "readings")
-        keep(
-            self,
+        self._keep(
             readings=readings,
             monitors=monitors,
             noise=noise_table(self.noise, monitors),
