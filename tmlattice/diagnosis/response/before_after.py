@@ -331,7 +331,7 @@ def _sparse_or_all(
     if sparse is not None and sparse.noise:
         return sparse
     fit = _fit_change(data, split, trials, progress)
-    return fit if sparse is None or outperforms(fit, sparse.fit) else sparse
+    return fit if sparse is None or outperforms(fit, sparse, judgement) else sparse
 
 
 def _verdict(state: State) -> str:

@@ -131,9 +131,10 @@ def diagnose_response(
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
-    if sparse is None or overstated(ring, data.measured):  # to such a noise a few explain anything
+    if sparse is None or not sparse.noise or overstated(ring, data.measured):
         whole = _families(ring, measured, trials, holdout, max_effects, seed, progress)
-        sparse = None if sparse is None or outperforms(whole[0], sparse.fit) else sparse
+        worse = sparse is None or outperforms(whole[0], sparse, judgement)
+        sparse = None if worse else sparse
     rejected: tuple[tuple[str, str | None], ...] = ()
     if sparse is None:
         fit, measured, unlike, swaps = whole

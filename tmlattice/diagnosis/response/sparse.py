@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.assessment import combined_p_value
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
+from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import Step, StepwiseFit
@@ -76,9 +78,11 @@ class SparseFit:
         fit: the design, the same with the causes, and each of them as a step.
         findings: by falling statistic.
         verdict: the least certain of theirs.
-        told: the causes with their errors.
-        said: messages.
-        noise: whether the residual is noise of the stated size, neither more nor less.
+        fitted_causes: the causes with their errors.
+        messages: of the search.
+        p_value: of the residual, over its blocks.
+        noise: whether the residual is noise of the stated size, neither more nor less, in each of
+            its blocks.
     """
 
     fit: StepwiseFit
@@ -86,6 +90,7 @@ class SparseFit:
     verdict: str
     fitted_causes: list[StatedCause]
     messages: tuple[str, ...]
+    p_value: float
     noise: bool
 
 
@@ -156,11 +161,14 @@ def sparse_fit(
     return _result(data, split, problem.base, found, count, most, judgement)
 
 
-def outperforms(fit: StepwiseFit, sparse: StepwiseFit) -> bool:
-    """Whether correctors that were not fitted say that a fit of everything knows more than a few
-    causes do, of the monitors that it takes for good and the planes that were read."""
+def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bool:
+    """Whether a fit of everything explains more than a sparse solution: it alone leaves noise, or
+    held-out correctors favour it, in the planes that were read and the BPMs that it accepts."""
+    if sparse.p_value < judgement.noise[0] <= combined_p_value(remainder(fit.state)):
+        return True
+    state = sparse.fit.state
     of_all = fit.heldout[1]
-    of_few = score(replace(sparse.state, good=fit.state.good), sparse.state.split.held)
+    of_few = score(replace(state, good=fit.state.good), state.split.held)
     gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
     return bool(np.nansum(gained) < np.log(LESS))
 
@@ -321,6 +329,9 @@ def _result(
     errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
     stepwise = StepwiseFit(design, state, tuple(steps), (), heldout)
     fitted_causes = list(zip(causes, errors, strict=True))
-    less = p_value > 1 - judgement.noise[1]
-    noise = p_value >= judgement.noise[1] and not less
-    return SparseFit(stepwise, findings[:most], verdict, fitted_causes, messages, noise)
+    expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
+    left = combined_p_value(remainder(state))
+    return SparseFit(
+        stepwise, findings[:most], verdict, fitted_causes, messages, left,
+        noise=expected and left >= judgement.noise[0],
+    )  # fmt: skip
