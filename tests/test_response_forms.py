@@ -170,6 +170,6 @@ def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_
         response[place] += 20 * np.nanstd(response)
     data = replace(whole, response=response)
     measured, (said,) = without_gross(data, response_data(small_ring, data))
-    assert said.endswith(f"left out: 4; most at {whole.correctors[2]} (2)")
+    assert said.endswith(f"rejected: 4; most at {whole.correctors[2]} (2)")
     gone = np.isnan(measured.response) & np.isfinite(response)
     assert [tuple(place) for place in np.argwhere(gone)] == places
