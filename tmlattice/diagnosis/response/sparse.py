@@ -1,8 +1,7 @@
 """A sparse solution of an orbit response's gap: the search of trajectories, on the response's rows.
 
 A single faulty magnet, corrector or BPM is identified before families of distributed errors are
-fitted. Where a sparse set of causes leaves more than noise, this returns None, and the hierarchical
-fit follows.
+fitted. If a sparse set of causes leaves more than noise, the hierarchical fit follows.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +36,7 @@ from tmlattice.observe.split import Split
 Flags = NDArray[np.bool_]
 
 MOST = 3
-"""Causes of a sparse solution at most: each costs a search of its own."""
+"""Most causes of a sparse solution: each costs a search of its own."""
 
 RARER = 100.0
 """Log prior odds of each further cause: the residual of an inexact cause looks like one more."""
@@ -55,17 +54,17 @@ ROUNDS, SETTLED = 30, 0.99
 """Rounds of filling in missing readings, and the least gain of chi-square in a round."""
 
 LESS = 0.98
-"""Ratio of both planes' rms, multiplied, to those of the sparse solution below which distributed
-errors are preferred."""
+"""Ratio of the product of both planes' rms to the sparse solution's, below which a fit is
+better."""
 
 LARGER = 2.0
-"""Ratio to the largest fault above which a kick is implausible, because it stands for its tune
-shift by sextupoles."""
+"""Ratio to the largest fault above which a kick is implausible: it fits a tune shift by
+sextupoles."""
 
 
 BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12
-"""Most products of readings and undetermined errors; searches; and hypotheses, before and after one
-of them explains the readings."""
+"""Most products of readings and undetermined errors; most searches; and hypotheses, before and
+after one of them explains the readings."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,8 @@ class SparseFit:
         fit: the design, the same with the causes, and each of them as a step.
         findings: by falling statistic.
         verdict: the least certain of theirs.
-        told: the causes with their errors.
-        said: messages.
+        fitted_causes: the causes with their errors.
+        messages: about the findings.
         noise: whether the residual is noise of the stated size, neither more nor less.
     """
 
@@ -113,11 +112,10 @@ def sparse_fit(
     """Return the sparse solution of a response, or None where it has none.
 
     Args:
-        data: what was measured.
-        split: held-out correctors give half of their monitors to the fit: it determines their own
-            calibration.
-        effects: names of those that may be the cause; None: all usual ones.
-        most: findings at most.
+        data: the measurement on the ring.
+        split: half of the BPMs of held-out correctors is fitted, and determines their calibration.
+        effects: names of candidates; None: all usual ones.
+        most: most findings.
         judgement: thresholds.
         seed: of the threshold's simulation.
         progress: called with the name of each stage.
@@ -157,8 +155,8 @@ def sparse_fit(
 
 
 def outperforms(fit: StepwiseFit, sparse: StepwiseFit) -> bool:
-    """Whether correctors that were not fitted say that a fit of everything knows more than a few
-    causes do, of the monitors that it takes for good and the planes that were read."""
+    """Return whether the hierarchical fit predicts held-out readings better than the sparse
+    solution, at the BPMs that it does not reject, in the planes that were read."""
     of_all = fit.heldout[1]
     of_few = score(replace(sparse.state, good=fit.state.good), sparse.state.split.held)
     gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
@@ -191,8 +189,8 @@ def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
 def _among_open(
     search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
 ) -> Explanation | None:
-    """The solution given the ring's undetermined errors, where it is more probable; else the
-    previous one."""
+    """The solution given undetermined errors of the ring, if more probable; else the previous
+    one."""
     seen = found.first if found else scan(
         plain.metric(before.point), search.hypotheses, before.residual, seed=search.seed
     )  # fmt: skip
@@ -238,8 +236,8 @@ def _among_open(
 
 
 def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
-    """The search repeated given the undetermined errors; and its log evidence, if it still explains
-    the readings."""
+    """The search repeated given undetermined errors; its log evidence, if it explains the
+    readings."""
     evidence = -np.inf
     for _ in range(AGAIN):
         problem = blur.among(blur.of(found.fit.causes))
@@ -258,8 +256,7 @@ def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanatio
 def _hopeless(
     problem: Response, hypotheses: Sequence[Hypothesis], left: Fit, number: int, enough: float
 ) -> bool:
-    """Whether a few further causes cannot reduce the residual below the limit: a quick test before
-    the search."""
+    """Whether a few further causes cannot reduce the residual below the limit: a quick test."""
     if _beyond(problem, left, PATTERNS * number + SPARE, enough) <= enough:
         return False
     # a kick, and an energy offset, are no product of columns and readings
