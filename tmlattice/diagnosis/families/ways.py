@@ -44,7 +44,7 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
     """
     found, ways = list[Element](), list[Element]()
     within, bends = list[_Placed](), list[float]()
-    begin = np.inf  # of the first way, which ends the last turn's
+    begin = np.inf  # the first straight ends at the first magnet of the turn
     for element, s in _around(ring):
         if not _parts(element):
             within.append(_Placed(element, s))
@@ -63,7 +63,7 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
 
 class _Placed(NamedTuple):
     element: Element
-    s: float  # m, one turn further where the way to it goes through the lattice's first place
+    s: float  # m, one turn further behind the lattice's first element
 
 
 def _parts(element: Element) -> bool:

@@ -246,8 +246,7 @@ def _of_the_ring(fitted: State) -> Iterator[str]:
 def _by_good_monitors(
     ring: Ring, fitted: State, before: OrbitResponse, after: OrbitResponse, messages: list[str]
 ) -> tuple[ResponseData, ResponseData, Errors]:
-    """Both measurements, and the errors of the first, without BPMs that are bad in it; messages
-    too."""
+    """Both measurements, and the errors of the first, without BPMs that are bad in the first."""
     errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     if not fitted.good.all():
         names = np.array(fitted.data.measured.monitors)

@@ -6,8 +6,7 @@
 A hierarchical fit estimates an error of every quadrupole. The same readings are explained again by
 common factors, numbers that many magnets share. Candidates of every level are compared by the
 marginal likelihood (`inference.levels`), with alternative sets (`inference.sets`). The learnt
-scatter of single magnets is in every error. Outlier magnets are reported with correlated
-neighbours.
+scatter of single magnets is in every error. Outlier magnets are reported, with their neighbours.
 """
 
 from collections.abc import Sequence

@@ -242,7 +242,7 @@ class _Search:
         return other if gained > 0 else state
 
     def revised(self, state: State) -> State:
-        """The state with each cause compared with its alternatives again, without redundant
+        """The state with each cause compared with its alternatives, and without redundant
         causes."""
         for one in state.apart[:-1]:
             state = self.better(state, one)
@@ -259,7 +259,7 @@ class _Search:
         return state
 
     def members(self, state: State, one: Apart) -> int:
-        """Number of amounts that determine the statistic's scale: of the family, or of orbit
+        """Number of amounts that determine the statistic's scale: of the family, or orbit
         patterns."""
         if one.variable not in (kind.variable for kind in KINDS):
             return max(len(one.members) - 1, 1)
@@ -323,8 +323,7 @@ def _place(seen: Seen, one: Apart) -> int:
 
 
 def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
-    """Statistic, amount and error of a cause, widened for BPMs and columns that contradict
-    others."""
+    """Statistic, amount and error of a cause, widened for contradicting BPMs and columns."""
     own, here = seen.beside(one.name), _place(seen, one)
     it = seen.blocks[one.block]
     posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)

@@ -73,8 +73,7 @@ def elsewhere(data: ResponseData) -> Guess | None:
 
 
 def first_guess(design: State) -> Guess | None:
-    """Return the start of a fit of the design; None if that is near enough, or nothing is
-    better."""
+    """Return the start of a fit of the design; None if that is near, or nothing is better."""
     unexplained = strange(design)
     family = QuadrupoleGradient()
     if not unexplained > FAR or not family.size(design.data):

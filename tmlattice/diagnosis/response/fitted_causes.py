@@ -72,8 +72,7 @@ def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: 
 def _correlated(
     state: State, families: Iterable[Family], there: Linear, covariance: Array
 ) -> tuple[Correlation, ...]:
-    """Strongly correlated amounts of the magnets' families; each number is named by its first
-    cause."""
+    """Strongly correlated amounts of the magnets' families, each named by its first cause."""
     amounts: list[Hypothesis] = []
     numbers: list[int] = []
     for family in families:

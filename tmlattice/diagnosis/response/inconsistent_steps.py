@@ -30,8 +30,7 @@ _MAD = 1.4826  # of a Gaussian
 
 
 def inconsistent(state: State) -> Flags:
-    """Return the columns whose readings are no single orbit, given gains and gradients,
-    [column]."""
+    """Return the columns whose readings are no single orbit, [column]; `state` has gains."""
     data = state.data
     out = np.zeros(len(data.plane), dtype=bool)
     for plane in (0, 1):

@@ -64,8 +64,7 @@ def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, 
 
 
 def _numbers(found: Posterior | None) -> float:
-    """Effective number of parameters: 1 for each that the data determine, 0 for each at its
-    prior."""
+    """Effective number of parameters: 1 for each by the data, 0 for each by its prior."""
     if found is None:
         return 0.0
     return float(len(found.prior) - np.trace(found.covariance))

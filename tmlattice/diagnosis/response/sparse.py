@@ -54,12 +54,10 @@ ROUNDS, SETTLED = 30, 0.99
 """Rounds of filling in missing readings, and the least gain of chi-square in a round."""
 
 LESS = 0.98
-"""Ratio of the product of both planes' rms to the sparse solution's, below which a fit is
-better."""
+"""Product of both planes' rms, relative to the sparse solution's, below which a fit is better."""
 
 LARGER = 2.0
-"""Ratio to the largest fault above which a kick is implausible: it fits a tune shift by
-sextupoles."""
+"""Ratio to the largest fault above which a kick is implausible: it fits a tune shift."""
 
 
 BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12
@@ -189,8 +187,7 @@ def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
 def _among_open(
     search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
 ) -> Explanation | None:
-    """The solution given undetermined errors of the ring, if more probable; else the previous
-    one."""
+    """The solution given undetermined errors of the ring, if more probable; else `found`."""
     seen = found.first if found else scan(
         plain.metric(before.point), search.hypotheses, before.residual, seed=search.seed
     )  # fmt: skip
@@ -236,8 +233,7 @@ def _among_open(
 
 
 def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
-    """The search repeated given undetermined errors; its log evidence, if it explains the
-    readings."""
+    """The search repeated given undetermined errors; its log evidence, -inf if it fails."""
     evidence = -np.inf
     for _ in range(AGAIN):
         problem = blur.among(blur.of(found.fit.causes))

@@ -233,8 +233,7 @@ def lost(without: Validated, within: Validated) -> tuple[float, float]:
 
 
 def against(change: tuple[float, float], least: float = VETO) -> bool:
-    """Return whether validation is significantly better without, by `lost`, by at least this
-    much."""
+    """Return whether validation is significantly better without, by `lost`, and by `least`."""
     return change[0] < -max(least, SURELY * change[1])
 
 

@@ -70,8 +70,7 @@ def _common(state: State, block: int) -> tuple[Array, Array]:
 
 
 def weighed(state: State, block: int, left: Array) -> Array:
-    """Return the inverse covariance of fitted readings times the residual, 1/m, [column,
-    monitor]."""
+    """Return the inverse covariance of fitted readings times `left`, 1/m, [column, monitor]."""
     weights, own = weight(state, block), taken(state, block)
     left = np.where(weights > 0, left, 0.0)
     return weights * left if own is None else times_precision(weights, own, left)
@@ -174,8 +173,7 @@ def sound_monitors(state: State) -> Flags:
 
 
 def _good_across(state: State) -> Flags:
-    """The good BPMs in the plane that is not kicked, given their gains and fitted skew
-    gradients."""
+    """The good BPMs in the plane that is not kicked, given gains and fitted skew gradients."""
     data = state.data
     good = np.ones(data.shape[1], dtype=bool)
     if not state.allows(COUPLING):
