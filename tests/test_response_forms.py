@@ -91,7 +91,7 @@ def test_reversed_monitors_and_correctors_are_fitted_and_named(small_ring, whole
     fit = fit_steps(response_data(small_ring, data), split, STEPS[:3])
     assert fit.steps[-1].heldout_rms_in_plane < 3e-8
     assert reversed_ones(fit.state) == [
-        "monitors that read with the wrong sign: "
+        "BPMs that read with the wrong sign: "
         f"{data.monitors[7]} in x, {data.monitors[7]} in y, {data.monitors[20]} in y",
         f"correctors that kick with the wrong sign: {data.correctors[3]}",
     ]

@@ -242,8 +242,7 @@ class _Search:
         return other if gained > 0 else state
 
     def revised(self, state: State) -> State:
-        """The state with each cause compared with its alternatives, and without redundant
-        causes."""
+        """The state with each cause compared with its alternatives, less redundant causes."""
         for one in state.apart[:-1]:
             state = self.better(state, one)
         while len(state.apart) > 1:
@@ -259,7 +258,7 @@ class _Search:
         return state
 
     def members(self, state: State, one: Apart) -> int:
-        """Number of amounts that determine the statistic's scale: of the family, or orbit
+        """Number of amounts that determine the statistic's scale, of the family or orbit
         patterns."""
         if one.variable not in (kind.variable for kind in KINDS):
             return max(len(one.members) - 1, 1)

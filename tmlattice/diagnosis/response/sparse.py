@@ -54,10 +54,10 @@ ROUNDS, SETTLED = 30, 0.99
 """Rounds of filling in missing readings, and the least gain of chi-square in a round."""
 
 LESS = 0.98
-"""Product of both planes' rms, relative to the sparse solution's, below which a fit is better."""
+"""Ratio of rms, both planes multiplied, below which the hierarchical fit is preferred."""
 
 LARGER = 2.0
-"""Ratio to the largest fault above which a kick is implausible: it fits a tune shift."""
+"""Ratio to the largest fault above which a kick is implausible: it fits tunes by sextupoles."""
 
 
 BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12

@@ -26,7 +26,7 @@ TIMES = 5.0
 ALSO = 2.0
 """The same ratio for the corrector's own plane, given a spurious kick in the other one."""
 SHARE = 0.15
-"""Largest ratio of mean square residuals, at the other half of the BPMs, by the kick."""
+"""Largest ratio of mean square residuals at the other BPMs, with and without the kick."""
 HERE = 0.5
 """Largest ratio of that residual to the one with a jump at the corrector's place instead: above it,
 the corrector is misplaced."""

@@ -47,7 +47,7 @@ ORBITS = (
     "quadrupole_offset_x", "quadrupole_offset_y", "dipole_field", "dipole_roll",
     "sextupole_offset_x", "sextupole_offset_y",
 )  # fmt: skip
-"""Effects that make orbits: hardly visible in a response, but in a change of sextupoles."""
+"""Effects that make orbits: a response hardly shows them, but a change of sextupoles does."""
 
 
 def undetermined(state: State) -> Undetermined:

@@ -76,7 +76,7 @@ def reversed_ones(state: State) -> list[str]:
     gains = np.diagonal(errors.monitors, axis1=1, axis2=2)
     messages = []
     for what, names in (
-        ("monitors that read", [
+        ("BPMs that read", [
             f"{measured.monitors[m]} in {'xy'[p]}"
             for m, p in np.argwhere((gains < 0) & state.good[:, None])
         ]),
