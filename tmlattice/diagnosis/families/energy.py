@@ -15,7 +15,7 @@ from tmlattice.observe.response_data import ResponseData
 Array = NDArray[np.float64]
 
 USUAL_OFFSET = 1e-3
-"""Prior rms: a millimetre of orbit where the dispersion is a metre."""
+"""Prior rms: an orbit of a millimetre where the dispersion is a metre."""
 WIDENED, UNKNOWN_SPREAD = 2.0, 1.5e-3
 """Largest ratio of the energy spread to that of radiation (instabilities, wigglers without a field
 in the lattice), as rms; and the usual spread without radiation."""
@@ -39,7 +39,7 @@ class _OfBeam(Family):
 
 
 class EnergyOffset(_OfBeam):
-    """The beam's energy relative to the one of the magnets' settings: the RF frequency does not
+    """The beam's energy relative to that of the magnets' settings, by an RF frequency that does not
     match the circumference."""
 
     name, effects = "energy_offset", ("energy_offset",)

@@ -1,4 +1,4 @@
-"""A family of closed-orbit patterns of small kicks, which act in sextupoles.
+"""Families of closed-orbit patterns by small kicks, which act through sextupoles.
 
 A response is hardly sensitive to a kick itself, but off axis sextupoles focus and couple. With
 usual alignment that exceeds the quadrupoles' own errors. Single kicks are degenerate, so the
@@ -25,9 +25,9 @@ from tmlattice.observe.response_data import ResponseData
 Array = NDArray[np.float64]
 
 LEAST = 0.02
-"""Share of the strongest pattern below which a pattern is omitted; quadrupoles take it up."""
+"""Share of the strongest pattern below which one is omitted; quadrupole gradients absorb it."""
 TOGETHER = 32
-"""Bends whose rows are computed at a time."""
+"""Number of bends whose derivatives are computed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class _Orbit(Family):
 
     @property
     def largest(self) -> float:
-        """Zero: a pattern has no members."""
+        """Zero: patterns have no members that could be faulty."""
         return 0.0
 
     def size(self, data: ResponseData) -> int:
@@ -87,25 +87,25 @@ class _Orbit(Family):
 
 
 class HorizontalOrbit(_Orbit):
-    """The horizontal orbit by fields of bends: it focuses."""
+    """The horizontal orbit by field errors of bends, which focuses in sextupoles."""
 
     name, effect, effects = "horizontal orbit", "dipole_field", ("dipole_field",)
     block, variable = 0, "horizontal orbit"
 
 
 class VerticalOrbit(_Orbit):
-    """The vertical orbit by rolls of bends: it couples."""
+    """The vertical orbit by rolls of bends, which couples in sextupoles."""
 
     name, effect, effects = "vertical orbit", "dipole_roll", ("dipole_roll",)
     block, variable = 1, "vertical orbit"
 
 
 def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
-    """One family of each plane; none without sextupoles or bends.
+    """Return a family for each plane; none without sextupoles or bends.
 
     Args:
         ring: the design.
-        model: of it.
+        model: of the design.
     """
     magnets = ring.magnets
     bends = [i for i, e in enumerate(magnets) if e.kind == "bend" and e.angle]

@@ -1,4 +1,4 @@
-"""Drifts and neighbours of magnets, and straights for insertion devices.
+"""Neighbouring magnets of correctors, and straights for insertion devices.
 
 >>> [way.name for way in straights(ring)]
 """
@@ -16,7 +16,7 @@ STRAIGHT = 1.0
 
 
 def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> list[str]:
-    """Plane of each corrector, with the families of the magnets before and behind it.
+    """Return the plane of each corrector, with the families of the magnets before and behind it.
 
     Args:
         ring: with the magnets.
@@ -33,19 +33,18 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
 
 
 def straights(ring: Ring, beside: bool = False) -> list[Element]:
-    """Markers nearest to the middle of each long straight, or its longest drift where there is no
-    marker.
+    """Return the marker nearest to the middle of each long straight, else its longest drift.
 
-    A straight next to a wiggler of alternating bends has none, because it is degenerate with
-    the wiggler's own focusing.
+    A straight next to a wiggler of alternating bends has none, because its focusing is degenerate
+    with the wiggler's own.
 
     Args:
         ring: the ring.
-        beside: ways beside such a wiggler too.
+        `beside`: whether straights next to such a wiggler are included.
     """
     found, ways = list[Element](), list[Element]()
     within, bends = list[_Placed](), list[float]()
-    begin = np.inf  # of the first way, which ends the last turn's
+    begin = np.inf  # the first straight ends at the first magnet of the turn
     for element, s in _around(ring):
         if not _parts(element):
             within.append(_Placed(element, s))
@@ -64,17 +63,17 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
 
 class _Placed(NamedTuple):
     element: Element
-    s: float  # m, one turn further where the way to it goes through the lattice's first place
+    s: float  # m, one turn further behind the lattice's first element
 
 
 def _parts(element: Element) -> bool:
-    """Whether the straights at both ends differ."""
+    """Whether an element separates two straights."""
     return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
 
 
 def _around(ring: Ring) -> list[_Placed]:
-    """A turn from a magnet to itself, both included; it starts at no bend if possible, because
-    alternating bends are a wiggler."""
+    """One turn from a magnet to itself, both included; it starts at no bend if possible, so that a
+    wiggler of alternating bends is not split."""
     own = ring.elements
     magnets = sorted(
         (i for i, e in enumerate(own) if _parts(e)), key=lambda i: (own[i].kind == "bend", i)
