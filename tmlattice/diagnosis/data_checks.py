@@ -5,23 +5,26 @@
 
 Global errors come first: a wrong sign, unit or order is reported with its correction and with the
 assumption that continues without it. Launches, noise, BPMs and single readings follow.
+
+BPMs and correctors of a measurement that are not in the lattice. A control room reads more than its
+lattice file has, such as a BPM in a transfer line. Such channels are rejected, with a note. If most
+names are unknown, the names or the lattice are wrong: the first one raises an error. So does a
+magnet in the place of a BPM.
 """
 
 import time
-from collections.abc import Iterable, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.absent import in_the_lattice
-from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
+from tmlattice.diagnosis.signals import Check, Checkup, fine, note, wrong
 from tmlattice.diagnosis.stored_data_checks import StoredData, stored_checks
 from tmlattice.effects import Cause, expected_radiation
-from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.errors import MeasurementError, TmlatticeError, UnknownNameError, first_of
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
@@ -35,14 +38,12 @@ from tmlattice.measurement import (
 )
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
-from tmlattice.observe.evidence import Names, Verdict, certain
-from tmlattice.observe.global_errors import GlobalErrors
+from tmlattice.measurement.monitors import Names
+from tmlattice.observe.global_errors import GlobalErrors, Verdict, certain
 from tmlattice.observe.noise import PASSES, noise_scatter
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors, ResponseVerdict
 from tmlattice.observe.sections import Passes, SectionFits
-
-Array = NDArray[np.float64]
 
 ENERGY = 0.02
 """Share by which a stated beam energy may differ from the lattice's."""
@@ -442,7 +443,7 @@ def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
         return None
 
 
-def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
+def _words(names: Sequence[str], alike: Sequence[Sequence[str]]) -> tuple[str, str, str]:
     """The error, its alternatives, and the correction."""
     words = " and ".join(ASSUMPTIONS[n].words for n in names)
     others = "; ".join(
@@ -454,3 +455,68 @@ def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
         f" ({others})" if others else "",
         f"{corrections}, or go on with {_options(names)}",
     )
+
+
+MOST = 0.5
+"""Share of the names that may be unknown."""
+SHOWN = 8
+"""Names in a sentence at most."""
+MEANT = "did you mean"
+"""Phrase in the message about a misspelt name."""
+
+Measured = TypeVar("Measured")
+
+
+def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]:
+    """The measurement without BPMs and correctors that are not in the lattice, and a sentence for
+    each kind left out.
+
+    Args:
+        ring: the design.
+        measured: of any kind.
+
+    Raises:
+        UnknownNameError: more than half of the monitors, or of the correctors, are not there.
+    """
+    own: Any = measured
+    messages: list[str] = []
+    if not ring.monitors:
+        return measured, messages  # nothing can be read there; reported elsewhere
+    monitors = Names("monitor", (monitor.name for monitor in ring.monitors))
+    for what, find in (("monitors", monitors.__getitem__), ("correctors", ring.index)):
+        names = getattr(own, what, ())
+        unknown = [name for name in names if not _has(ring, monitors, name)]
+        if not unknown:
+            continue
+        fix = _hint(find, unknown[0])
+        if len(unknown) > MOST * len(names):
+            raise UnknownNameError(
+                f"{len(unknown)} of {len(names)} {what} are not in the lattice: {fix}"
+            )
+        own = own.select(**{what: [name for name in names if name not in unknown]})
+        typed = MEANT in fix and len(unknown) == 1
+        messages.append(
+            f"not in the lattice, and left out: {len(unknown)} of {len(names)} {what} "
+            f"({first_of(unknown, SHOWN)})" + (f"; {fix.partition('; ')[2]}" if typed else "")
+        )
+    return own, messages
+
+
+def _hint(find: Callable[[str], object], name: str) -> str:
+    """The message about an unknown name."""
+    try:
+        find(name)
+    except UnknownNameError as error:
+        return str(error)
+    return ""
+
+
+def _has(ring: Ring, monitors: Names, name: str) -> bool:
+    """Whether the ring has an element of this name."""
+    if monitors.find(name) is not None:
+        return True
+    try:
+        ring.index(name)
+    except UnknownNameError:
+        return False
+    return True

@@ -83,7 +83,7 @@ class Part:
         heldout: the validation set; None where nothing is held out.
         estimated: whether its noise comes from the data.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
-        said: messages.
+        messages: about the data.
         hypotheses: what its readings can determine; None: what the problem sees.
         start: nuisances to start at; None: the problem's own first guess.
         shots: numbers of those of the fit, those of a reference first (None), and of those that

@@ -16,7 +16,6 @@ import numpy as np
 
 from tmlattice.diagnosis.assessment import Block
 from tmlattice.diagnosis.consequences import Consequences
-from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import element_kind
 from tmlattice.diagnosis.response.common_factors import CommonFactors, Instead
@@ -24,7 +23,7 @@ from tmlattice.diagnosis.response.inconsistencies import Inconsistency
 from tmlattice.diagnosis.response.missing_effects import Weighed
 from tmlattice.diagnosis.response.stepwise import Step
 from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.diagnosis.support import Support
+from tmlattice.diagnosis.support import Correlation, Support
 from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.diagnosis.views import PartView, StoredView
 from tmlattice.effects import Cause, RingEffect, apply, find

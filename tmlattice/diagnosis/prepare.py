@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.choice import chosen_effects
-from tmlattice.effects import Cause, expected_radiation, find, rare
-from tmlattice.errors import BeamLostError, MeasurementError, first_of
+from tmlattice.effects import Cause, LaunchEffect, expected_radiation, find, modelled, names, rare
+from tmlattice.errors import BeamLostError, EffectError, MeasurementError, first_of
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
@@ -63,7 +62,7 @@ class Prepared:
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
         noise: rms of a reading, m, (x, y); NaN for a plane without readings.
         estimated: whether the noise comes from the data.
-        said: messages.
+        messages: about the data.
     """
 
     problem: FirstTurns
@@ -122,7 +121,7 @@ def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurem
     Args:
         ring: the design.
         measurement: any number of shots.
-        said: receives a message about omitted shots.
+        messages: receives a message about omitted shots.
 
     Raises:
         MeasurementError: not one shot fits.
@@ -303,3 +302,44 @@ def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
     outliers = np.zeros(other.valid.shape, dtype=bool)
     outliers[:, :readings] = never[None, :readings]
     return other.without(outliers)
+
+
+_COLUMNS = (0, 1, 2, 3, 5)
+"""The five coordinates of a launch in a measurement."""
+
+
+def chosen_effects(
+    ring: Ring, effects: Sequence[str] | None, launch_sigma: NDArray[np.float64]
+) -> list[str]:
+    """The effects to be fitted; none where all that are requested show in the data alone.
+
+    Args:
+        ring: the design.
+        effects: names; None: all usual ones.
+        launch_sigma: how well each launch is known, 0 exactly, [shot, 5].
+
+    Raises:
+        EffectError: no effect is named, or none of them can be looked for.
+        UnknownNameError: an effect that does not exist.
+    """
+    if not names(effects):
+        raise EffectError("no effect is named; leave effects out to look for all of them")
+    chosen = modelled(effects)
+    free = [six for six, sigma in zip(_COLUMNS, launch_sigma.T, strict=True) if (sigma > 0).any()]
+    why = [
+        f"{name} shows in turns of a stored beam alone"
+        for name in names(effects) if find(name).of_turns
+    ]  # fmt: skip
+    for name in list(chosen):
+        effect = find(name)
+        if not effect.places(ring):
+            why.append(f"{name} has no place in '{ring.name}' (it sits on: {effect.sits_on_text})")
+            chosen.remove(name)
+        elif isinstance(effect, LaunchEffect) and effect.shifts in free:
+            why.append(
+                f"{name} cannot be separated from the launch of each shot, which is fitted too"
+            )
+            chosen.remove(name)
+    if not chosen and len(why) == len(names(effects)):
+        raise EffectError("; ".join(why) + ": name another effect")
+    return chosen

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import Assessment, Block, assess
 from tmlattice.diagnosis.consequences import Consequences
-from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
-from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
-from tmlattice.diagnosis.support import FREE, Support, share_of_fault
+from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
 from tmlattice.diagnosis.views import (
     JointView,
@@ -30,8 +28,10 @@ from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Gap, Misfit
+from tmlattice.late import ClassMethod, Method
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
+from tmlattice.speaks import Speaks, last_part
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis.response.common_factors import CommonFactors
@@ -50,6 +50,70 @@ _MEASURES = {
 
 VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
 """Verdicts from the most certain to the least."""
+
+
+MOST = 4
+"""Findings in the line of a diagnosis."""
+
+
+class ShownFinding(Speaks):
+    """The line of a finding; the attributes are `Finding`'s."""
+
+    effect: str | None
+    element: str | None
+    amount: float | None
+    amount_sigma: float | None
+    unit: str | None
+    probability: float
+    words: str
+    where: tuple[float, float] | None
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        place = "" if self.where is None else f"{self.where[0]:.1f} m to {self.where[1]:.1f} m"
+        return self.in_short, {"place": place, "probability": f"{self.probability:.3g}"}
+
+    @property
+    def in_short(self) -> str:
+        """Effect, element and amount, as the catalogue names them; else the finding's words."""
+        if self.words:
+            return self.words
+        what = " ".join(word for word in (self.effect or "no known effect", self.element) if word)
+        if self.amount is None:
+            return what
+        error = "" if self.amount_sigma is None else f" ± {self.amount_sigma:.2g}"
+        return f"{what} {self.amount:.4g}{error} {self.unit or ''}".rstrip()
+
+
+class ShownDiagnosis(Speaks):
+    """The line of a diagnosis, its report and figures; the attributes are `Diagnosis`'."""
+
+    report = Method("tmlattice.report.speaking", "report", "The report as text.")
+    save = Method(
+        "tmlattice.report.speaking",
+        "save",
+        "Write report.html, report.txt, diagnosis.json and the figures into a folder.",
+    )
+    load = ClassMethod(
+        "tmlattice.diagnosis.load",
+        "load",
+        "Return the diagnosis of a folder of `save`, or of a diagnosis.json.",
+    )
+    plot = Method(
+        "tmlattice.plots.speaking",
+        "plot_diagnosis",
+        "Draw the scan along the ring, or the figure of this name: a matplotlib Figure.",
+    )
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        own: Any = self  # its attributes are the dataclass's
+        explained = None if own.heldout is None else own.heldout.explained
+        rows = {"of": f"{own.kind} of {last_part(own.ring.name)}"}
+        for number, finding in enumerate(own.findings[:MOST], 1):
+            rows[f"finding {number}"] = finding.in_short
+        if len(own.findings) > MOST:
+            rows["and"] = f"{len(own.findings) - MOST} more"
+        rows["gap explained"] = "" if explained is None else f"{100 * explained:.1f} %"
+        return own.verdict, rows
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.kinds import Part
-from tmlattice.diagnosis.numbers import numbers_read
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
-from tmlattice.diagnosis.views import PartView, TrajectoryView
+from tmlattice.diagnosis.views import PartView, TrajectoryView, numbers_read
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import Blocks, CombinedProblem

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.checkup import Check, fine, note, wrong
+from tmlattice.diagnosis.signals import Check, fine, note, wrong
 from tmlattice.effects import modelled
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
@@ -21,9 +21,8 @@ from tmlattice.measurement import ClosedOrbit, Dispersion, TuneReading, TurnByTu
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.stored import Stored
-from tmlattice.observe.stored_metric import LINES
 from tmlattice.observe.tune_readings import tune_readings
-from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
+from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

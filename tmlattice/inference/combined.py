@@ -19,8 +19,7 @@ from scipy.linalg import block_diag
 from tmlattice.effects import Cause
 from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
-from tmlattice.inference.root import Root
-from tmlattice.inference.whitening import Projection
+from tmlattice.inference.whitening import Projection, Root
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -19,7 +19,7 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
-from tmlattice.observe.response_rf import read
+from tmlattice.observe.response_data import read
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]

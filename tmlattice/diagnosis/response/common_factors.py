@@ -23,9 +23,14 @@ from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes
 from tmlattice.diagnosis.support import share_from_data
-from tmlattice.inference.common_factors import MIN_CHI2, FactorModel
+from tmlattice.inference.common_factors import (
+    MIN_CHI2,
+    FactorModel,
+    LikelySet,
+    likely_sets,
+    over_sets,
+)
 from tmlattice.inference.normal import solve
-from tmlattice.inference.sets import LikelySet, likely_sets, over_sets
 from tmlattice.lattice.supplies import magnets
 
 Array = NDArray[np.float64]
