@@ -93,20 +93,10 @@ def diagnose_together(
 
     Args:
         ring: the design.
-        measured: by the names that the result calls them.
-        reference: of the same machine before the fault, of any kinds: static errors cancel.
-        background: distributed errors, as of `diagnose`.
-        known: of the distributed errors, from an earlier diagnosis whose estimated ring this
-            is: see `twin`. Then no background is needed.
-        holdout: share of shots, or of correctors, in the validation set.
-        heldout: of first turns alone: those shots themselves, instead of a share.
-        effects: names of those that may be the cause; else all usual ones.
-        max_effects: findings at most.
-        radiation: of first turns alone: the model radiates as expected.
-        false_alarm: share of faultless data sets in which something may be found.
-        assume: what was written down wrongly everywhere, see `measurement.assume`.
-        seed: of the split and of the threshold's simulation.
-        progress: called with the name of each stage.
+        measured, reference: by the names that the result calls them.
+        heldout, radiation: of first turns alone.
+        background, known, holdout, effects, max_effects, false_alarm, assume, seed, progress: as of
+            `diagnose`.
 
     Raises:
         MeasurementError: data that cannot be used; the message names them.

@@ -15,7 +15,7 @@ signatures, since its search whitens rows by them.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +118,11 @@ class DistributedErrors:
         return np.asarray(self.rms * np.sqrt(np.maximum(1 - taken, 0.0)))
 
 
+def _of_inner(name: str) -> Any:
+    """A property or a method of the inner problem."""
+    return property(lambda problem: getattr(problem.inner, name))
+
+
 @dataclass(frozen=True, kw_only=True)
 class MarginalProblem(Problem):
     """A problem with nuisance errors integrated out: Gaussian, of size 1.
@@ -154,26 +159,20 @@ class MarginalProblem(Problem):
         """Rows [..., row] of the inner problem, whitened."""
         return self._root.white(rows)
 
+    # --- as in the inner problem ----------------------------------------------------------------
+    first = _of_inner("first")
+    free = _of_inner("free")
+    freedom = _of_inner("freedom")
+    alone = _of_inner("alone")
+    monitors = _of_inner("monitors")
+    valid = _of_inner("valid")
+    kick_places = _of_inner("kick_places")
+    sees = _of_inner("sees")
+    moved = _of_inner("moved")
+    neighbours = _of_inner("neighbours")
+    owner = _of_inner("owner")
+
     # --- the model ------------------------------------------------------------------------------
-    @property
-    def first(self) -> Array:
-        """As in the inner problem."""
-        return self.inner.first
-
-    @property
-    def free(self) -> int:
-        """As in the inner problem."""
-        return self.inner.free
-
-    @property
-    def freedom(self) -> int:
-        """As in the inner problem."""
-        return self.inner.freedom
-
-    def sees(self, hypothesis: Hypothesis) -> bool:
-        """As in the inner problem."""
-        return self.inner.sees(hypothesis)
-
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return the model's point; its `view` is the inner problem's."""
         point = self.inner.at(causes, nuisances, kicks)
@@ -190,20 +189,11 @@ class MarginalProblem(Problem):
         """Return the whitened slope, [row]."""
         return self.white(self.inner.slope(point.view, cause))
 
-    def moved(self, nuisances: Array, change: Array) -> Array:
-        """As in the inner problem."""
-        return self.inner.moved(nuisances, change)
-
     def metric(self, point: Point) -> Metric:
         """Return the kind's own products, or those of whitened signatures."""
         assert point.projection is not None
         fast = self.inner.metric_among(point.view, self._root, point.projection)
         return _MarginalMetric(self, point) if fast is None else fast
-
-    @property
-    def kick_places(self) -> Sequence[str]:
-        """As in the inner problem."""
-        return self.inner.kick_places
 
     def kick_rows(self, point: Point, place: int) -> Array:
         """Return the whitened rows, [parameter, row]."""
@@ -213,36 +203,13 @@ class MarginalProblem(Problem):
         """As in the inner problem."""
         return replace(self, inner=self.inner.everywhere())
 
-    @property
-    def alone(self) -> bool:
-        """As in the inner problem."""
-        return self.inner.alone
-
     def with_fixed(self, causes: Sequence[Cause]) -> Self:
         """Return the problem with further fixed causes and the same errors."""
         other = replace(self, inner=self.inner.with_fixed(causes))
         vars(other)["_root"] = self._root
         return other
 
-    def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """As in the inner problem."""
-        return self.inner.neighbours(hypothesis, among)
-
     # --- readings -------------------------------------------------------------------------------
-    @property
-    def monitors(self) -> Sequence[str]:
-        """As in the inner problem."""
-        return self.inner.monitors
-
-    @property
-    def valid(self) -> Flags:
-        """As in the inner problem."""
-        return self.inner.valid
-
-    def owner(self) -> NDArray[np.int64]:
-        """As in the inner problem."""
-        return self.inner.owner()
-
     def as_rows(self, readings: Array) -> Array:
         """Return whitened rows, [..., row]."""
         return self.white(self.inner.as_rows(readings))

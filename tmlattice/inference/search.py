@@ -460,13 +460,8 @@ def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
     alone = float(free.gain[monitor]) + back.problem.unknown_prior(len(free.gain))
     if back.fit.outcome is Outcome.STUCK:  # see `_refitted`
         alone += 0.5 * (back.fit.chi2 - state.fit.chi2 - float(free.statistic[monitor]))
-    if alone <= 0:
-        return back
-    tried = alternatives(back.problem, back.fit, _scan(search, back), search.hypotheses, 8)
-    if tried and tried[0].fit.log_evidence - back.fit.log_evidence > alone:
-        named = (*back.named, Identified(state.monitors[monitor], tried))
-        return replace(back, fit=tried[0].fit, named=named)
-    return state
+    evidence = back.fit.log_evidence + alone
+    return _better(search, state, back, evidence, state.monitors[monitor], 8)
 
 
 def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> AnyState:
@@ -478,11 +473,29 @@ def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> An
     without = replace(state, fit=alone, kicks=seen)
     if alone.point.lost:
         return state
-    if alone.log_evidence > now.log_evidence:
+    return _better(search, state, without, now.log_evidence, state.kicks[place], count)
+
+
+def _better(
+    search: Search, state: AnyState, without: AnyState, evidence: float, seen: Detection, count: int
+) -> AnyState:
+    """Return a state without an unnamed choice, or with a cause of the catalogue in its place, if
+    that explains as much as the choice.
+
+    Args:
+        search: what is searched.
+        state, without: with the choice, and without it.
+        evidence: log evidence with the choice.
+        seen: significance of the choice.
+        count: causes that are tried.
+    """
+    alone = without.fit
+    if alone.log_evidence >= evidence:
         return without
-    tried = alternatives(state.problem, alone, _scan(search, without), search.hypotheses, count)
-    if tried and tried[0].fit.log_evidence > now.log_evidence:
-        named = (*state.named, Identified(state.kicks[place], tried))
+    scanned = _scan(search, without)
+    tried = alternatives(without.problem, alone, scanned, search.hypotheses, count)
+    if tried and tried[0].fit.log_evidence > evidence:
+        named = (*without.named, Identified(seen, tried))
         return replace(without, fit=tried[0].fit, named=named)
     return state
 

@@ -16,7 +16,6 @@ from tmlattice.effects import Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion
-from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.stored import Stored, rf_of, stacked
 
 Array = NDArray[np.float64]
@@ -26,11 +25,6 @@ Array = NDArray[np.float64]
 class Orbits(Stored):
     """Closed orbits, m, [shot, monitor, 2]."""
 
-    @property
-    def first(self) -> Array:
-        """No nuisances."""
-        return NOTHING
-
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the readings; a shot is a state."""
         return stacked(states, "orbit")
@@ -39,11 +33,6 @@ class Orbits(Stored):
 @dataclass(frozen=True, kw_only=True)
 class RfOrbits(Stored):
     """Orbit changes for steps of the RF, m, [step, monitor, 2]."""
-
-    @property
-    def first(self) -> Array:
-        """No nuisances."""
-        return NOTHING
 
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the change from half a step below to half a step above."""

@@ -26,7 +26,7 @@ from tmlattice.inference.metric import Hypothesis, Indices, Metric, Products
 from tmlattice.inference.problem import Point
 from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.steady import MAX_NUMBERS, NOTHING, Steady, SteadyMetric
+from tmlattice.observe.steady import MAX_NUMBERS, Steady, SteadyMetric
 
 Array = NDArray[np.float64]
 
@@ -67,11 +67,6 @@ class Response(Steady):
     """
 
     base: Predicted = field(repr=False)
-
-    @property
-    def first(self) -> Array:
-        """No nuisances."""
-        return NOTHING
 
     @property
     def values(self) -> Array:

@@ -71,6 +71,11 @@ class Steady(Problem):
         return np.zeros((0, *self.used.shape))
 
     # --- the model ------------------------------------------------------------------------------
+    @property
+    def first(self) -> Array:
+        """First guess of the nuisances; here none."""
+        return NOTHING
+
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return the model's point, lost without a stored beam."""
         count = int(self.used.sum())
