@@ -200,6 +200,19 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
     return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
 
 
+AnySearch = TypeVar("AnySearch", GlobalErrors, ResponseGlobalErrors)
+
+
+def _in_turn(checked: AnySearch, most: int) -> tuple[list[Any], AnySearch]:
+    """Global errors one after another, each with those before it corrected, and the search with all
+    of them corrected."""
+    found: list[Any] = []
+    while len(found) < most and (own := checked.verdict()) is not None:
+        found.append(own)
+        checked = checked.corrected(own.names)
+    return found, checked
+
+
 # --- first turns ----------------------------------------------------------------------------------
 def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
     lost = beam_lost(data)
@@ -214,10 +227,7 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
-    checked = GlobalErrors(ring, data, known)
-    verdicts = checked.verdicts()
-    for verdict in verdicts:
-        checked = checked.corrected(verdict.names)
+    verdicts, checked = _in_turn(GlobalErrors(ring, data, known), 3)
     passes, found = checked.found(checked.measurement)
     lattice = _lattice(ring, checked, passes, found)
     if lattice.status == "wrong":  # no wrong sign, unit or order explains that
@@ -382,10 +392,7 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
     checks = signals.monitors(ring, data.monitors, data.response)
     if any(check.status == "wrong" for check in checks):
         return checks
-    checked = ResponseGlobalErrors(ring, data)
-    verdicts = checked.verdicts()
-    for verdict in verdicts:
-        checked = checked.corrected(verdict.names)
+    verdicts, checked = _in_turn(ResponseGlobalErrors(ring, data), 4)
     left = checked.misfit(())
     typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
     if typical > (CORRECTED if verdicts else ANOTHER):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
-from tmlattice.diagnosis.prepare import batch, prepare
+from tmlattice.diagnosis.prepare import batch, noise_of, prepare
 from tmlattice.diagnosis.stored_data_checks import raise_if_wrong
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import CombinedProblem
@@ -161,8 +161,9 @@ def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
             ready = prepare(ring, measured, before, *options)
     other = None
     if held is not None:
-        data = of_measurement(ring, held).with_sigma(np.array(ready.noise))
-        model = Model(ring, data.settings, data.turns, ready.known, active=data.active)
+        data = of_measurement(ring, held).with_sigma(np.array(noise_of(ready.problem.data)))
+        known = ready.problem.model.assembly.known
+        model = Model(ring, data.settings, data.turns, known, active=data.active)
         other = FirstTurns(model=model, data=data, places=how.places)
     earlier: tuple[int | None, ...] = (None,) * (0 if before is None else len(before.shots))
     return Part(

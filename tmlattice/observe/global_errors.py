@@ -1,7 +1,7 @@
 """Global errors of first turns: a wrong sign, unit or order of all readings or settings.
 
 >>> search = GlobalErrors(ring, measurement)
->>> search.verdicts()                   # corrections that improve the data far, the best first
+>>> search.verdict()                    # the correction that improves the data far
 
 Each assumption is corrected in the data, and the trajectories of all sections are fitted again. The
 score is their agreement with themselves, with the next section, and with the launches. Every term
@@ -414,15 +414,6 @@ class GlobalErrors:
         gain = float(stated.cost(square).sum() - other.cost(square).sum())
         gain -= max(other.blur - stated.blur, 0.0)
         return Verdict(names, gain, levels(stated), levels(other))
-
-    def verdicts(self, most: int = 3) -> list[Verdict]:
-        """Return global errors one after another, each with those before it corrected."""
-        found: list[Verdict] = []
-        search = self
-        while len(found) < most and (own := search.verdict()) is not None:
-            found.append(own)
-            search = search.corrected(own.names)
-        return found
 
     def corrected(self, names: Names) -> "GlobalErrors":
         """Return the search with assumptions corrected in the data."""

@@ -69,14 +69,26 @@ def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
     return Patterns((shapes[:, kept] * size[kept]).T, own, kicks[kept])
 
 
-class _Kicks(Family):
-    per, trust = "ring", 1e-3
-    plane: ClassVar[int]
+class _PatternFamily(Family):
+    """Amplitudes of patterns of kicks, which the data do not separate into single ones."""
+
+    per = "ring"
 
     @property
     def largest(self) -> float:
         """Zero: a pattern has no members."""
         return 0.0
+
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
+        """No causes: single kicks are degenerate."""
+        return []
+
+
+class _Kicks(_PatternFamily):
+    trust = 1e-3
+    plane: ClassVar[int]
 
     def patterns(self, data: ResponseData) -> Patterns:
         """The kicks in the design."""
@@ -129,12 +141,6 @@ class _Kicks(Family):
             dispersion=errors.dispersion + more,
             at_correctors=errors.at_correctors + values @ patterns.at_correctors,
         )
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """No causes: single kicks are degenerate."""
-        return []
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """No effect of the catalogue."""
@@ -242,7 +248,7 @@ TOGETHER = 32
 
 
 @dataclass(frozen=True, eq=False)
-class _Orbit(Family):
+class _Orbit(_PatternFamily):
     """Patterns of kicks.
 
     Attributes:
@@ -253,13 +259,8 @@ class _Orbit(Family):
     places: tuple[str, ...]
     patterns: Array
 
-    per, trust = "ring", 1.0
+    trust = 1.0
     effect: ClassVar[str]
-
-    @property
-    def largest(self) -> float:
-        """Zero: a pattern has no members."""
-        return 0.0
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
@@ -284,12 +285,6 @@ class _Orbit(Family):
         amounts = (values @ self.patterns).tolist()
         causes = [Cause(self.effect, *one) for one in zip(self.places, amounts, strict=True)]
         return replace(errors, ring=(*errors.ring, *(c for c in causes if c.amount)))
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """No causes: single kicks are degenerate."""
-        return []
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """Kicks of all bends."""
