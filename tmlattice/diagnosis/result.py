@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.assessment import Assessment, Block, assess
+from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
@@ -141,7 +141,7 @@ class Member:
         return {key: value for key, value in vars(self).items() if key != "device" or value}
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class Finding(ShownFinding):
     """One error, or one localised but unexplained deviation.
 
@@ -167,18 +167,18 @@ class Finding(ShownFinding):
         devices: the same of `elements` and `near`, by name.
     """
 
-    effect: str | None
-    element: str | None
+    effect: str | None = None
+    element: str | None = None
     s: float | None
-    amount: float | None
-    amount_sigma: float | None
-    unit: str | None
-    probability: float
+    amount: float | None = None
+    amount_sigma: float | None = None
+    unit: str | None = None
+    probability: float = 1.0
     detection: Detection
     where: tuple[float, float] | None
     near: tuple[str, ...]
-    credible_set: tuple[Member, ...]
-    mass: float
+    credible_set: tuple[Member, ...] = ()
+    mass: float = 0.0
     recommended_actions: tuple[RecommendedAction, ...] = ()
     consequences: Consequences | None = None
     seen_by: Mapping[str, float] | None = None
@@ -354,7 +354,7 @@ class Diagnosis(ShownDiagnosis):
     def assessment(self) -> Assessment:
         """Whether the remainder is noise, a gap is explained, an effect is missing: each once."""
         options = self.provenance["options"]
-        return assess(
+        return Assessment(
             self.verdict,
             self.compared,
             self.heldout,
