@@ -6,13 +6,14 @@ difference that neither the launch nor the amount can absorb.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
+from tmlattice.diagnosis.records import OPTIONAL, named, record_of
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Alternative
@@ -54,20 +55,17 @@ class NextMeasurement:
 
     launch: dict[str, float] | None
     settings: Settings
-    parts: tuple[str, str]
-    separation: float
+    parts: tuple[str, str] = field(metadata=named("between"))
+    separation: float = field(metadata=named("separation_sigma"))
     kind: str = "trajectory"
-    minutes: float | None = None
+    minutes: float | None = field(default=None, metadata=OPTIONAL)
 
     def as_json(self) -> dict[str, object]:
         """The entry in the file of the diagnosis."""
-        return {
-            "launch": self.launch,
-            "settings": {name: dict(value) for name, value in self.settings.items()},
-            "between": list(self.parts),
-            "separation_sigma": self.separation,
-            **({} if self.minutes is None else {"kind": self.kind, "minutes": self.minutes}),
-        }
+        own = record_of(self)
+        if self.minutes is None:
+            del own["kind"]
+        return own
 
 
 def next_measurement(

@@ -13,6 +13,7 @@ from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
+from tmlattice.diagnosis.records import OPTIONAL, encoded, record_of
 from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
 from tmlattice.diagnosis.views import (
@@ -134,11 +135,7 @@ class Member:
     probability: float
     amount: float
     recommended_action: str
-    device: str | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {key: value for key, value in vars(self).items() if key != "device" or value}
+    device: str | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -181,12 +178,12 @@ class Finding(ShownFinding):
     mass: float = 0.0
     recommended_actions: tuple[RecommendedAction, ...] = ()
     consequences: Consequences | None = None
-    seen_by: Mapping[str, float] | None = None
+    seen_by: Mapping[str, float] | None = field(default=None, metadata=OPTIONAL)
     words: str = ""
     to_check: str = ""
     elements: tuple[str, ...] = ()
-    device: str | None = None
-    devices: Mapping[str, str] = field(default_factory=dict)
+    device: str | None = field(default=None, metadata=OPTIONAL)
+    devices: Mapping[str, str] = field(default_factory=dict, metadata=OPTIONAL)
 
     @property
     def label(self) -> str:
@@ -207,46 +204,17 @@ class Finding(ShownFinding):
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        found = self.detection
-        where = None
+        own = record_of(self)
         if self.where is not None:
-            where = {"s_from": self.where[0], "s_to": self.where[1]}
-        stated = {"words": self.words, "to_check": self.to_check, "elements": list(self.elements)}
-        return {
-            "effect": self.effect,
-            "element": self.element,
-            "s": self.s,
-            "amount": self.amount,
-            "amount_sigma": self.amount_sigma,
+            own["where"] = {"s_from": self.where[0], "s_to": self.where[1]}
+        if not self.words:
+            del own["words"], own["to_check"], own["elements"]
+        first, *others = own.pop("recommended_actions") or [None]
+        return own | {
             "share_from_data": share_of_fault(self.effect, self.amount_sigma),
-            "unit": self.unit,
-            "probability": self.probability,
-            "detection": {
-                "statistic": found.statistic,
-                "threshold": found.threshold,
-                "p_value": found.p_value,
-            },
-            "where": where,
-            "near": list(self.near),
-            "credible_set": [member.as_json() for member in self.credible_set],
-            "mass": self.mass,
-            "recommended_action": None
-            if self.recommended_action is None
-            else self.recommended_action.as_json(),
-            "alternative_actions": [
-                recommended_action.as_json() for recommended_action in self.recommended_actions[1:]
-            ],
-            "consequences": None if self.consequences is None else self.consequences.as_json(),
-            **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
-            **(stated if self.words else {}),
-            **_device(self.device),
-            **({"devices": dict(self.devices)} if self.devices else {}),
+            "recommended_action": first,
+            "alternative_actions": others,
         }
-
-
-def _device(name: str | None) -> dict[str, str]:
-    """A row's field of the control system's name; none where it is unknown."""
-    return {} if name is None else {"device": name}
 
 
 def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
@@ -562,7 +530,6 @@ class Diagnosis(ShownDiagnosis):
         """The result in the format `tmlattice-diagnosis`, version 1 (see `schemas/`)."""
         from tmlattice import __version__
 
-        weighed = self.hypotheses
         return {
             "format": "tmlattice-diagnosis",
             "version": 2,
@@ -570,9 +537,9 @@ class Diagnosis(ShownDiagnosis):
             "kind": self.kind,
             "model": self.ring.model,
             "verdict": self.verdict,
-            "findings": [finding.as_json() for finding in self.findings],
-            "steps": [step.as_json() for step in self.steps],
-            "rejected_steps": [step.as_json() for step in self.rejected_steps],
+            "findings": encoded(self.findings),
+            "steps": encoded(self.steps),
+            "rejected_steps": encoded(self.rejected_steps),
             "bad_monitors": list(self.bad_monitors),
             "rejected_channels": [
                 {"element": name, "plane": plane} for name, plane in self.rejected_channels
@@ -587,25 +554,21 @@ class Diagnosis(ShownDiagnosis):
                     "amount": c.amount,
                     "amount_sigma": s,
                     **support.as_json(),
-                    **_device(self.devices.get(c.element or "")),
+                    **({"device": own} if (own := self.devices.get(c.element or "")) else {}),
                 }
                 for c, s, support in self.supported
             ],
-            "correlations": [pair.as_json() for pair in self.correlations],
-            "common_factors": None
-            if self.common_factors is None
-            else self.common_factors.as_json(),
-            "inconsistencies": None
-            if self.inconsistencies is None
-            else self.inconsistencies.as_json(),
-            "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
-            **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
+            "correlations": encoded(self.correlations),
+            "common_factors": encoded(self.common_factors),
+            "inconsistencies": encoded(self.inconsistencies),
+            "hypotheses": encoded(self.hypotheses),
+            **({"measurements": encoded(self.parts)} if self.parts else {}),
             "assessment": self.assessment.as_json(),
             "gap": self.gap,
-            "suspects": [suspect.as_json() for suspect in self.suspects],
+            "suspects": encoded(self.suspects),
             "unexplained": {"patterns": None, **self.unexplained},
             "tunes": self.tunes,
-            "next_measurement": None if self.next is None else self.next.as_json(),
+            "next_measurement": encoded(self.next),
             "sensitivity": self.sensitivity,
             "warnings": list(self.warnings),
             "outliers": [dict(row) for row in self.outliers],

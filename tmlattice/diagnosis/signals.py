@@ -1,12 +1,13 @@
 """Checks of the BPMs' signals without a model: silent, frozen, copied, cut off."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.records import encoded, named
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
@@ -46,20 +47,9 @@ class Check:
     name: str
     status: Status
     sentence: str
-    before: float | None = None
-    after: float | None = None
+    before: float | None = field(default=None, metadata=named("chi2_before"))
+    after: float | None = field(default=None, metadata=named("chi2_after"))
     assume: tuple[str, ...] = ()
-
-    def as_json(self) -> dict[str, Any]:
-        """As in the schema `check`."""
-        return {
-            "name": self.name,
-            "status": self.status,
-            "sentence": self.sentence,
-            "chi2_before": self.before,
-            "chi2_after": self.after,
-            "assume": list(self.assume),
-        }
 
 
 def fine(name: str, sentence: str) -> Check:
@@ -123,7 +113,7 @@ class Checkup:
             "version": 1,
             "kind": self.kind,
             "status": self.status,
-            "checks": [check.as_json() for check in self.checks],
+            "checks": encoded(self.checks),
             "provenance": dict(self.provenance),
         }
 

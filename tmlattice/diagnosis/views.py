@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.records import OPTIONAL, named, record_of
 from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Misfit
@@ -35,10 +36,6 @@ class NumberRead:
     error: float
     before: float
     after: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return dict(vars(self))
 
 
 def numbers_read(own: Problem, before: Point, after: Point) -> tuple[NumberRead, ...]:
@@ -117,25 +114,20 @@ class PartView:
         numbers: of tunes, each as read and as both models have it.
     """
 
-    label: str
+    label: str = field(metadata=named("name"))
     kind: str
     readings: int
     before: Misfit
     after: Misfit
     monitors: tuple[str, ...]
     left: NDArray[np.float64] = field(repr=False)
-    numbers: tuple[NumberRead, ...] = ()
+    numbers: tuple[NumberRead, ...] = field(default=(), metadata=OPTIONAL)
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        return {
-            "name": self.label,
-            "kind": self.kind,
-            "readings": self.readings,
-            "before": dict(vars(self.before)),
-            "after": dict(vars(self.after)),
-            **({"numbers": [n.as_json() for n in self.numbers]} if self.numbers else {}),
-        }
+        own = record_of(self)
+        del own["monitors"], own["left"]
+        return own
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,14 @@ neighbours.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.records import named
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
@@ -116,7 +117,7 @@ class Instead:
     """
 
     probability: float
-    amounts: tuple[tuple[str, float, float], ...]
+    amounts: tuple[tuple[str, float, float], ...] = field(metadata=named("common_factors"))
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
@@ -166,18 +167,7 @@ class CommonFactors:
     outliers: tuple[Outlier, ...]
     share: float
     scatter: float
-    between: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {
-            "common_factors": [own.as_json() for own in self.common_factors],
-            "instead": [own.as_json() for own in self.instead],
-            "outliers": [own.as_json() for own in self.outliers],
-            "share": self.share,
-            "scatter": self.scatter,
-            "between_families": self.between,
-        }
+    between: float = field(metadata=named("between_families"))
 
 
 def explain_gradients(state: State) -> CommonFactors | None:
