@@ -27,7 +27,6 @@ from tmlattice.beam.kicks import (
 )
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.effects import Cause, find
-from tmlattice.inference.priors import Group
 from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -87,7 +86,7 @@ class _PatternFamily(Family):
 
 
 class _Kicks(_PatternFamily):
-    trust = 1e-3
+    trust, rms = 1e-3, USUAL
     plane: ClassVar[int]
 
     def patterns(self, data: ResponseData) -> Patterns:
@@ -105,10 +104,6 @@ class _Kicks(_PatternFamily):
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
         return len(self.patterns(data).rf)
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of independent kicks."""
-        return [Group(self.name, np.eye(self.size(data)), USUAL)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """Responses of the RF's orbit, and of the correctors by the energy, see
@@ -259,16 +254,12 @@ class _Orbit(_PatternFamily):
     places: tuple[str, ...]
     patterns: Array
 
-    trust = 1.0
+    trust, rms = 1.0, 1.0  # in units of usual kicks
     effect: ClassVar[str]
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
         return len(self.patterns)
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """Amplitudes in units of usual kicks."""
-        return [Group(self.name, np.eye(len(self.patterns)), 1.0)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """Derivatives by the kicks of all bends."""

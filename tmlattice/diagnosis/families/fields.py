@@ -93,15 +93,11 @@ class QuadrupoleGradient(_Magnets):
     name = effect = "quadrupole_gradient"
     effects: ClassVar[tuple[str, ...]] = ("quadrupole_gradient",)
     block, variable, trust = 0, "gradient", 0.01
+    rms, tails, most = 3e-3, TAILS, LARGEST_GRADIENT
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """Quadrupoles that have a gradient."""
         return [{e.name: 1.0 for e in own} for own in magnets(data.ring, ("quadrupole",), True)]
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of single quadrupoles."""
-        eye = np.eye(self.size(data))
-        return [Group(self.name, eye, 3e-3, TAILS, most=LARGEST_GRADIENT)]
 
     def units(self, values: Array) -> Array:
         """Gradients relative to the design's strength, not to the estimated one."""
@@ -143,6 +139,7 @@ class BendGradient(_Magnets):
     name = effect = "bend_gradient"
     effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
     block, variable, trust = 0, "bend_gradient", 0.01
+    rms = 3e-3
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """Zero: single bends of a type are degenerate with neighbouring quadrupoles."""
@@ -150,10 +147,6 @@ class BendGradient(_Magnets):
         for own in magnets(data.ring, ("bend",), powered=True):
             types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
         return list(types.values())
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of types."""
-        return [Group(self.name, np.eye(self.size(data)), 3e-3)]
 
 
 class SkewGradient(_Thin):
@@ -183,13 +176,10 @@ class OtherGradient(_Thin):
     name = effect = "gradient_absolute"
     effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
     block, variable, trust = 0, "other", 3e-3
+    rms, tails = 1e-4, TAILS
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("sextupole", "wiggler"))
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of sextupoles."""
-        return [Group(self.name, np.eye(self.size(data)), 1e-4, TAILS)]
 
 
 class VerticalFocusing(_Thin):
@@ -198,6 +188,7 @@ class VerticalFocusing(_Thin):
     name = effect = "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
     block, variable, trust = 0, "device", 3e-3
+    rms, tails = 1e-4, 1.0
 
     @property
     def title(self) -> str:
@@ -210,10 +201,6 @@ class VerticalFocusing(_Thin):
     def _devices(self, ring: Ring, ways: Sequence[Element]) -> list[tuple[Element, ...]]:
         devices = [*magnets(ring, ("wiggler",)), *((e,) for e in ways)]
         return sorted(devices, key=lambda own: own[0].s)
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of each device."""
-        return [Group(self.name, np.eye(self.size(data)), 1e-4, 1.0)]
 
     def lowest(self, data: ResponseData) -> Array | float:
         """Zero: a device focuses; only one of the design may focus less."""
@@ -282,6 +269,7 @@ class CorrectorPosition(_Magnets):
     name = effect = "corrector_position"
     effects: ClassVar[tuple[str, ...]] = ("corrector_position",)
     block, variable, trust = 0, "position", 0.02
+    rms, most = 5e-3, FURTHEST
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The correctors of each number."""
@@ -291,10 +279,6 @@ class CorrectorPosition(_Magnets):
         for name, own in zip(measured.correctors, where, strict=True):
             alike.setdefault(own, {})[name] = 1.0
         return [correctors for correctors in alike.values() if len(correctors) > 1]
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of each number."""
-        return [Group(self.name, np.eye(self.size(data)), 5e-3, most=FURTHEST)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The jump of the orbit in the corrector's own column."""

@@ -151,16 +151,13 @@ class EnergySpread(_OfBeam):
 
 
 class _Monitors(Family):
-    per = "monitor"
+    per, rms, tails = "monitor", 0.01, TAILS
 
     def size(self, data: ResponseData) -> int:
         return 2 * len(data.at)
 
     def rows(self, at: Predicted, values: Array) -> Array:
         return at.data.pick(at.kicked)
-
-    def _own(self, data: ResponseData) -> Group:
-        return Group(self.name, np.eye(self.size(data)), 0.01, TAILS)
 
 
 class MonitorGain(_Monitors):
@@ -173,7 +170,7 @@ class MonitorGain(_Monitors):
         """Priors of single BPMs and of all BPMs of a plane."""
         alike = np.zeros((self.size(data), 2))
         alike[0::2, 0] = alike[1::2, 1] = 1
-        return [self._own(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
+        return [*super().groups(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The diagonals of the BPMs' matrices."""
@@ -206,10 +203,6 @@ class MonitorRoll(_Monitors):
 
     name, effects = "monitor_roll", ("monitor_roll", "monitor_coupling")
     block, variable, trust = 1, "mixing", 0.02
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """One number a BPM and plane."""
-        return [self._own(data)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The off-diagonals of the BPMs' matrices."""
@@ -245,7 +238,7 @@ LEAST_KICK = 1e-3
 
 
 class _Columns(Family):
-    per = "column"
+    per, tails = "column", TAILS
 
     def size(self, data: ResponseData) -> int:
         return len(data.kicks)
@@ -272,15 +265,12 @@ class CorrectorCalibration(_Columns):
     """Priors of single correctors and of families."""
 
     name, effects = "corrector_calibration", ("corrector_calibration",)
-    block, variable, trust, gross = 0, "calibration", 0.01, 0.3
+    block, variable, trust, gross, rms = 0, "calibration", 0.01, 0.3, 0.02
 
     def groups(self, data: ResponseData) -> list[Group]:
         """Numbers of single correctors and of families."""
         kinds = families([*data.measured.correctors, "\0"])[1]
-        return [
-            Group(self.name, np.eye(self.size(data)), 0.02, TAILS),
-            Group(f"{self.name} of families", kinds, 0.05),
-        ]
+        return [*super().groups(data), Group(f"{self.name} of families", kinds, 0.05)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The column itself."""
@@ -304,11 +294,7 @@ class CorrectorRoll(_Columns):
     """Rolls of correctors."""
 
     name, effects = "corrector_roll", ("corrector_roll",)
-    block, variable, trust, gross = 1, "roll", 0.02, 0.1
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """One number a corrector."""
-        return [Group(self.name, np.eye(self.size(data)), 0.01, TAILS)]
+    block, variable, trust, gross, rms = 1, "roll", 0.02, 0.1, 0.01
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The kick in the other plane."""
