@@ -17,6 +17,7 @@ import numpy as np
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.records import OPTIONAL, record_of
 from tmlattice.effects import Cause
+from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation
@@ -132,7 +133,7 @@ def outliers(
             continue
         amounts = np.array([places[0].amount for places, _ in own])
         off = np.abs(amounts - np.median(amounts))
-        scatter = 1.4826 * float(np.median(off))
+        scatter = chi2.MAD * float(np.median(off))
         for (places, sigma), distance in zip(own, off, strict=True):
             times = float(distance / max(scatter, sigma, 1e-30))
             if times > OUTLIER and not any((c.effect, c.element) in known for c in places):

@@ -21,7 +21,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import UnstableRingError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.response_noise import completed
+from tmlattice.observe.noise import completed
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -91,7 +91,7 @@ def response_data(ring: Ring, measured: OrbitResponse) -> ResponseData:
 
     Without an RF step, or with an RF orbit that was not measured (`read`), its column is
     empty, and only priors separate the scales of correctors and monitors. Unstated noise is
-    estimated, see `response_noise`.
+    estimated, see `noise.completed`.
 
     Raises:
         MeasurementError: no noise, and too few readings to estimate it.

@@ -23,6 +23,7 @@ from scipy.special import betaincinv
 
 from tmlattice.errors import TooFewTurnsError, first_of
 from tmlattice.harmonics import MIN_TURNS
+from tmlattice.inference import chi2
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.line_fit import (
     NARROW,
@@ -233,7 +234,7 @@ def _robust(residual: Array, there: Mask) -> Array:
     middle = np.median(size, axis=1)
     for i in np.flatnonzero(~there.all(axis=1)):
         middle[i] = np.median(size[i, there[i]])
-    return np.asarray(1.4826 * middle)
+    return np.asarray(chi2.MAD * middle)
 
 
 # --- reported doubts ------------------------------------------------------------------------------
