@@ -57,66 +57,6 @@ MOST = 4
 """Findings in the line of a diagnosis."""
 
 
-class ShownFinding(Speaks):
-    """The line of a finding; the attributes are `Finding`'s."""
-
-    effect: str | None
-    element: str | None
-    amount: float | None
-    amount_sigma: float | None
-    unit: str | None
-    probability: float
-    words: str
-    where: tuple[float, float] | None
-
-    def _told(self) -> tuple[str, dict[str, str]]:
-        place = "" if self.where is None else f"{self.where[0]:.1f} m to {self.where[1]:.1f} m"
-        return self.in_short, {"place": place, "probability": f"{self.probability:.3g}"}
-
-    @property
-    def in_short(self) -> str:
-        """Effect, element and amount, as the catalogue names them; else the finding's words."""
-        if self.words:
-            return self.words
-        what = " ".join(word for word in (self.effect or "no known effect", self.element) if word)
-        if self.amount is None:
-            return what
-        error = "" if self.amount_sigma is None else f" ± {self.amount_sigma:.2g}"
-        return f"{what} {self.amount:.4g}{error} {self.unit or ''}".rstrip()
-
-
-class ShownDiagnosis(Speaks):
-    """The line of a diagnosis, its report and figures; the attributes are `Diagnosis`'."""
-
-    report = Method("tmlattice.report.speaking", "report", "The report as text.")
-    save = Method(
-        "tmlattice.report.speaking",
-        "save",
-        "Write report.html, report.txt, diagnosis.json and the figures into a folder.",
-    )
-    load = ClassMethod(
-        "tmlattice.diagnosis.load",
-        "load",
-        "Return the diagnosis of a folder of `save`, or of a diagnosis.json.",
-    )
-    plot = Method(
-        "tmlattice.plots.speaking",
-        "plot_diagnosis",
-        "Draw the scan along the ring, or the figure of this name: a matplotlib Figure.",
-    )
-
-    def _told(self) -> tuple[str, dict[str, str]]:
-        own: Any = self  # its attributes are the dataclass's
-        explained = None if own.heldout is None else own.heldout.explained
-        rows = {"of": f"{own.kind} of {last_part(own.ring.name)}"}
-        for number, finding in enumerate(own.findings[:MOST], 1):
-            rows[f"finding {number}"] = finding.in_short
-        if len(own.findings) > MOST:
-            rows["and"] = f"{len(own.findings) - MOST} more"
-        rows["gap explained"] = "" if explained is None else f"{100 * explained:.1f} %"
-        return own.verdict, rows
-
-
 @dataclass(frozen=True)
 class Member:
     """One explanation in a credible set.
@@ -139,7 +79,7 @@ class Member:
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class Finding(ShownFinding):
+class Finding(Speaks):
     """One error, or one localised but unexplained deviation.
 
     Attributes:
@@ -185,6 +125,21 @@ class Finding(ShownFinding):
     device: str | None = field(default=None, metadata=OPTIONAL)
     devices: Mapping[str, str] = field(default_factory=dict, metadata=OPTIONAL)
 
+    def _told(self) -> tuple[str, dict[str, str]]:
+        place = "" if self.where is None else f"{self.where[0]:.1f} m to {self.where[1]:.1f} m"
+        return self.in_short, {"place": place, "probability": f"{self.probability:.3g}"}
+
+    @property
+    def in_short(self) -> str:
+        """Effect, element and amount, as the catalogue names them; else the finding's words."""
+        if self.words:
+            return self.words
+        what = " ".join(word for word in (self.effect or "no known effect", self.element) if word)
+        if self.amount is None:
+            return what
+        error = "" if self.amount_sigma is None else f" ± {self.amount_sigma:.2g}"
+        return f"{what} {self.amount:.4g}{error} {self.unit or ''}".rstrip()
+
     @property
     def label(self) -> str:
         """The element, or the place, for short labels."""
@@ -228,7 +183,7 @@ def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cau
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis(ShownDiagnosis):
+class Diagnosis(Speaks):
     """The result of a diagnosis. See `as_json` for the file format.
 
     Attributes:
@@ -310,8 +265,35 @@ class Diagnosis(ShownDiagnosis):
     compared: tuple[Block, ...] = ()
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
-    supports: tuple[Support, ...] = field(default=(), repr=False)
+    supports: tuple[Support, ...] = ()
     covariance: NDArray[np.float64] | None = field(default=None, repr=False)
+
+    report = Method("tmlattice.report.speaking", "report", "The report as text.")
+    save = Method(
+        "tmlattice.report.speaking",
+        "save",
+        "Write report.html, report.txt, diagnosis.json and the figures into a folder.",
+    )
+    load = ClassMethod(
+        "tmlattice.diagnosis.load",
+        "load",
+        "Return the diagnosis of a folder of `save`, or of a diagnosis.json.",
+    )
+    plot = Method(
+        "tmlattice.plots.speaking",
+        "plot_diagnosis",
+        "Draw the scan along the ring, or the figure of this name: a matplotlib Figure.",
+    )
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        explained = None if self.heldout is None else self.heldout.explained
+        rows = {"of": f"{self.kind} of {last_part(self.ring.name)}"}
+        for number, finding in enumerate(self.findings[:MOST], 1):
+            rows[f"finding {number}"] = finding.in_short
+        if len(self.findings) > MOST:
+            rows["and"] = f"{len(self.findings) - MOST} more"
+        rows["gap explained"] = "" if explained is None else f"{100 * explained:.1f} %"
+        return self.verdict, rows
 
     @property
     def tables(self) -> Tables:
