@@ -17,9 +17,9 @@ from tmlattice.beam.rf import rf_of
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis.findings import credible
 from tmlattice.diagnosis.kinds import How
-from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement
+from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement, separations
 from tmlattice.diagnosis.recommended_actions import recommended_action
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.distributed import DistributedProblem, fit_distributed_errors
@@ -138,18 +138,9 @@ def _separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> floa
     ]  # fmt: skip
     first = fit_nuisances(problem, each[0], problem.first)
     second = problem.at(each[1], first.nuisances)
-    if first.projection is None or second.projection is None:
+    if first.lost or second.lost:
         return 0.0
-    clean = first.projection.out(second.residual - first.residual)
-    square = float(clean @ clean)
-    for rival, causes, point in zip(pair, each, (first, second), strict=True):
-        if find(rival.cause.effect).discrete or rival.cause not in causes:
-            continue
-        # another amount would explain a part of it
-        row = first.projection.out(problem.slope(point, causes.index(rival.cause)))
-        known = 1 / max(float(rival.fit.covariance[-1, -1]), 1e-300)
-        square -= float(row @ clean) ** 2 / (float(row @ row) + known) / 2
-    return float(np.sqrt(max(square, 0.0)))
+    return float(separations(problem, pair, (first, second))[0])
 
 
 # --- simulated measurements: their noise and the amplitude of kicks count ------------------
