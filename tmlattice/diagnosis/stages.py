@@ -15,7 +15,7 @@ from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.views import PartView, TrajectoryView, numbers_read
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.combined import Blocks, CombinedProblem
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import (
     DistributedProblem,
     FittedErrors,
@@ -27,6 +27,7 @@ from tmlattice.inference.newton import Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Gap, Misfit, held_out_gap
+from tmlattice.inference.whitening import Blocks
 from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
 Array = NDArray[np.float64]
