@@ -49,9 +49,9 @@ def numbers_read(own: Problem, before: Point, after: Point) -> tuple[NumberRead,
         return ()
     read_numbers = []
     for shot, column in np.argwhere(own.valid).tolist():
-        values = [float(one[shot, column]) for one in (own.data, before.orbit, after.orbit)]
+        values = [float(one[shot, column]) for one in (own.values, before.orbit, after.orbit)]
         read, *models = (value % 1.0 for value in values) if column < 2 else values
-        error = float(own.errors[shot, column])
+        error = float(own.sigma[shot, column])
         read_numbers.append(NumberRead(shot, QUANTITIES[column], read, error, *models))
     return tuple(read_numbers)
 

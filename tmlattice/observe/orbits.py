@@ -51,7 +51,7 @@ def closed_orbits(ring: Ring, measured: ClosedOrbit, places: Mapping[str, float]
     settings: tuple[Settings, ...] = whole.settings or ({},) * len(whole.orbit)
     data, errors, used, read_by = _of_monitors(whole.orbit, whole.noise, "a closed orbit")
     return Orbits(
-        ring=ring, places=places, data=data, errors=errors, used=used, read_by=read_by,
+        ring=ring, places=places, values=data, sigma=errors, used=used, read_by=read_by,
         states=tuple((one, rf_of(one)) for one in settings),
     )  # fmt: skip
 
@@ -67,7 +67,7 @@ def dispersion(ring: Ring, measured: Dispersion, places: Mapping[str, float]) ->
     data, errors, used, read_by = _of_monitors(whole.orbits, whole.noise, "dispersion")
     steps = [step.step / step.frequency for step in whole.steps]
     return RfOrbits(
-        ring=ring, places=places, data=data, errors=errors, used=used, read_by=read_by,
+        ring=ring, places=places, values=data, sigma=errors, used=used, read_by=read_by,
         states=tuple(({}, side * step / 2) for step in steps for side in (1, -1)),
     )  # fmt: skip
 

@@ -64,19 +64,16 @@ class Response(Steady):
     Attributes:
         base: prediction with the known errors, see `Predicted`.
         used: fitted readings, [column, monitor, 2].
+        values, sigma: orbit changes, m, [column, monitor, 2], and noise, m, [monitor, 2].
     """
 
     base: Predicted = field(repr=False)
+    values: Array = field(init=False, repr=False)
+    sigma: Array = field(init=False, repr=False)
 
-    @property
-    def values(self) -> Array:
-        """Orbit changes, m, [column, monitor, 2]."""
-        return self.base.data.orbits
-
-    @property
-    def sigma(self) -> Array:
-        """Noise, m, [monitor, 2]."""
-        return self.base.data.noise
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", self.base.data.orbits)
+        object.__setattr__(self, "sigma", self.base.data.noise)
 
     def sees(self, hypothesis: Hypothesis) -> bool:
         """Whether a cause acts on a closed orbit; of the beam's, the energies do."""

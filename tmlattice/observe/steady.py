@@ -35,19 +35,12 @@ class Steady(Problem):
 
     Attributes:
         used: fitted readings, of the kind's own shape.
+        values, sigma: measured readings, and their noise, of compatible shapes.
     """
 
     used: Flags = field(repr=False)
-
-    @property
-    @abstractmethod
-    def values(self) -> Array:
-        """Measured readings, of the kind's shape."""
-
-    @property
-    @abstractmethod
-    def sigma(self) -> Array:
-        """Noise of each reading, of a compatible shape."""
+    values: Array = field(repr=False)
+    sigma: Array = field(repr=False)
 
     @abstractmethod
     def view(self, causes: Sequence[Cause]) -> Any:

@@ -68,8 +68,8 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     return TuneReadings(
         ring=ring,
         states=tuple((one, rf_of(one) + h) for one in settings for h in (0.0, step, -step)),
-        data=np.where(there, data, 0.0),
-        errors=errors,
+        values=np.where(there, data, 0.0),
+        sigma=errors,
         read_by=np.full(data.shape, -1),
         used=there,
         places=places,

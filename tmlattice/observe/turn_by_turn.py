@@ -334,7 +334,7 @@ class ManyTurns(Stored):
     @property
     def _turn(self) -> Array:
         """Measured phase advance of both lines per turn, [shot, mode], rad, in (-pi, pi)."""
-        return np.asarray(2 * np.pi * ((self.data[:, -2:] + 0.5) % 1 - 0.5))
+        return np.asarray(2 * np.pi * ((self.values[:, -2:] + 0.5) % 1 - 0.5))
 
     def with_turn_offsets(self, states: Sequence[Moved], late: Array) -> list[Moved]:
         """Return the states after the phase of each monitor's turn offset."""
@@ -354,11 +354,11 @@ class ManyTurns(Stored):
     @property
     def first(self) -> Array:
         """Amplitudes that fit the known ring."""
-        shots = len(self.data)
+        shots = len(self.values)
         view = self.view(self.fixed)
         nothing = np.zeros((shots, 2, 3))
         slopes = self.as_rows(self.directions(view, nothing)).T
-        left = self.as_rows(self.data - self.read(view, nothing))
+        left = self.as_rows(self.values - self.read(view, nothing))
         solved = np.linalg.lstsq(slopes, left, rcond=None)[0]
         return np.asarray(solved.reshape(nothing.shape))
 
@@ -450,8 +450,8 @@ def many_turns(
     blank = ManyTurns(
         ring=ring,
         states=tuple((one, rf_of(one)) for one in settings),
-        data=np.zeros(shape),
-        errors=np.ones(shape),
+        values=np.zeros(shape),
+        sigma=np.ones(shape),
         read_by=np.tile(np.append(np.repeat(np.arange(count), 8), [-1] * 4), (shots, 1)),
         used=np.zeros(shape, dtype=bool),
         places=places,
@@ -486,8 +486,8 @@ def many_turns(
         )
     return replace(
         blank,
-        data=np.where(there, data, 0.0),
-        errors=np.where(there, errors, 1.0),
+        values=np.where(there, data, 0.0),
+        sigma=np.where(there, errors, 1.0),
         used=there,
         shift=shift,
         warnings=(*found.warnings, *large),
