@@ -93,6 +93,12 @@ class DistributedErrors:
         return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
                           .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
 
+    def amounts_at(self, x: Array) -> Array:
+        """Amounts at independent errors of size 1 [error], within their bounds, [error]."""
+        amounts = (self.amounts + self.rms * self.correlated(x)).tolist()
+        own = zip(self.hypotheses, amounts, strict=True)
+        return np.array([find(name).floored(amount) for (name, _), amount in own])
+
     def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
         """Return the distribution after more readings.
 
@@ -260,10 +266,7 @@ class DistributedProblem(MarginalProblem):
 
     def estimate(self, clean: Array) -> Array:
         """Most probable amounts of the errors, given the rows that remain, [error]."""
-        known = self.known
-        amounts = known.amounts + known.rms * known.correlated(self.rows @ self._root.back(clean))
-        own = zip(known.hypotheses, amounts.tolist(), strict=True)
-        return np.array([find(name).floored(amount) for (name, _), amount in own])
+        return self.known.amounts_at(self.rows @ self._root.back(clean))
 
     def learnt(self, explained: Fit) -> DistributedErrors:
         """Distribution of the errors given an explanation."""
@@ -581,12 +584,7 @@ def posterior(
         most_probable = np.zeros(len(pull))
         factor = cho_factor(spread + np.eye(len(visible)), overwrite_a=True, check_finite=False)
         most_probable[visible] = cho_solve(factor, pull[visible], check_finite=False)
-        own = zip(
-            known.hypotheses,
-            known.amounts + known.rms * known.correlated(most_probable),
-            strict=True,
-        )
-        amounts = np.array([find(name).floored(amount) for (name, _), amount in own])
+        amounts = known.amounts_at(most_probable)
     return Posterior(known, amounts, visible, spread, errors)
 
 

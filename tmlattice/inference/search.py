@@ -76,15 +76,17 @@ def unnamed(
     place = int(free.gain.argmax())
     where = int(free.places[place])
     freedom = max(int(free.freedom[place]), 1)
-    seen = Detection(
-        float(free.statistic[place]),
-        free_threshold(rate, freedom, len(names)),
-        look_elsewhere(float(free.statistic[place]), freedom, len(names)),
-    )
+    seen = _detection(float(free.statistic[place]), rate, freedom, len(names))
     if not seen.p_value < rate or where in taken:
         return []
     gain = float(free.gain[place]) + problem.unknown_prior(len(names))
     return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
+
+
+def _detection(statistic: float, rate: float, freedom: int, count: float) -> Detection:
+    """Significance of the largest of a number of chi-squares."""
+    threshold = free_threshold(rate, freedom, count)
+    return Detection(statistic, threshold, look_elsewhere(statistic, freedom, count))
 
 
 def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
@@ -103,7 +105,7 @@ def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
     worst = tuple(int(i) for i in np.unravel_index(int(statistic.argmax()), statistic.shape))
     value, count = float(statistic[worst]), float(problem.valid.sum())
     rate = thresholds.rate("reading")
-    seen = Detection(value, free_threshold(rate, 1, count), look_elsewhere(value, 1, count))
+    seen = _detection(value, rate, 1, count)
     if not seen.p_value < rate:
         return []
     # a log-uniform amount, as for every other cause
