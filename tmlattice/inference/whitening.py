@@ -23,8 +23,9 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cholesky, eigh
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg import block_diag, eigh
+
+from tmlattice.inference.normal import inverse_of_lower, lower_factor
 
 Array = NDArray[np.float64]
 
@@ -111,10 +112,7 @@ def inverse_root(spread: Array) -> Root:
     if errors >= rows:
         covariance = spread.T @ spread
         covariance[np.diag_indices(rows)] += 1.0
-        factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
-        inverse, failed = dtrtri(factor, lower=1, overwrite_c=1)
-        assert failed == 0
-        return _Triangle(np.tril(inverse))
+        return _Triangle(inverse_of_lower(lower_factor(covariance)))
     values, directions = directions_of(spread)
     return _Symmetric(directions, 1 / np.sqrt(1 + values))
 
