@@ -22,23 +22,20 @@ from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
 from tmlattice.diagnosis.signals import Check, Checkup, fine, note, wrong
-from tmlattice.diagnosis.stored_data_checks import StoredData, stored_checks
+from tmlattice.diagnosis.stored_data_checks import GLOBAL, stored_checks
 from tmlattice.effects import Cause, expected_radiation
 from tmlattice.errors import MeasurementError, TmlatticeError, UnknownNameError, first_of
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
-    ClosedOrbit,
-    Dispersion,
     Measurement,
     OrbitResponse,
-    TuneReading,
-    TurnByTurn,
     in_words,
 )
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.measurement.monitors import Names
+from tmlattice.measurement.stored_files import KINDS as STORED
 from tmlattice.observe.global_errors import GlobalErrors, Verdict, certain
 from tmlattice.observe.noise import PASSES, noise_scatter
 from tmlattice.observe.response_data import response_data
@@ -93,43 +90,43 @@ def check_data(
         MeasurementError: an assumption without meaning for these data.
         UnknownNameError: an unknown assumption, or names that mostly are not the lattice's.
     """
+    from tmlattice import __version__
+
     begun = time.perf_counter()
-    names = [monitor.name for monitor in ring.monitors]
     data, absent = in_the_lattice(ring, data)
-    stated = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
+    checks = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
     if not isinstance(data, Measurement | OrbitResponse):
-        return _of_stored(ring, data, assumed, stated, begun)
-    kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
-    few = signals.few(ring, data)
-    checks = stated
-    if few is not None:
-        checks.append(few)
-    elif isinstance(data, Measurement):
-        known = tuple(expected_radiation(ring)) if radiation else ()
-        corrected = assume(in_beam_order(data, names), assumed, names)
-        checks += _of_first_turns(ring, corrected, known)
+        kind = next(name for name, own in STORED.items() if isinstance(data, own.record))
+        if assumed:
+            raise MeasurementError(
+                f"'{assumed[0]}' cannot be assumed of {in_words(data)}: correct the data themselves"
+            )
+        checks += stored_checks(ring, data)
     else:
-        checks += _of_response(ring, assume(in_beam_order(data, names), assumed, names))
-    return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
+        kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
+        few = signals.few(ring, data)
+        checks += _of_readings(ring, data, assumed, radiation) if few is None else [few]
+    provenance = {
+        "package": __version__,
+        "lattice": ring.name,
+        "measurement": None,
+        "options": {"assume": list(assumed), "radiation": radiation and kind not in STORED},
+        "seconds": time.perf_counter() - begun,
+    }
+    return Checkup(kind, tuple(checks), provenance)
 
 
-def _of_stored(
-    ring: Ring, data: StoredData, assumed: Sequence[str], stated: Sequence[Check], begun: float
-) -> Checkup:
-    if assumed:
-        raise MeasurementError(
-            f"'{assumed[0]}' cannot be assumed of {in_words(data)}: correct the data themselves"
-        )
-    kinds = {
-        TurnByTurn: "turn_by_turn", ClosedOrbit: "closed_orbit", Dispersion: "dispersion",
-        TuneReading: "tunes",
-    }  # fmt: skip
-    checks = (*stated, *stored_checks(ring, data))
-    return Checkup(kinds[type(data)], checks, _provenance(ring, assumed, False, begun))
+def _of_readings(
+    ring: Ring, data: Measurement | OrbitResponse, assumed: Sequence[str], radiation: bool
+) -> list[Check]:
+    names = [monitor.name for monitor in ring.monitors]
+    if isinstance(data, OrbitResponse):
+        return _of_response(ring, assume(in_beam_order(data, names), assumed, names))
+    corrected = assume(in_beam_order(data, names), assumed, names)
+    return _of_first_turns(ring, corrected, expected_radiation(ring) if radiation else ())
 
 
-_GLOBAL = "signs, units and order"
-_REPORTED = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
+_REPORTED = ("energy", "copied monitors", "lost beam", GLOBAL, "launches")
 """Notes that the diagnosis does not find by itself."""
 
 
@@ -171,20 +168,6 @@ def corrected_data(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
     if data is None or not assumed:
         return data
     return assume(data, assumed, [monitor.name for monitor in ring.monitors])
-
-
-def _provenance(
-    ring: Ring, assumed: Sequence[str], radiation: bool, begun: float
-) -> dict[str, object]:
-    from tmlattice import __version__
-
-    return {
-        "package": __version__,
-        "lattice": ring.name,
-        "measurement": None,
-        "options": {"assume": list(assumed), "radiation": radiation},
-        "seconds": time.perf_counter() - begun,
-    }
 
 
 def _stated(ring: Ring, data: AnyMeasurement) -> Check:
@@ -246,7 +229,7 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
 def _global(verdicts: Sequence[Verdict]) -> list[Check]:
     """One check for each global error."""
     if not verdicts:
-        return [fine(_GLOBAL, "no global error would improve the agreement")]
+        return [fine(GLOBAL, "no global error would improve the agreement")]
     return [_sentence(verdict) for verdict in verdicts]
 
 
@@ -263,7 +246,7 @@ def _sentence(verdict: Verdict) -> Check:
         f"{_number(before)} as stated, {_number(after)} with that corrected; {correction}"
     )
     make = wrong if sure else note
-    return make("signs, units and order", text, before=before, after=after, assume=verdict.names)
+    return make(GLOBAL, text, before=before, after=after, assume=verdict.names)
 
 
 def _options(names: Iterable[str]) -> str:
@@ -416,7 +399,7 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
             "machine, and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
     if not verdicts:
-        checks.append(fine(_GLOBAL, "no global error would improve the agreement"))
+        checks.append(fine(GLOBAL, "no global error would improve the agreement"))
     text = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
     return [*checks, *map(_of_all, verdicts), *_rf_step(checked), fine("lattice", text)]
 
@@ -428,7 +411,7 @@ def _of_all(verdict: ResponseVerdict) -> Check:
         f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
         f"stated, by {after:.0f} % with that corrected; {correction}"
     )
-    return wrong(_GLOBAL, text, assume=verdict.names)
+    return wrong(GLOBAL, text, assume=verdict.names)
 
 
 def _rf_step(checked: ResponseGlobalErrors) -> list[Check]:

@@ -41,10 +41,6 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-MINUTES: Mapping[str, float] = {
-    "closed_orbit": 0.5, "tunes": 2.0, "turn_by_turn": 2.0, "dispersion": 3.0,
-}  # fmt: skip
-"""Machine time of one measurement: an averaged orbit; a few kicks; a step of the RF up and down."""
 A_CORRECTOR = 0.2
 """Minutes of an orbit response for each of its correctors: two settings and their orbits."""
 
@@ -94,7 +90,7 @@ def next_kind(
     if pair is None:
         return None
     found, best = None, 0.0
-    for kind, make in KINDS.items():
+    for kind, (make, _) in KINDS.items():
         if kind in taken:
             continue
         try:
@@ -113,9 +109,8 @@ def next_kind(
 
 def minutes_of(ring: Ring, kind: str) -> float:
     """Machine time of one measurement."""
-    if kind == "orbit_response":
-        return A_CORRECTOR * sum(e.kind in ("hcorrector", "vcorrector") for e in ring.elements)
-    return MINUTES[kind]
+    correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in ring.elements)
+    return A_CORRECTOR * correctors if kind == "orbit_response" else KINDS[kind][1]
 
 
 def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Problem:
@@ -209,10 +204,12 @@ def _response(ring: Ring, how: How) -> Problem:
     )  # fmt: skip
 
 
-KINDS: Mapping[str, Callable[[Ring, How], Problem]] = {
-    "closed_orbit": _orbit,
-    "tunes": _tunes,
-    "turn_by_turn": _turns,
-    "dispersion": _dispersion,
-    "orbit_response": _response,
+KINDS: Mapping[str, tuple[Callable[[Ring, How], Problem], float]] = {
+    "closed_orbit": (_orbit, 0.5),
+    "tunes": (_tunes, 2.0),
+    "turn_by_turn": (_turns, 2.0),
+    "dispersion": (_dispersion, 3.0),
+    "orbit_response": (_response, np.nan),
 }
+"""Simulated measurement by kind, and machine time, minutes: an averaged orbit; a few kicks; a step
+of the RF up and down. See `minutes_of` for a response."""
