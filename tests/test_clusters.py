@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tmlattice.inference.clusters import (
+from tmlattice.inference.errors import (
     LinearFit,
     Rows,
     _mismatches,

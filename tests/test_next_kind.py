@@ -100,7 +100,7 @@ def test_what_a_kind_cannot_see_it_does_not_part(small_ring, tunes):
                     (cause.effect, cause.element), replace(fit, point=point, covariance=known)
                 )
             )
-        separation = module._separation(KINDS[kind](small_ring, asked), tuple(pair))
+        separation = module._separation(KINDS[kind][0](small_ring, asked), tuple(pair))
         assert (separation > 10) is parts
         if parts:  # 200 um in one reading of 2 um
             assert separation == pytest.approx(100, rel=0.01)

@@ -31,9 +31,9 @@ from tmlattice.machine.response import simulate_response as simulated
 from tmlattice.measurement import OrbitResponse, read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.calibration import calibrated_response, read_calibration
+from tmlattice.observe.noise import Places, estimated_noise
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_noise import Places, estimated_noise
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes, twiss
 from tmlattice.report.plain import report_text

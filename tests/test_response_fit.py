@@ -17,10 +17,9 @@ from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference import slopes
-from tmlattice.inference.normal import Normal, normal_equations, solve
+from tmlattice.inference import normal as blocks
+from tmlattice.inference.normal import Normal, Slopes, normal_equations, solve
 from tmlattice.inference.priors import Group
-from tmlattice.inference.slopes import Slopes
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors
 from tmlattice.observe.response_data import response_data
@@ -76,7 +75,7 @@ def test_normal_equations_of_several_families_in_several_pieces(problem, rng, mo
     now = rng.uniform(0.5, 2, residual.shape)
     ring = (Slopes(J[:3]), Slopes(J[3:3]), Slopes(J[3:] / now, now))
     for columns in (2, 5):
-        monkeypatch.setattr(slopes, "AT_ONCE", columns * residual.shape[1])
+        monkeypatch.setattr(blocks, "AT_ONCE", columns * residual.shape[1])
         normal = normal_equations(residual, weight, plane, u, v, ring)
         assert_allclose(normal.matrix, X.T @ (w[:, None] * X), rtol=1e-12, atol=1e-7)
         right = X.T @ (w * np.nan_to_num(residual.ravel()))

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tmlattice import Cause, diagnose
-from tmlattice.diagnosis.families.orbit_modes import orbit_families
+from tmlattice.diagnosis.families.dispersion import orbit_families
 from tmlattice.diagnosis.response.detected_faults import detected_faults
 from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.linear import linear

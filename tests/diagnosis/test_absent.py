@@ -7,8 +7,7 @@ import pytest
 
 from tmlattice import diagnose
 from tmlattice.challenge.kinds import measure
-from tmlattice.diagnosis.absent import in_the_lattice
-from tmlattice.diagnosis.data_checks import check_data
+from tmlattice.diagnosis.data_checks import check_data, in_the_lattice
 from tmlattice.effects import Cause
 from tmlattice.errors import UnknownNameError
 from tmlattice.machine.response import simulate_response

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
-from tmlattice.diagnosis.assessment import STATEMENTS, Block, assess, compared_of
+from tmlattice.diagnosis.assessment import STATEMENTS, Assessment, Block, compared_of
 from tmlattice.effects import background_rms
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.machine.response import simulate_response
@@ -196,10 +196,10 @@ def every_assessment():
                 alone = not told["families"] and not told["small_errors"]
                 if verdict == "distributed" and alone and told["amounts"]:
                     continue  # it puts nothing into the model
-                yield assess(verdict, compared_of(fitted, gap), gap, **told)
-    yield assess("none", (), None, amounts=False, findings=False, noise_estimated=False)
+                yield Assessment(verdict, compared_of(fitted, gap), gap, **told)
+    yield Assessment("none", (), None, amounts=False, findings=False, noise_estimated=False)
     for fitted in FITTED.values():
-        yield assess("none", (fitted,), None, amounts=False, findings=False,
+        yield Assessment("none", (fitted,), None, amounts=False, findings=False,
                      noise_estimated=False, reference=True, change=True)  # fmt: skip
 
 

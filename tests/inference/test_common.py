@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.clusters import LinearFit, Rows, cluster_robust_errors
-from tmlattice.inference.common import amounts, common, times_precision
-from tmlattice.inference.normal import normal_equations
+from tmlattice.inference.errors import LinearFit, Rows, cluster_robust_errors
+from tmlattice.inference.normal import amounts, common, normal_equations, times_precision
 
 COLUMNS, MONITORS, ERRORS, PATTERNS = 6, 9, 3, 2
 

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from tmlattice.inference.heavy_tails import moments
+from tmlattice.inference.errors import moments
 from tmlattice.inference.normal import Normal, solve
 from tmlattice.inference.priors import Group
 

@@ -9,7 +9,7 @@ import pytest
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.errors import BeamLostError
-from tmlattice.inference.dual import most_probable
+from tmlattice.fitting.map_fit import most_probable
 from tmlattice.inference.newton import Outcome, _best_move, fit
 from tmlattice.inference.priors import AmountPrior, Student
 from tmlattice.inference.problem import Point

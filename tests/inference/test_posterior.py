@@ -14,16 +14,15 @@ from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import background_rms, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import distributed
-from tmlattice.inference import posterior as module
 from tmlattice.inference.distributed import (
     ROWS,
     DistributedErrors,
     fit_distributed_errors,
+    posterior,
     sampled_rows,
 )
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.metric import Metric
-from tmlattice.inference.posterior import posterior
 from tmlattice.inference.whitening import Projection
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe import response_metric
@@ -131,7 +130,7 @@ def test_memory_does_not_grow_with_readings():
     )
     point = SimpleNamespace(residual=residual, projection=projection)
     tracemalloc.start()
-    sums = module.sums_at(problem, point, known, np.zeros(count), np.array([3, size + 7]))
+    sums = distributed.sums_at(problem, point, known, np.zeros(count), np.array([3, size + 7]))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20e6

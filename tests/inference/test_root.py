@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.root import inverse_root
+from tmlattice.inference.whitening import inverse_root
 
 
 @pytest.mark.parametrize("errors", [0, 1, 12, 40, 55])

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference import scale_uncertainty
+from tmlattice.inference import errors
+from tmlattice.inference.errors import FACTORS, scale_covariance
 from tmlattice.inference.normal import Normal, solve
 from tmlattice.inference.priors import Group
-from tmlattice.inference.scale_uncertainty import FACTORS, scale_covariance
 
 READINGS = 40
 
@@ -14,7 +14,7 @@ READINGS = 40
 @pytest.fixture
 def problem(monkeypatch):
     """Ten numbers that are known, and one of a kind of its own that two of them make up for."""
-    monkeypatch.setattr(scale_uncertainty, "DRAWS", 3000)
+    monkeypatch.setattr(errors, "DRAWS", 3000)
     random = np.random.default_rng(2)
     J = random.standard_normal((READINGS, 11))
     J[:, 10] = J[:, 0] + J[:, 1] + 0.1 * J[:, 10]

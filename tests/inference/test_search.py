@@ -12,7 +12,7 @@ from tmlattice.beam.model import Model
 from tmlattice.inference import search as own
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.newton import fit
-from tmlattice.inference.options import Option
+from tmlattice.inference.search import Option
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 

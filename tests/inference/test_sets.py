@@ -5,8 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from tmlattice.inference.common_factors import FactorModel
-from tmlattice.inference.sets import likely_sets, over_sets
+from tmlattice.inference.common_factors import FactorModel, likely_sets, over_sets
 
 FAMILIES = np.kron(np.eye(4), np.ones((10, 1)))
 A, B, C, D, FIRST_THREE, LAST_TWO, ALL = range(7)

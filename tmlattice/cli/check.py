@@ -19,7 +19,7 @@ from tmlattice.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from tmlattice.diagnosis.checkup import Checkup
+    from tmlattice.diagnosis.signals import Checkup
 
 WRONG = 1
 

@@ -11,6 +11,7 @@ sentence with the condition that it requires; `docs/diagnose.md` shows it.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -78,23 +79,18 @@ def combined_p_value(blocks: Sequence[Block]) -> float:
     return min(1.0, len(blocks) * min(block.p_value for block in blocks))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Assessment:
     """The conclusions of a diagnosis about its own fit.
 
     Attributes:
         verdict: of the diagnosis.
-        remainder: whether the residual of the result is noise.
-        p_value: of the remainder, over all blocks.
-        blocks: the readings that were compared.
-        significant: of those, the ones that leave more than expected.
-        places: where the remainder is, (from, to) in m.
+        blocks: readings compared with what the result predicts.
+        held_out: the gap of held-out readings; None: none were held out.
+        amounts: whether anything with an amount was put into the model.
+        findings: whether there are findings.
         noise_estimated: whether the noise comes from the same readings.
-        gap: whether held-out readings show a gap, and whether it is explained.
-        before, after: rms of held-out readings, m.
-        explained, interval: share of the gap that is explained, and its 95 % interval.
-        series: rms of the held-out readings of each model, and what the last one expects, m; empty
-            without distributed errors.
+        places: where the remainder is, with `s_from` and `s_to`, m.
         families: whether families of errors were fitted.
         rejected: families that were tried and are not in the result.
         small_errors: whether distributed errors are in the model.
@@ -102,28 +98,63 @@ class Assessment:
         change: whether the findings are changes since that reference.
         measured: quantities of the stored beam that were measured.
         model: what the lattice is of the machine, such as "design".
+        false_alarm: p-value from which on a remainder is noise.
     """
 
     verdict: str
-    remainder: Remainder
-    p_value: float
     blocks: tuple[Block, ...]
-    significant: tuple[Block, ...]
-    places: tuple[tuple[float, float], ...]
+    held_out: Gap | None
+    amounts: bool
+    findings: bool
     noise_estimated: bool
-    gap: GapState
-    before: float
-    after: float
-    explained: float | None
-    interval: tuple[float, float] | None
-    series: tuple[float, ...]
-    families: bool
-    rejected: tuple[str, ...]
-    small_errors: bool
-    reference: bool
-    change: bool
-    measured: frozenset[str]
+    places: Sequence[Mapping[str, float]] = ()
+    families: bool = False
+    rejected: Sequence[str] = ()
+    small_errors: bool = False
+    reference: bool = False
+    change: bool = False
+    measured: Sequence[str] = ()
     model: str = "design"
+    false_alarm: float = DEFAULT.false_alarm
+
+    @cached_property
+    def p_value(self) -> float:
+        """P-value of the remainder, over all blocks."""
+        return combined_p_value(self.blocks)
+
+    @cached_property
+    def significant(self) -> tuple[Block, ...]:
+        """The blocks that leave more than expected."""
+        count = len(self.blocks)
+        return tuple(b for b in self.blocks if count * b.p_value < self.false_alarm)
+
+    @cached_property
+    def remainder(self) -> Remainder:
+        """Whether the residual of the result is noise."""
+        if not self.blocks:
+            return "unknown"
+        if any(block.ratio**2 > MISSING for block in self.significant):
+            return "effect_missing"
+        if self.significant:
+            return "unknown" if self.noise_estimated else "above_noise"
+        return "noise"
+
+    @cached_property
+    def gap(self) -> GapState:
+        """Whether held-out readings show a gap, and whether it is explained."""
+        held_out = self.held_out
+        if held_out is None:
+            return "not_held_out"
+        if held_out.lost:
+            return "beam_lost"
+        if not self.amounts:
+            left = any(block.name.startswith("held-out") for block in self.significant)
+            if not left or self.remainder not in _UNEXPLAINED:
+                return "none"
+            return "no_amount" if self.findings else "nothing_fitted"
+        if held_out.explained is not None:
+            return "explained"
+        return "share_unknown" if held_out.significant(self.false_alarm) else "none"
 
     @property
     def statements(self) -> tuple["Statement", ...]:
@@ -145,97 +176,6 @@ class Assessment:
             "measured": sorted(self.measured),
             "statements": {one.name: one.text(self) for one in self.statements},
         }
-
-
-def assess(
-    verdict: str,
-    blocks: Sequence[Block],
-    gap: Gap | None,
-    *,
-    amounts: bool,
-    findings: bool,
-    places: Sequence[Mapping[str, float]] = (),
-    noise_estimated: bool,
-    families: bool = False,
-    rejected: Sequence[str] = (),
-    small_errors: bool = False,
-    reference: bool = False,
-    change: bool = False,
-    measured: Sequence[str] = (),
-    model: str = "design",
-    false_alarm: float = DEFAULT.false_alarm,
-) -> Assessment:
-    """Return the conclusions about a result.
-
-    Args:
-        verdict: of the diagnosis.
-        blocks: readings compared with what the result predicts.
-        gap: of held-out readings; None: none were held out.
-        amounts: whether anything with an amount was put into the model.
-        findings: whether there are findings.
-        places: where the remainder is, with `s_from` and `s_to`, m.
-        noise_estimated, families, rejected: see `Assessment`.
-        small_errors, reference, change, measured, model: likewise.
-        false_alarm: p-value from which on a remainder is noise.
-    """
-    p_value = combined_p_value(blocks)
-    significant = tuple(b for b in blocks if len(blocks) * b.p_value < false_alarm)
-    remainder: Remainder = "noise"
-    if not blocks:
-        remainder = "unknown"
-    elif any(block.ratio**2 > MISSING for block in significant):
-        remainder = "effect_missing"
-    elif significant:
-        remainder = "unknown" if noise_estimated else "above_noise"
-    held = [block for block in significant if block.name.startswith("held-out")]
-    before = after = float("nan")
-    series: tuple[float, ...] = ()
-    if gap is not None:
-        before, after = gap.misfits[gap.baseline].rms, gap.misfits[-1].rms
-        expected = gap.misfits[-1].expected
-        if small_errors and expected is not None:
-            series = (*(misfit.rms for misfit in gap.misfits), expected)
-    return Assessment(
-        verdict=verdict,
-        remainder=remainder,
-        p_value=p_value,
-        blocks=tuple(blocks),
-        significant=significant,
-        places=tuple((place["s_from"], place["s_to"]) for place in places),
-        noise_estimated=noise_estimated,
-        gap=_gap(gap, amounts, findings, held if remainder in _UNEXPLAINED else (), false_alarm),
-        before=before,
-        after=after,
-        explained=None if gap is None else gap.explained,
-        interval=None if gap is None else gap.interval,
-        series=series,
-        families=families,
-        rejected=tuple(rejected),
-        small_errors=small_errors,
-        reference=reference,
-        change=change,
-        measured=frozenset(measured),
-        model=model,
-    )
-
-
-def _gap(
-    gap: Gap | None,
-    amounts: bool,
-    findings: bool,
-    left: Sequence[Block],
-    false_alarm: float,
-) -> GapState:
-    """The state of the gap, see `GapState`."""
-    if gap is None:
-        return "not_held_out"
-    if gap.lost:
-        return "beam_lost"
-    if not amounts:
-        return ("no_amount" if findings else "nothing_fitted") if left else "none"
-    if gap.explained is not None:
-        return "explained"
-    return "share_unknown" if gap.significant(false_alarm) else "none"
 
 
 # --- the sentences --------------------------------------------------------------------------------
@@ -265,7 +205,7 @@ def chance_text(p_value: float) -> str:
 
 
 def _where(own: Assessment) -> str:
-    spans = "; ".join(f"{low:.1f} m to {high:.1f} m" for low, high in own.places)
+    spans = "; ".join(f"{one['s_from']:.1f} m to {one['s_to']:.1f} m" for one in own.places)
     return f" It is largest at s = {spans}." if spans else ""
 
 
@@ -299,14 +239,17 @@ def _missing(own: Assessment) -> str:
 
 
 def _closed(own: Assessment) -> str:
-    text = f"On {_held(own)} {100 * (own.explained or 0.0):.1f} % of the gap is explained"
-    if own.interval is not None:
-        low, high = own.interval
+    gap = own.held_out
+    assert gap is not None
+    text = f"On {_held(own)} {100 * (gap.explained or 0.0):.1f} % of the gap is explained"
+    if gap.interval is not None:
+        low, high = gap.interval
         text += f" (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"
-    if own.series:
-        *rms, expected = own.series
+    expected = gap.misfits[-1].expected
+    if own.small_errors and expected is not None:
         added = (f"the {own.model}", "with distributed errors", "with the findings")
-        steps = ", ".join(f"{a} {micrometres(b)}" for a, b in zip(added, rms, strict=False))
+        own_rms = zip(added, (misfit.rms for misfit in gap.misfits), strict=False)
+        steps = ", ".join(f"{model} {micrometres(rms)}" for model, rms in own_rms)
         text += f": {steps}; {micrometres(expected)} are expected"
     return text + "."
 
@@ -316,7 +259,10 @@ def _held(own: Assessment) -> str:
 
 
 def _falls(own: Assessment) -> str:
-    return f"from {micrometres(own.before)} to {micrometres(own.after)}"
+    gap = own.held_out
+    assert gap is not None
+    before, after = gap.misfits[gap.baseline].rms, gap.misfits[-1].rms
+    return f"from {micrometres(before)} to {micrometres(after)}"
 
 
 def _everywhere(own: Assessment) -> bool:

@@ -8,8 +8,7 @@ the ring's energy. Only layers that a cause changes are computed again.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
 from tmlattice.diagnosis.recommended_actions import compensated
+from tmlattice.diagnosis.records import named
 from tmlattice.effects import Cause, RingEffect, changed_elements, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Element, Ring
@@ -54,24 +54,12 @@ class Consequences:
     Attributes:
         design: tunes of the design.
         found: with everything that was found.
-        repaired: with this finding repaired and the others still there.
+        corrected: with this finding corrected and the others still there.
     """
 
-    design: Pair | None
+    design: Pair | None = field(metadata=named("design_tunes"))
     found: Beam | None
     corrected: Beam | None
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {
-            "design_tunes": None if self.design is None else list(self.design),
-            "found": _json(self.found),
-            "corrected": _json(self.corrected),
-        }
-
-
-def _json(beam: Beam | None) -> dict[str, Any] | None:
-    return None if beam is None else {name: list(pair) for name, pair in asdict(beam).items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,44 +5,42 @@
 
 Global errors come first: a wrong sign, unit or order is reported with its correction and with the
 assumption that continues without it. Launches, noise, BPMs and single readings follow.
+
+BPMs and correctors of a measurement that are not in the lattice. A control room reads more than its
+lattice file has, such as a BPM in a transfer line. Such channels are rejected, with a note. If most
+names are unknown, the names or the lattice are wrong: the first one raises an error. So does a
+magnet in the place of a BPM.
 """
 
 import time
-from collections.abc import Iterable, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.absent import in_the_lattice
-from tmlattice.diagnosis.checkup import Check, Checkup, fine, note, wrong
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
-from tmlattice.diagnosis.stored_data_checks import StoredData, stored_checks
+from tmlattice.diagnosis.signals import Check, Checkup, fine, note, wrong
+from tmlattice.diagnosis.stored_data_checks import GLOBAL, stored_checks
 from tmlattice.effects import Cause, expected_radiation
-from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.errors import MeasurementError, TmlatticeError, UnknownNameError, first_of
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
-    ClosedOrbit,
-    Dispersion,
     Measurement,
     OrbitResponse,
-    TuneReading,
-    TurnByTurn,
     in_words,
 )
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
-from tmlattice.observe.evidence import Names, Verdict, certain
-from tmlattice.observe.global_errors import GlobalErrors
+from tmlattice.measurement.monitors import Names
+from tmlattice.measurement.stored_files import KINDS as STORED
+from tmlattice.observe.global_errors import GlobalErrors, Verdict, certain
 from tmlattice.observe.noise import PASSES, noise_scatter
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors, ResponseVerdict
 from tmlattice.observe.sections import Passes, SectionFits
-
-Array = NDArray[np.float64]
 
 ENERGY = 0.02
 """Share by which a stated beam energy may differ from the lattice's."""
@@ -92,43 +90,43 @@ def check_data(
         MeasurementError: an assumption without meaning for these data.
         UnknownNameError: an unknown assumption, or names that mostly are not the lattice's.
     """
+    from tmlattice import __version__
+
     begun = time.perf_counter()
-    names = [monitor.name for monitor in ring.monitors]
     data, absent = in_the_lattice(ring, data)
-    stated = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
+    checks = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
     if not isinstance(data, Measurement | OrbitResponse):
-        return _of_stored(ring, data, assumed, stated, begun)
-    kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
-    few = signals.few(ring, data)
-    checks = stated
-    if few is not None:
-        checks.append(few)
-    elif isinstance(data, Measurement):
-        known = tuple(expected_radiation(ring)) if radiation else ()
-        corrected = assume(in_beam_order(data, names), assumed, names)
-        checks += _of_first_turns(ring, corrected, known)
+        kind = next(name for name, own in STORED.items() if isinstance(data, own.record))
+        if assumed:
+            raise MeasurementError(
+                f"'{assumed[0]}' cannot be assumed of {in_words(data)}: correct the data themselves"
+            )
+        checks += stored_checks(ring, data)
     else:
-        checks += _of_response(ring, assume(in_beam_order(data, names), assumed, names))
-    return Checkup(kind, tuple(checks), _provenance(ring, assumed, radiation, begun))
+        kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
+        few = signals.few(ring, data)
+        checks += _of_readings(ring, data, assumed, radiation) if few is None else [few]
+    provenance = {
+        "package": __version__,
+        "lattice": ring.name,
+        "measurement": None,
+        "options": {"assume": list(assumed), "radiation": radiation and kind not in STORED},
+        "seconds": time.perf_counter() - begun,
+    }
+    return Checkup(kind, tuple(checks), provenance)
 
 
-def _of_stored(
-    ring: Ring, data: StoredData, assumed: Sequence[str], stated: Sequence[Check], begun: float
-) -> Checkup:
-    if assumed:
-        raise MeasurementError(
-            f"'{assumed[0]}' cannot be assumed of {in_words(data)}: correct the data themselves"
-        )
-    kinds = {
-        TurnByTurn: "turn_by_turn", ClosedOrbit: "closed_orbit", Dispersion: "dispersion",
-        TuneReading: "tunes",
-    }  # fmt: skip
-    checks = (*stated, *stored_checks(ring, data))
-    return Checkup(kinds[type(data)], checks, _provenance(ring, assumed, False, begun))
+def _of_readings(
+    ring: Ring, data: Measurement | OrbitResponse, assumed: Sequence[str], radiation: bool
+) -> list[Check]:
+    names = [monitor.name for monitor in ring.monitors]
+    if isinstance(data, OrbitResponse):
+        return _of_response(ring, assume(in_beam_order(data, names), assumed, names))
+    corrected = assume(in_beam_order(data, names), assumed, names)
+    return _of_first_turns(ring, corrected, expected_radiation(ring) if radiation else ())
 
 
-_GLOBAL = "signs, units and order"
-_REPORTED = ("energy", "copied monitors", "lost beam", _GLOBAL, "launches")
+_REPORTED = ("energy", "copied monitors", "lost beam", GLOBAL, "launches")
 """Notes that the diagnosis does not find by itself."""
 
 
@@ -172,20 +170,6 @@ def corrected_data(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
     return assume(data, assumed, [monitor.name for monitor in ring.monitors])
 
 
-def _provenance(
-    ring: Ring, assumed: Sequence[str], radiation: bool, begun: float
-) -> dict[str, object]:
-    from tmlattice import __version__
-
-    return {
-        "package": __version__,
-        "lattice": ring.name,
-        "measurement": None,
-        "options": {"assume": list(assumed), "radiation": radiation},
-        "seconds": time.perf_counter() - begun,
-    }
-
-
 def _stated(ring: Ring, data: AnyMeasurement) -> Check:
     """The check of the stated lattice and energy."""
     if data.energy is None:
@@ -197,6 +181,19 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
             "name this machine's lattice, or its energy (`energy` in tmlattice.toml)",
         )
     return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
+
+
+AnySearch = TypeVar("AnySearch", GlobalErrors, ResponseGlobalErrors)
+
+
+def _in_turn(checked: AnySearch, most: int) -> tuple[list[Any], AnySearch]:
+    """Global errors one after another, each with those before it corrected, and the search with all
+    of them corrected."""
+    found: list[Any] = []
+    while len(found) < most and (own := checked.verdict()) is not None:
+        found.append(own)
+        checked = checked.corrected(own.names)
+    return found, checked
 
 
 # --- first turns ----------------------------------------------------------------------------------
@@ -213,10 +210,7 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
-    checked = GlobalErrors(ring, data, known)
-    verdicts = checked.verdicts()
-    for verdict in verdicts:
-        checked = checked.corrected(verdict.names)
+    verdicts, checked = _in_turn(GlobalErrors(ring, data, known), 3)
     passes, found = checked.found(checked.measurement)
     lattice = _lattice(ring, checked, passes, found)
     if lattice.status == "wrong":  # no wrong sign, unit or order explains that
@@ -235,7 +229,7 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
 def _global(verdicts: Sequence[Verdict]) -> list[Check]:
     """One check for each global error."""
     if not verdicts:
-        return [fine(_GLOBAL, "no global error would improve the agreement")]
+        return [fine(GLOBAL, "no global error would improve the agreement")]
     return [_sentence(verdict) for verdict in verdicts]
 
 
@@ -252,7 +246,7 @@ def _sentence(verdict: Verdict) -> Check:
         f"{_number(before)} as stated, {_number(after)} with that corrected; {correction}"
     )
     make = wrong if sure else note
-    return make("signs, units and order", text, before=before, after=after, assume=verdict.names)
+    return make(GLOBAL, text, before=before, after=after, assume=verdict.names)
 
 
 def _options(names: Iterable[str]) -> str:
@@ -381,10 +375,7 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
     checks = signals.monitors(ring, data.monitors, data.response)
     if any(check.status == "wrong" for check in checks):
         return checks
-    checked = ResponseGlobalErrors(ring, data)
-    verdicts = checked.verdicts()
-    for verdict in verdicts:
-        checked = checked.corrected(verdict.names)
+    verdicts, checked = _in_turn(ResponseGlobalErrors(ring, data), 4)
     left = checked.misfit(())
     typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
     if typical > (CORRECTED if verdicts else ANOTHER):
@@ -408,7 +399,7 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
             "machine, and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
     if not verdicts:
-        checks.append(fine(_GLOBAL, "no global error would improve the agreement"))
+        checks.append(fine(GLOBAL, "no global error would improve the agreement"))
     text = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
     return [*checks, *map(_of_all, verdicts), *_rf_step(checked), fine("lattice", text)]
 
@@ -420,7 +411,7 @@ def _of_all(verdict: ResponseVerdict) -> Check:
         f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
         f"stated, by {after:.0f} % with that corrected; {correction}"
     )
-    return wrong(_GLOBAL, text, assume=verdict.names)
+    return wrong(GLOBAL, text, assume=verdict.names)
 
 
 def _rf_step(checked: ResponseGlobalErrors) -> list[Check]:
@@ -442,7 +433,7 @@ def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
         return None
 
 
-def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
+def _words(names: Sequence[str], alike: Sequence[Sequence[str]]) -> tuple[str, str, str]:
     """The error, its alternatives, and the correction."""
     words = " and ".join(ASSUMPTIONS[n].words for n in names)
     others = "; ".join(
@@ -454,3 +445,68 @@ def _words(names: Names, alike: Sequence[Names]) -> tuple[str, str, str]:
         f" ({others})" if others else "",
         f"{corrections}, or go on with {_options(names)}",
     )
+
+
+MOST = 0.5
+"""Share of the names that may be unknown."""
+SHOWN = 8
+"""Names in a sentence at most."""
+MEANT = "did you mean"
+"""Phrase in the message about a misspelt name."""
+
+Measured = TypeVar("Measured")
+
+
+def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]:
+    """The measurement without BPMs and correctors that are not in the lattice, and a sentence for
+    each kind left out.
+
+    Args:
+        ring: the design.
+        measured: of any kind.
+
+    Raises:
+        UnknownNameError: more than half of the monitors, or of the correctors, are not there.
+    """
+    own: Any = measured
+    messages: list[str] = []
+    if not ring.monitors:
+        return measured, messages  # nothing can be read there; reported elsewhere
+    monitors = Names("monitor", (monitor.name for monitor in ring.monitors))
+    for what, find in (("monitors", monitors.__getitem__), ("correctors", ring.index)):
+        names = getattr(own, what, ())
+        unknown = [name for name in names if not _has(ring, monitors, name)]
+        if not unknown:
+            continue
+        fix = _hint(find, unknown[0])
+        if len(unknown) > MOST * len(names):
+            raise UnknownNameError(
+                f"{len(unknown)} of {len(names)} {what} are not in the lattice: {fix}"
+            )
+        own = own.select(**{what: [name for name in names if name not in unknown]})
+        typed = MEANT in fix and len(unknown) == 1
+        messages.append(
+            f"not in the lattice, and left out: {len(unknown)} of {len(names)} {what} "
+            f"({first_of(unknown, SHOWN)})" + (f"; {fix.partition('; ')[2]}" if typed else "")
+        )
+    return own, messages
+
+
+def _hint(find: Callable[[str], object], name: str) -> str:
+    """The message about an unknown name."""
+    try:
+        find(name)
+    except UnknownNameError as error:
+        return str(error)
+    return ""
+
+
+def _has(ring: Ring, monitors: Names, name: str) -> bool:
+    """Whether the ring has an element of this name."""
+    if monitors.find(name) is not None:
+        return True
+    try:
+        ring.index(name)
+    except UnknownNameError:
+        return False
+    return True

@@ -59,7 +59,10 @@ def findings_of(
         found.append(located(ring, ring.magnets[layer], detection))
     for m, detection in explanation.monitors.items():
         found.append(located(ring, ring.monitors[m], detection))
-    found += [_dead(ring, ring.monitors[m], amount) for m, amount in dead]
+    sure = Detection(float("inf"), float("nan"), 0.0)  # the readings alone show the fault
+    for m, amount in dead:
+        cause = Cause("monitor_dead", ring.monitors[m].name, amount)
+        found.append(finding_of(ring, [cause], np.ones(1), [cause], 0.0, sure, judgement.mass))
     return strongest_first(found)
 
 
@@ -133,41 +136,8 @@ def finding_of(
 def located(ring: Ring, element: Element, detection: Detection) -> Finding:
     """The finding of a kick without a named cause."""
     where, near = between(ring, [element.s])
-    return Finding(
-        effect=None,
-        element=None,
-        s=element.s,
-        amount=None,
-        amount_sigma=None,
-        unit=None,
-        probability=1.0,
-        detection=detection,
-        where=where,
-        near=tuple(dict.fromkeys((*near[:1], element.name, *near[1:]))),
-        credible_set=(),
-        mass=0.0,
-    )
-
-
-def _dead(ring: Ring, monitor: Element, amount: float) -> Finding:
-    """The finding of a BPM whose readings alone show a fault."""
-    where, near = between(ring, [monitor.s])
-    cause = Cause("monitor_dead", monitor.name, amount)
-    return Finding(
-        effect="monitor_dead",
-        element=monitor.name,
-        s=monitor.s,
-        amount=amount,
-        amount_sigma=0.0,
-        unit="discrete",
-        probability=1.0,
-        detection=Detection(float("inf"), float("nan"), 0.0),
-        where=where,
-        near=near,
-        credible_set=(_member(ring, cause, 1.0),),
-        mass=1.0,
-        recommended_actions=recommended_actions(ring, [cause], [1.0], 0.0),
-    )
+    near = tuple(dict.fromkeys((*near[:1], element.name, *near[1:])))
+    return Finding(s=element.s, detection=detection, where=where, near=near)
 
 
 def with_consequences(

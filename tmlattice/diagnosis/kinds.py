@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
-from tmlattice.diagnosis.prepare import batch, prepare
+from tmlattice.diagnosis.prepare import batch, noise_of, prepare
 from tmlattice.diagnosis.stored_data_checks import raise_if_wrong
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import CombinedProblem
@@ -83,7 +83,7 @@ class Part:
         heldout: the validation set; None where nothing is held out.
         estimated: whether its noise comes from the data.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
-        said: messages.
+        messages: about the data.
         hypotheses: what its readings can determine; None: what the problem sees.
         start: nuisances to start at; None: the problem's own first guess.
         shots: numbers of those of the fit, those of a reference first (None), and of those that
@@ -161,8 +161,9 @@ def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
             ready = prepare(ring, measured, before, *options)
     other = None
     if held is not None:
-        data = of_measurement(ring, held).with_sigma(np.array(ready.noise))
-        model = Model(ring, data.settings, data.turns, ready.known, active=data.active)
+        data = of_measurement(ring, held).with_sigma(np.array(noise_of(ready.problem.data)))
+        known = ready.problem.model.assembly.known
+        model = Model(ring, data.settings, data.turns, known, active=data.active)
         other = FirstTurns(model=model, data=data, places=how.places)
     earlier: tuple[int | None, ...] = (None,) * (0 if before is None else len(before.shots))
     return Part(
@@ -200,16 +201,22 @@ def _response(label: str, kind: str, measured: Any, how: How) -> Part:
     return Part(label, kind, fitted, judges, messages=messages)
 
 
-def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]:
-    """A kind whose shots are held out if there are enough of them."""
+def _of_stored(
+    make: Callable[..., Problem], shots: bool = False
+) -> Callable[[str, str, Any, How], Part]:
+    """A kind of a stored beam; with `shots`, some are held out if there are enough of them."""
 
     def made(label: str, kind: str, measured: Any, how: How) -> Part:
-        shots = list(measured.shots)
-        count = round(how.holdout * len(shots))
-        _check_assumed(label, kind, how)
+        if how.assume:
+            raise MeasurementError(
+                f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
+                "correct the data themselves"
+            )
         held = None
-        if len(shots) > 2 and count:
-            drawn = np.random.default_rng(how.seed).permutation(shots).tolist()
+        ids = list(measured.shots) if shots else []
+        count = round(how.holdout * len(ids))
+        if len(ids) > 2 and count:
+            drawn = np.random.default_rng(how.seed).permutation(ids).tolist()
             held, measured = (
                 measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
             )
@@ -224,34 +231,12 @@ def _with_shots(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], 
     return made
 
 
-def _alone(make: Callable[..., Problem]) -> Callable[[str, str, Any, How], Part]:
-    """A kind without a validation set."""
-
-    def made(label: str, kind: str, measured: Any, how: How) -> Part:
-        _check_assumed(label, kind, how)
-        problem = make(how.ring, measured, how.places)
-        if isinstance(problem, Stored):
-            raise_if_wrong(how.ring, measured, problem)
-        return Part(label, kind, problem)
-
-    return made
-
-
-def _check_assumed(label: str, kind: str, how: How) -> None:
-    if how.assume:
-        raise MeasurementError(
-            f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
-            "correct the "
-            "data themselves"
-        )
-
-
 KINDS: Mapping[str, tuple[type, Callable[[str, str, Any, How], Part]]] = {
     "trajectory": (Measurement, _first_turns),
     "orbit_response": (OrbitResponse, _response),
-    "turn_by_turn": (TurnByTurn, _with_shots(many_turns)),
-    "closed_orbit": (ClosedOrbit, _with_shots(closed_orbits)),
-    "dispersion": (Dispersion, _alone(dispersion)),
-    "tunes": (TuneReading, _alone(tune_readings)),
+    "turn_by_turn": (TurnByTurn, _of_stored(many_turns, shots=True)),
+    "closed_orbit": (ClosedOrbit, _of_stored(closed_orbits, shots=True)),
+    "dispersion": (Dispersion, _of_stored(dispersion)),
+    "tunes": (TuneReading, _of_stored(tune_readings)),
 }
 """Records and their part functions, by the kind that a folder states."""

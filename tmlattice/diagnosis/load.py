@@ -5,26 +5,23 @@ readings, the scan and the covariance: functions that need them raise an error.
 """
 
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass, replace
-from functools import cache
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 
 from tmlattice.diagnosis.assessment import Block
-from tmlattice.diagnosis.consequences import Consequences
-from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import element_kind
-from tmlattice.diagnosis.response.common_factors import CommonFactors, Instead
+from tmlattice.diagnosis.records import decoded
+from tmlattice.diagnosis.response.common_factors import CommonFactors
 from tmlattice.diagnosis.response.inconsistencies import Inconsistency
 from tmlattice.diagnosis.response.missing_effects import Weighed
 from tmlattice.diagnosis.response.stepwise import Step
 from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.diagnosis.support import Support
+from tmlattice.diagnosis.support import Correlation, Support
 from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.diagnosis.views import PartView, StoredView
 from tmlattice.effects import Cause, RingEffect, apply, find
@@ -36,16 +33,6 @@ from tmlattice.measurement.documents import read_document
 FORMAT, VERSION = "tmlattice-diagnosis", 2
 DOCUMENT, LATTICE = "diagnosis.json", "diagnosis.lattice.json"
 """Of a folder of `save`: the result, and the lattice that it is about."""
-
-_KEYS = {
-    (Consequences, "design"): "design_tunes",
-    (Instead, "amounts"): "common_factors",
-    (NextMeasurement, "parts"): "between",
-    (NextMeasurement, "separation"): "separation_sigma",
-    (PartView, "label"): "name",
-    (CommonFactors, "between"): "between_families",
-}
-"""Of a field, where the file calls it otherwise."""
 
 
 def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diagnosis:
@@ -172,46 +159,3 @@ def _gap(gap: Mapping[str, Any]) -> Gap | None:
         held["readings"],
         held["lost"],
     )
-
-
-def decoded(kind: Any, value: Any) -> Any:
-    """A value of a JSON file as the type that an attribute has.
-
-    Null is NaN for a number. A tuple of fixed length may be an object, by the order of its keys.
-
-    Raises:
-        KeyError: a field that is absent.
-    """
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin in (Union, UnionType):
-        if value is None and NoneType in inner:
-            return None
-        return decoded(next(one for one in inner if one is not NoneType), value)
-    if kind is float:
-        return float("nan") if value is None else float(value)
-    if is_dataclass(kind):
-        return _record(kind, value)
-    if origin is tuple:
-        items = list(value.values()) if isinstance(value, Mapping) else value
-        if inner[-1] is Ellipsis:
-            return tuple(decoded(inner[0], item) for item in items)
-        return tuple(decoded(one, item) for one, item in zip(inner, items, strict=True))
-    if origin is Literal or not isinstance(origin, type) or not issubclass(origin, Mapping):
-        return value
-    return {key: decoded(inner[1], item) for key, item in value.items()}
-
-
-@cache
-def _hints(kind: Any) -> dict[str, Any]:
-    return get_type_hints(kind)
-
-
-def _record(kind: Any, row: Mapping[str, Any]) -> Any:
-    own = {}
-    for field in fields(kind):
-        key = _KEYS.get((kind, field.name), field.name)
-        if key in row:
-            own[field.name] = decoded(_hints(kind)[field.name], row[key])
-        elif field.default is MISSING and field.default_factory is MISSING:
-            raise KeyError(key)
-    return kind(**own)

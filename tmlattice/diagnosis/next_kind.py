@@ -17,9 +17,9 @@ from tmlattice.beam.rf import rf_of
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis.findings import credible
 from tmlattice.diagnosis.kinds import How
-from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement
+from tmlattice.diagnosis.next_measurement import LEAST, NextMeasurement, separations
 from tmlattice.diagnosis.recommended_actions import recommended_action
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.distributed import DistributedProblem, fit_distributed_errors
@@ -41,10 +41,6 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-MINUTES: Mapping[str, float] = {
-    "closed_orbit": 0.5, "tunes": 2.0, "turn_by_turn": 2.0, "dispersion": 3.0,
-}  # fmt: skip
-"""Machine time of one measurement: an averaged orbit; a few kicks; a step of the RF up and down."""
 A_CORRECTOR = 0.2
 """Minutes of an orbit response for each of its correctors: two settings and their orbits."""
 
@@ -94,7 +90,7 @@ def next_kind(
     if pair is None:
         return None
     found, best = None, 0.0
-    for kind, make in KINDS.items():
+    for kind, (make, _) in KINDS.items():
         if kind in taken:
             continue
         try:
@@ -113,9 +109,8 @@ def next_kind(
 
 def minutes_of(ring: Ring, kind: str) -> float:
     """Machine time of one measurement."""
-    if kind == "orbit_response":
-        return A_CORRECTOR * sum(e.kind in ("hcorrector", "vcorrector") for e in ring.elements)
-    return MINUTES[kind]
+    correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in ring.elements)
+    return A_CORRECTOR * correctors if kind == "orbit_response" else KINDS[kind][1]
 
 
 def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Problem:
@@ -138,18 +133,9 @@ def _separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> floa
     ]  # fmt: skip
     first = fit_nuisances(problem, each[0], problem.first)
     second = problem.at(each[1], first.nuisances)
-    if first.projection is None or second.projection is None:
+    if first.lost or second.lost:
         return 0.0
-    clean = first.projection.out(second.residual - first.residual)
-    square = float(clean @ clean)
-    for rival, causes, point in zip(pair, each, (first, second), strict=True):
-        if find(rival.cause.effect).discrete or rival.cause not in causes:
-            continue
-        # another amount would explain a part of it
-        row = first.projection.out(problem.slope(point, causes.index(rival.cause)))
-        known = 1 / max(float(rival.fit.covariance[-1, -1]), 1e-300)
-        square -= float(row @ clean) ** 2 / (float(row @ row) + known) / 2
-    return float(np.sqrt(max(square, 0.0)))
+    return float(separations(problem, pair, (first, second))[0])
 
 
 # --- simulated measurements: their noise and the amplitude of kicks count ------------------
@@ -218,10 +204,12 @@ def _response(ring: Ring, how: How) -> Problem:
     )  # fmt: skip
 
 
-KINDS: Mapping[str, Callable[[Ring, How], Problem]] = {
-    "closed_orbit": _orbit,
-    "tunes": _tunes,
-    "turn_by_turn": _turns,
-    "dispersion": _dispersion,
-    "orbit_response": _response,
+KINDS: Mapping[str, tuple[Callable[[Ring, How], Problem], float]] = {
+    "closed_orbit": (_orbit, 0.5),
+    "tunes": (_tunes, 2.0),
+    "turn_by_turn": (_turns, 2.0),
+    "dispersion": (_dispersion, 3.0),
+    "orbit_response": (_response, np.nan),
 }
+"""Simulated measurement by kind, and machine time, minutes: an averaged orbit; a few kicks; a step
+of the RF up and down. See `minutes_of` for a response."""

@@ -6,19 +6,21 @@ difference that neither the launch nor the amount can absorb.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
+from tmlattice.diagnosis.records import OPTIONAL, named, record_of
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Alternative
-from tmlattice.inference.whitening import Projection, Whitening
+from tmlattice.inference.problem import Point, Problem
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import Data
+from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import one_turn_optics
 
 Array = NDArray[np.float64]
@@ -54,20 +56,17 @@ class NextMeasurement:
 
     launch: dict[str, float] | None
     settings: Settings
-    parts: tuple[str, str]
-    separation: float
+    parts: tuple[str, str] = field(metadata=named("between"))
+    separation: float = field(metadata=named("separation_sigma"))
     kind: str = "trajectory"
-    minutes: float | None = None
+    minutes: float | None = field(default=None, metadata=OPTIONAL)
 
     def as_json(self) -> dict[str, object]:
         """The entry in the file of the diagnosis."""
-        return {
-            "launch": self.launch,
-            "settings": {name: dict(value) for name, value in self.settings.items()},
-            "between": list(self.parts),
-            "separation_sigma": self.separation,
-            **({} if self.minutes is None else {"kind": self.kind, "minutes": self.minutes}),
-        }
+        own = record_of(self)
+        if self.minutes is None:
+            del own["kind"]
+        return own
 
 
 def next_measurement(
@@ -107,16 +106,11 @@ def next_measurement(
         turns=data.turns,
         active=np.ones(count, dtype=bool),
     )
-    whitening = Whitening(shots)
-    base = model.paths(launches, first.fit.causes)
-    other = model.readings(launches, second.fit.causes)
-    difference = whitening.signature(np.nan_to_num(other - base.readings)).reshape(count, -1)
-    projection = Projection(whitening.launch(base.launch))
-    clean = projection.out(difference.reshape(-1)).reshape(count, -1)
-    separation = np.einsum("sr,sr->s", clean, clean)
-    for rival in (first, second):
-        separation -= _absorbed(model, whitening, projection, launches, rival, clean)
-    separation = np.sqrt(np.maximum(separation, 0.0))
+    problem = FirstTurns(model=model, data=shots, places={})
+    points = [problem.at(own.fit.causes, launches) for own in (first, second)]
+    if points[0].lost:
+        return None
+    separation = separations(problem, (first, second), points, count)
     best = int(separation.argmax())
     if not separation[best] >= LEAST:
         return None
@@ -129,30 +123,31 @@ def next_measurement(
     )
 
 
-def _absorbed(
-    model: Model,
-    whitening: Whitening,
-    projection: Projection,
-    launches: Array,
-    rival: Alternative,
-    clean: Array,
+def separations(
+    problem: Problem, pair: Sequence[Alternative], points: Sequence[Point], parts: int = 1
 ) -> Array:
-    """The part of the difference that another amount would explain, given its prior, [shot]."""
-    cause = rival.cause
-    effect = find(cause.effect)
-    if effect.discrete:
-        return np.zeros(len(clean))
-    h = 1e-3 * effect.largest
-    others = rival.fit.causes[:-1]
-    ends = [
-        model.readings(launches, [*others, Cause(cause.effect, cause.element, cause.amount + a)])
-        for a in (h, -h)
-    ]
-    rows = whitening.signature(np.nan_to_num(ends[0] - ends[1]) / (2 * h))
-    rows = projection.out(rows).reshape(len(clean), -1)
-    known = 1.0 / max(float(rival.fit.covariance[-1, -1]), 1e-300)
-    information = np.einsum("sr,sr->s", rows, rows) + known
-    return np.asarray(np.einsum("sr,sr->s", rows, clean) ** 2 / information / 2)
+    """Return the separation of two explanations in standard deviations, [part].
+
+    Args:
+        problem: of the proposed readings.
+        pair: the explanations.
+        points: of each, at the same nuisances; the first is not lost.
+        parts: equal parts of the rows, such as shots.
+    """
+    projection = points[0].projection
+    assert projection is not None
+    clean = projection.out(np.nan_to_num(points[1].residual - points[0].residual))
+    clean = clean.reshape(parts, -1)
+    square = (clean**2).sum(axis=1)
+    for own, point in zip(pair, points, strict=True):
+        if find(own.cause.effect).discrete or own.cause not in point.causes:
+            continue
+        # another amount, given its prior, would explain a part of it
+        row = projection.out(problem.slope(point, point.causes.index(own.cause)))
+        row = row.reshape(parts, -1)
+        known = 1 / max(float(own.fit.covariance[-1, -1]), 1e-300)
+        square -= (row * clean).sum(axis=1) ** 2 / ((row**2).sum(axis=1) + known) / 2
+    return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
 def _candidates(

@@ -1,7 +1,6 @@
 """Preparation of the search: data and model, and the messages about them.
 
-BPMs without a signal are rejected, the noise is estimated where none is stated, and data of another
-ring raise an error.
+BPMs without a signal are rejected, and the noise is estimated where none is stated.
 """
 
 from collections.abc import Sequence
@@ -12,9 +11,8 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.choice import chosen_effects
-from tmlattice.effects import Cause, expected_radiation, find, rare
-from tmlattice.errors import BeamLostError, MeasurementError, first_of
+from tmlattice.effects import LaunchEffect, expected_radiation, find, modelled, names, rare
+from tmlattice.errors import BeamLostError, EffectError, MeasurementError, first_of
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis
@@ -24,7 +22,7 @@ from tmlattice.measurement.assume import in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.data import Data, joined, of_measurement
 from tmlattice.observe.first_turns import STEPS, FirstTurns
-from tmlattice.observe.noise import estimate, local_misfit
+from tmlattice.observe.noise import estimate
 
 Array = NDArray[np.float64]
 
@@ -59,19 +57,15 @@ class Prepared:
         problem: launches and readings, no distributed errors.
         before: launches alone.
         hypotheses: what may be the cause.
-        known: causes that are in the model anyway.
         dead: monitors without a signal (1) or with a frozen one (2), (index, which).
-        noise: rms of a reading, m, (x, y); NaN for a plane without readings.
         estimated: whether the noise comes from the data.
-        said: messages.
+        messages: about the data.
     """
 
     problem: FirstTurns
     before: Fit
     hypotheses: tuple[Hypothesis, ...]
-    known: tuple[Cause, ...]
     dead: tuple[tuple[int, float], ...]
-    noise: tuple[float, float]
     estimated: bool
     messages: tuple[str, ...]
 
@@ -87,7 +81,7 @@ def prepare(
     """Return data, model and launches.
 
     Raises:
-        MeasurementError: data that cannot be used, or that are of another lattice.
+        MeasurementError: data that cannot be used.
         BeamLostError: the launches are lost in the design.
         EffectError: none of the effects can be looked for.
         UnknownNameError: a monitor that the ring does not have, or an effect that does not exist.
@@ -106,14 +100,13 @@ def prepare(
         model=model, data=rough, places=places, rare=rare(ring, chosen), judgement=judgement
     )
     start = _on_its_way(fit(problem, (), problem.first, steps=STEPS), ring)
-    data, noise, estimated = _with_noise(data, start)
-    data, noise, floor = _above_the_floor(data, noise)
-    _check_lattice(ring, data, start, judgement)
+    data, estimated = _with_noise(data, start)
+    data, floor = _above_the_floor(data)
     messages = (*messages, *floor)
     problem = replace(problem, data=data, white=None)
     before = _on_its_way(fit(problem, (), start.nuisances, steps=STEPS), ring)
     hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data))
-    return Prepared(problem, before, hypotheses, known, dead, noise, estimated, messages)
+    return Prepared(problem, before, hypotheses, dead, estimated, messages)
 
 
 def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurement:
@@ -122,7 +115,7 @@ def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurem
     Args:
         ring: the design.
         measurement: any number of shots.
-        said: receives a message about omitted shots.
+        messages: receives a message about omitted shots.
 
     Raises:
         MeasurementError: not one shot fits.
@@ -228,8 +221,8 @@ def _dead_monitors(
     return dead, data.without(dropped), tuple(messages)
 
 
-def _with_noise(data: Data, start: Fit) -> tuple[Data, tuple[float, float], bool]:
-    """The data with a noise for every reading, its rms by plane, and whether it is estimated."""
+def _with_noise(data: Data, start: Fit) -> tuple[Data, bool]:
+    """The data with a noise for every reading, and whether it is estimated."""
     missing = ~np.isfinite(data.sigma) & data.valid
     if (data.sigma[data.valid & ~missing] <= 0).any():
         raise MeasurementError("a monitor's noise is zero or negative; leave it out if unknown")
@@ -242,8 +235,7 @@ def _with_noise(data: Data, start: Fit) -> tuple[Data, tuple[float, float], bool
                 "noise of a reading"
             )
         data = data.with_sigma(np.where(np.isfinite(found), found, np.nanmean(found)))
-    data = data.with_sigma(np.ones(2))  # where nothing was read
-    return data, noise_of(data), estimated
+    return data.with_sigma(np.ones(2)), estimated  # where nothing was read
 
 
 def noise_of(data: Data) -> tuple[float, float]:
@@ -252,41 +244,20 @@ def noise_of(data: Data) -> tuple[float, float]:
     return x, y
 
 
-def _above_the_floor(
-    data: Data, noise: tuple[float, float]
-) -> tuple[Data, tuple[float, float], tuple[str, ...]]:
-    """The data with noise not below the residual of second-order maps, its rms, and messages."""
+def _above_the_floor(data: Data) -> tuple[Data, tuple[str, ...]]:
+    """The data with noise not below the residual of second-order maps, and messages."""
     floor = FLOOR * _rms(data.readings[data.valid])
     if not (data.sigma[data.valid] < floor).any():
-        return data, noise, ()
-    data = replace(data, sigma=np.maximum(data.sigma, floor))
-    messages = (
-        f"the noise, {1e6 * min(noise):.2g} µm, is below the error of second-order maps for such "
-        f"an orbit: {1e6 * floor:.2g} µm is taken"
+        return data, ()
+    message = (
+        f"the noise, {1e6 * min(noise_of(data)):.2g} µm, is below the error of second-order maps "
+        f"for such an orbit: {1e6 * floor:.2g} µm is taken"
     )
-    return data, (max(noise[0], floor), max(noise[1], floor)), (messages,)
+    return replace(data, sigma=np.maximum(data.sigma, floor)), (message,)
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
-
-
-def _check_lattice(ring: Ring, data: Data, start: Fit, judgement: Judgement) -> None:
-    """Raise a MeasurementError if most BPMs contradict their neighbours: the data are of another
-    ring."""
-    local = local_misfit(data, start.point.view)
-    if not np.isfinite(local).sum() > 50:
-        return
-    size = float(np.median(np.abs(local[np.isfinite(local)])))
-    orbit = float(np.median(np.abs(data.readings[data.valid])))
-    noise = float(np.median(data.sigma[data.valid]))
-    if size > max(judgement.alien * orbit, 5 * noise):
-        raise MeasurementError(
-            f"the readings do not match '{ring.name}': even between neighbouring BPMs "
-            f"the error of the model is {1e6 * size:.0f} µm where the orbit is {1e6 * orbit:.0f} "
-            "µm; name "
-            "the lattice of this machine, and check units and the names of the monitors"
-        )
 
 
 def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
@@ -303,3 +274,44 @@ def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
     outliers = np.zeros(other.valid.shape, dtype=bool)
     outliers[:, :readings] = never[None, :readings]
     return other.without(outliers)
+
+
+_COLUMNS = (0, 1, 2, 3, 5)
+"""The five coordinates of a launch in a measurement."""
+
+
+def chosen_effects(
+    ring: Ring, effects: Sequence[str] | None, launch_sigma: NDArray[np.float64]
+) -> list[str]:
+    """The effects to be fitted; none where all that are requested show in the data alone.
+
+    Args:
+        ring: the design.
+        effects: names; None: all usual ones.
+        launch_sigma: how well each launch is known, 0 exactly, [shot, 5].
+
+    Raises:
+        EffectError: no effect is named, or none of them can be looked for.
+        UnknownNameError: an effect that does not exist.
+    """
+    if not names(effects):
+        raise EffectError("no effect is named; leave effects out to look for all of them")
+    chosen = modelled(effects)
+    free = [six for six, sigma in zip(_COLUMNS, launch_sigma.T, strict=True) if (sigma > 0).any()]
+    why = [
+        f"{name} shows in turns of a stored beam alone"
+        for name in names(effects) if find(name).of_turns
+    ]  # fmt: skip
+    for name in list(chosen):
+        effect = find(name)
+        if not effect.places(ring):
+            why.append(f"{name} has no place in '{ring.name}' (it sits on: {effect.sits_on_text})")
+            chosen.remove(name)
+        elif isinstance(effect, LaunchEffect) and effect.shifts in free:
+            why.append(
+                f"{name} cannot be separated from the launch of each shot, which is fitted too"
+            )
+            chosen.remove(name)
+    if not chosen and len(why) == len(names(effects)):
+        raise EffectError("; ".join(why) + ": name another effect")
+    return chosen

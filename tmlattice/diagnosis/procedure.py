@@ -8,15 +8,14 @@ steps). A reference of each kind has the earlier errors.
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import Block, combined_p_value, compared_of
-from tmlattice.diagnosis.correlations import correlations_of
 from tmlattice.diagnosis.findings import (
     findings_of,
     finished,
@@ -28,16 +27,8 @@ from tmlattice.diagnosis.findings import (
 from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
 from tmlattice.diagnosis.next_kind import leading, next_kind
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
-from tmlattice.diagnosis.outliers import (
-    about_launches,
-    about_rejected,
-    noise_text,
-    rejected_readings,
-    spikes,
-    with_silent,
-)
 from tmlattice.diagnosis.prepare import noise_of
-from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.stages import (
     held_out,
     held_out_shots,
@@ -50,6 +41,7 @@ from tmlattice.diagnosis.stages import (
     views_of,
 )
 from tmlattice.diagnosis.strategy import freedom, sought, sought_since
+from tmlattice.diagnosis.support import correlations_of
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.diagnosis.views import JointView
 from tmlattice.effects import (
@@ -74,18 +66,10 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import ring_tunes
+from tmlattice.speaks import micrometres
 from tmlattice.version import __version__
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
-
-MOST_OF_IT = 0.5
-"""Share of the gap that one cause has to explain to be separated before prior scales are learnt."""
-
-CROWDED = 1.5
-"""Misfit of half of the BPMs, in units of the noise, from which errors are distributed, if a sparse
-fit of named causes failed."""
 
 
 def diagnose_together(
@@ -109,20 +93,10 @@ def diagnose_together(
 
     Args:
         ring: the design.
-        measured: by the names that the result calls them.
-        reference: of the same machine before the fault, of any kinds: static errors cancel.
-        background: distributed errors, as of `diagnose`.
-        known: of the distributed errors, from an earlier diagnosis whose estimated ring this
-            is: see `twin`. Then no background is needed.
-        holdout: share of shots, or of correctors, in the validation set.
-        heldout: of first turns alone: those shots themselves, instead of a share.
-        effects: names of those that may be the cause; else all usual ones.
-        max_effects: findings at most.
-        radiation: of first turns alone: the model radiates as expected.
-        false_alarm: share of faultless data sets in which something may be found.
-        assume: what was written down wrongly everywhere, see `measurement.assume`.
-        seed: of the split and of the threshold's simulation.
-        progress: called with the name of each stage.
+        measured, reference: by the names that the result calls them.
+        heldout, radiation: of first turns alone.
+        background, known, holdout, effects, max_effects, false_alarm, assume, seed, progress: as of
+            `diagnose`.
 
     Raises:
         MeasurementError: data that cannot be used; the message names them.
@@ -353,3 +327,101 @@ def _noise(parts: Sequence[Part]) -> tuple[float, float]:
             rms = float(np.sqrt(np.mean(rows[rows > 0] ** -2.0)))
             return rms, rms
     return float("nan"), float("nan")
+
+
+def with_silent(ring: Ring, part: Part, measured: Any) -> Part:
+    """The part, with a message about BPMs of its measurement without usable readings.
+
+    Args:
+        ring: with the monitors.
+        part: made of the measurement; dead BPMs become findings, and are not reported again.
+        measured: of any kind; one without monitors has no message.
+    """
+    problem = part.problem
+    owners = problem.owner()
+    heard = {
+        ring[problem.monitors[m]].name for m in np.unique(owners[problem.valid & (owners >= 0)])
+    }
+    heard |= {ring.monitors[m].name for m, _ in part.dead}
+    names = [ring[name].name for name in getattr(measured, "monitors", ())]
+    silent = [name for name in names if name not in heard]
+    if not silent:
+        return part
+    messages = f"no usable reading of {', '.join(silent)}: rejected"
+    return replace(part, messages=(*part.messages, messages))
+
+
+def spikes(parts: Sequence[Part], problem: CombinedProblem, found: Explanation) -> Iterator[str]:
+    """A message for each measurement with single readings that the search rejected."""
+    ends = np.cumsum([part.valid.size for part in problem.parts])
+    own: dict[int, list[int]] = {}
+    for reading in found.outliers:
+        flat = int(np.ravel(reading)[-1])
+        own.setdefault(int(np.searchsorted(ends, flat, side="right")), []).append(flat)
+    for index, (part, one) in enumerate(zip(parts, problem.parts, strict=False)):
+        if index not in own:
+            continue
+        owners = one.owner().ravel()
+        start = int(ends[index]) - one.valid.size
+        count = Counter(one.monitors[owners[flat - start]] for flat in own[index])
+        notes = [name if many == 1 else f"{name} ({many})" for name, many in count.items()]
+        yield f"{part.label}: outliers, rejected: {', '.join(notes)}"
+
+
+# --- of first turns -------------------------------------------------------------------------------
+def rejected_readings(part: Part, found: Explanation) -> tuple[dict[str, Any], ...]:
+    """Single readings that the search rejected, {"shot", "turn", "monitor", "plane"}; the shot of a
+    reference is None."""
+    rows: list[dict[str, Any]] = []
+    names = part.problem.monitors
+    for (flat,) in found.outliers:
+        shot, reading, plane = np.unravel_index(flat, part.problem.valid.shape)
+        turn, monitor = divmod(int(reading), len(names))
+        rows.append({
+            "shot": part.shots[0][shot], "turn": turn, "monitor": names[monitor],
+            "plane": "xy"[plane],
+        })  # fmt: skip
+    return tuple(rows)
+
+
+def noise_text(noise: tuple[float, float]) -> str:
+    """A message that the noise of both planes, m, was estimated."""
+    both = zip(noise, "xy", strict=True)
+    levels = [f"{micrometres(own)} in {plane}" for own, plane in both if np.isfinite(own)]
+    return f"the noise was estimated from the data: {', '.join(levels)}"
+
+
+def about_launches(part: Part, findings: Sequence[Finding]) -> list[str]:
+    """Messages about what these launches leave undetermined of the findings."""
+    assert isinstance(part.problem, FirstTurns)
+    notes, data = [], part.problem.data
+    if not data.planes.all() and any(finding.effect is None for finding in findings):
+        unread, other = ("x", "y") if data.planes[1] else ("y", "x")
+        notes.append(
+            f"a localised error may begin upstream in {unread}, which sextupoles couple into "
+            f"{other}"
+        )
+    if data.active.sum() == 1 and findings:
+        notes.append(
+            "one trajectory gives one kick at each place: any single multipole "
+            "explains it; two or more launches identify the effect"
+        )
+    return notes
+
+
+SHOWN = 4
+"""Outliers that a warning names."""
+
+
+def about_rejected(outliers: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A message about outliers, if there are any."""
+    if not outliers:
+        return []
+    some = "; ".join(
+        f"{row['monitor']} {row['plane']}, "
+        + ("the reference" if row["shot"] is None else f"shot {row['shot']}")
+        + (f", turn {row['turn']}" if row["turn"] else "")
+        for row in outliers[:SHOWN]
+    )
+    more = f"; and {len(outliers) - SHOWN} more" if len(outliers) > SHOWN else ""
+    return [f"{len(outliers)} single readings are outliers and were rejected: {some}{more}"]

@@ -9,12 +9,13 @@ which amount (`Effect.stands_for`). The pieces of a magnet are one.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.records import OPTIONAL, record_of
 from tmlattice.diagnosis.support import share_of_fault
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.effects.effect import FamilyEffect, StrengthEffect
@@ -62,7 +63,7 @@ class RecommendedAction:
     probability: float
     mechanisms: tuple[tuple[str, float], ...]
     strength: Strength | None
-    device: str | None = None
+    device: str | None = field(default=None, metadata=OPTIONAL)
 
     @property
     def cause(self) -> Cause:
@@ -76,22 +77,16 @@ class RecommendedAction:
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        effect = find(self.effect)
-        return {
+        effect, own = find(self.effect), record_of(self)
+        del own["kind"]
+        return own | {
             "action": self.action,
             "check": effect.to_check,
-            "effect": self.effect,
-            "element": self.element,
-            "pieces": list(self.pieces),
             "quantity": effect.quantity or effect.words,
-            "amount": self.amount,
-            "amount_sigma": self.amount_sigma,
             "share_from_data": share_of_fault(self.effect, self.amount_sigma),
             "unit": effect.unit,
-            "strength": None if self.strength is None else dict(vars(self.strength)),
             "probability": min(self.probability, 1.0),  # a sum of shares
             "mechanisms": [{"effect": e, "probability": p} for e, p in self.mechanisms],
-            **({} if self.device is None else {"device": self.device}),
         }
 
 

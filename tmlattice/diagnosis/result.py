@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.assessment import Assessment, Block, assess
+from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
-from tmlattice.diagnosis.correlations import Correlation
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
-from tmlattice.diagnosis.shown import ShownDiagnosis, ShownFinding
-from tmlattice.diagnosis.support import FREE, Support, share_of_fault
+from tmlattice.diagnosis.records import OPTIONAL, encoded, record_of
+from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
 from tmlattice.diagnosis.views import (
     JointView,
@@ -30,8 +29,10 @@ from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Gap, Misfit
+from tmlattice.late import ClassMethod, Method
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import CALIBRATES, Dispersion
+from tmlattice.speaks import Speaks, last_part
 
 if TYPE_CHECKING:
     from tmlattice.diagnosis.response.common_factors import CommonFactors
@@ -52,6 +53,10 @@ VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
 """Verdicts from the most certain to the least."""
 
 
+MOST = 4
+"""Findings in the line of a diagnosis."""
+
+
 @dataclass(frozen=True)
 class Member:
     """One explanation in a credible set.
@@ -70,15 +75,11 @@ class Member:
     probability: float
     amount: float
     recommended_action: str
-    device: str | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {key: value for key, value in vars(self).items() if key != "device" or value}
+    device: str | None = field(default=None, metadata=OPTIONAL)
 
 
-@dataclass(frozen=True, repr=False)
-class Finding(ShownFinding):
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Finding(Speaks):
     """One error, or one localised but unexplained deviation.
 
     Attributes:
@@ -103,26 +104,41 @@ class Finding(ShownFinding):
         devices: the same of `elements` and `near`, by name.
     """
 
-    effect: str | None
-    element: str | None
+    effect: str | None = None
+    element: str | None = None
     s: float | None
-    amount: float | None
-    amount_sigma: float | None
-    unit: str | None
-    probability: float
+    amount: float | None = None
+    amount_sigma: float | None = None
+    unit: str | None = None
+    probability: float = 1.0
     detection: Detection
     where: tuple[float, float] | None
     near: tuple[str, ...]
-    credible_set: tuple[Member, ...]
-    mass: float
+    credible_set: tuple[Member, ...] = ()
+    mass: float = 0.0
     recommended_actions: tuple[RecommendedAction, ...] = ()
     consequences: Consequences | None = None
-    seen_by: Mapping[str, float] | None = None
+    seen_by: Mapping[str, float] | None = field(default=None, metadata=OPTIONAL)
     words: str = ""
     to_check: str = ""
     elements: tuple[str, ...] = ()
-    device: str | None = None
-    devices: Mapping[str, str] = field(default_factory=dict)
+    device: str | None = field(default=None, metadata=OPTIONAL)
+    devices: Mapping[str, str] = field(default_factory=dict, metadata=OPTIONAL)
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        place = "" if self.where is None else f"{self.where[0]:.1f} m to {self.where[1]:.1f} m"
+        return self.in_short, {"place": place, "probability": f"{self.probability:.3g}"}
+
+    @property
+    def in_short(self) -> str:
+        """Effect, element and amount, as the catalogue names them; else the finding's words."""
+        if self.words:
+            return self.words
+        what = " ".join(word for word in (self.effect or "no known effect", self.element) if word)
+        if self.amount is None:
+            return what
+        error = "" if self.amount_sigma is None else f" ± {self.amount_sigma:.2g}"
+        return f"{what} {self.amount:.4g}{error} {self.unit or ''}".rstrip()
 
     @property
     def label(self) -> str:
@@ -143,46 +159,17 @@ class Finding(ShownFinding):
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        found = self.detection
-        where = None
+        own = record_of(self)
         if self.where is not None:
-            where = {"s_from": self.where[0], "s_to": self.where[1]}
-        stated = {"words": self.words, "to_check": self.to_check, "elements": list(self.elements)}
-        return {
-            "effect": self.effect,
-            "element": self.element,
-            "s": self.s,
-            "amount": self.amount,
-            "amount_sigma": self.amount_sigma,
+            own["where"] = {"s_from": self.where[0], "s_to": self.where[1]}
+        if not self.words:
+            del own["words"], own["to_check"], own["elements"]
+        first, *others = own.pop("recommended_actions") or [None]
+        return own | {
             "share_from_data": share_of_fault(self.effect, self.amount_sigma),
-            "unit": self.unit,
-            "probability": self.probability,
-            "detection": {
-                "statistic": found.statistic,
-                "threshold": found.threshold,
-                "p_value": found.p_value,
-            },
-            "where": where,
-            "near": list(self.near),
-            "credible_set": [member.as_json() for member in self.credible_set],
-            "mass": self.mass,
-            "recommended_action": None
-            if self.recommended_action is None
-            else self.recommended_action.as_json(),
-            "alternative_actions": [
-                recommended_action.as_json() for recommended_action in self.recommended_actions[1:]
-            ],
-            "consequences": None if self.consequences is None else self.consequences.as_json(),
-            **({} if self.seen_by is None else {"seen_by": dict(self.seen_by)}),
-            **(stated if self.words else {}),
-            **_device(self.device),
-            **({"devices": dict(self.devices)} if self.devices else {}),
+            "recommended_action": first,
+            "alternative_actions": others,
         }
-
-
-def _device(name: str | None) -> dict[str, str]:
-    """A row's field of the control system's name; none where it is unknown."""
-    return {} if name is None else {"device": name}
 
 
 def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:
@@ -196,7 +183,7 @@ def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cau
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis(ShownDiagnosis):
+class Diagnosis(Speaks):
     """The result of a diagnosis. See `as_json` for the file format.
 
     Attributes:
@@ -278,8 +265,35 @@ class Diagnosis(ShownDiagnosis):
     compared: tuple[Block, ...] = ()
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
-    supports: tuple[Support, ...] = field(default=(), repr=False)
+    supports: tuple[Support, ...] = ()
     covariance: NDArray[np.float64] | None = field(default=None, repr=False)
+
+    report = Method("tmlattice.report.speaking", "report", "The report as text.")
+    save = Method(
+        "tmlattice.report.speaking",
+        "save",
+        "Write report.html, report.txt, diagnosis.json and the figures into a folder.",
+    )
+    load = ClassMethod(
+        "tmlattice.diagnosis.load",
+        "load",
+        "Return the diagnosis of a folder of `save`, or of a diagnosis.json.",
+    )
+    plot = Method(
+        "tmlattice.plots.speaking",
+        "plot_diagnosis",
+        "Draw the scan along the ring, or the figure of this name: a matplotlib Figure.",
+    )
+
+    def _told(self) -> tuple[str, dict[str, str]]:
+        explained = None if self.heldout is None else self.heldout.explained
+        rows = {"of": f"{self.kind} of {last_part(self.ring.name)}"}
+        for number, finding in enumerate(self.findings[:MOST], 1):
+            rows[f"finding {number}"] = finding.in_short
+        if len(self.findings) > MOST:
+            rows["and"] = f"{len(self.findings) - MOST} more"
+        rows["gap explained"] = "" if explained is None else f"{100 * explained:.1f} %"
+        return self.verdict, rows
 
     @property
     def tables(self) -> Tables:
@@ -290,7 +304,7 @@ class Diagnosis(ShownDiagnosis):
     def assessment(self) -> Assessment:
         """Whether the remainder is noise, a gap is explained, an effect is missing: each once."""
         options = self.provenance["options"]
-        return assess(
+        return Assessment(
             self.verdict,
             self.compared,
             self.heldout,
@@ -498,7 +512,6 @@ class Diagnosis(ShownDiagnosis):
         """The result in the format `tmlattice-diagnosis`, version 1 (see `schemas/`)."""
         from tmlattice import __version__
 
-        weighed = self.hypotheses
         return {
             "format": "tmlattice-diagnosis",
             "version": 2,
@@ -506,9 +519,9 @@ class Diagnosis(ShownDiagnosis):
             "kind": self.kind,
             "model": self.ring.model,
             "verdict": self.verdict,
-            "findings": [finding.as_json() for finding in self.findings],
-            "steps": [step.as_json() for step in self.steps],
-            "rejected_steps": [step.as_json() for step in self.rejected_steps],
+            "findings": encoded(self.findings),
+            "steps": encoded(self.steps),
+            "rejected_steps": encoded(self.rejected_steps),
             "bad_monitors": list(self.bad_monitors),
             "rejected_channels": [
                 {"element": name, "plane": plane} for name, plane in self.rejected_channels
@@ -523,25 +536,21 @@ class Diagnosis(ShownDiagnosis):
                     "amount": c.amount,
                     "amount_sigma": s,
                     **support.as_json(),
-                    **_device(self.devices.get(c.element or "")),
+                    **({"device": own} if (own := self.devices.get(c.element or "")) else {}),
                 }
                 for c, s, support in self.supported
             ],
-            "correlations": [pair.as_json() for pair in self.correlations],
-            "common_factors": None
-            if self.common_factors is None
-            else self.common_factors.as_json(),
-            "inconsistencies": None
-            if self.inconsistencies is None
-            else self.inconsistencies.as_json(),
-            "hypotheses": None if weighed is None else [row.as_json() for row in weighed],
-            **({"measurements": [p.as_json() for p in self.parts]} if self.parts else {}),
+            "correlations": encoded(self.correlations),
+            "common_factors": encoded(self.common_factors),
+            "inconsistencies": encoded(self.inconsistencies),
+            "hypotheses": encoded(self.hypotheses),
+            **({"measurements": encoded(self.parts)} if self.parts else {}),
             "assessment": self.assessment.as_json(),
             "gap": self.gap,
-            "suspects": [suspect.as_json() for suspect in self.suspects],
+            "suspects": encoded(self.suspects),
             "unexplained": {"patterns": None, **self.unexplained},
             "tunes": self.tunes,
-            "next_measurement": None if self.next is None else self.next.as_json(),
+            "next_measurement": encoded(self.next),
             "sensitivity": self.sensitivity,
             "warnings": list(self.warnings),
             "outliers": [dict(row) for row in self.outliers],

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.kinds import Part
-from tmlattice.diagnosis.numbers import numbers_read
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
-from tmlattice.diagnosis.views import PartView, TrajectoryView
+from tmlattice.diagnosis.views import PartView, TrajectoryView, numbers_read
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.combined import Blocks, CombinedProblem
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import (
     DistributedProblem,
     FittedErrors,
@@ -28,6 +27,7 @@ from tmlattice.inference.newton import Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Gap, Misfit, held_out_gap
+from tmlattice.inference.whitening import Blocks
 from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.checkup import Check, fine, note, wrong
+from tmlattice.diagnosis.signals import Check, fine, note, wrong
 from tmlattice.effects import modelled
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
@@ -21,9 +21,8 @@ from tmlattice.measurement import ClosedOrbit, Dispersion, TuneReading, TurnByTu
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.stored import Stored
-from tmlattice.observe.stored_metric import LINES
 from tmlattice.observe.tune_readings import tune_readings
-from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
+from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -130,7 +129,7 @@ def stored_checks(ring: Ring, data: StoredData, turns: ManyTurns | None = None) 
     """
     places = dict.fromkeys(modelled(turns=True), 1.0)
     if isinstance(data, TuneReading):
-        return _tunes(tune_readings(ring, data, places).data[:, :2], data, ring)
+        return _tunes(tune_readings(ring, data, places).values[:, :2], data, ring)
     names = [monitor.name for monitor in ring.monitors]
     whole = data.in_order_of(names)
     values = _values(whole)
@@ -143,16 +142,16 @@ def stored_checks(ring: Ring, data: StoredData, turns: ManyTurns | None = None) 
             return [*checks, *_of_turns(ring, data, own_turns)]
         if isinstance(data, Dispersion):
             own: Stored = dispersion(ring, data, places)
-            return [*checks, *_of_orbits(ring, own, own.data, "dispersion", WHOLE)]
+            return [*checks, *_of_orbits(ring, own, own.values, "dispersion", WHOLE)]
         own = closed_orbits(ring, data, places)
     except MeasurementError as error:
         return [*checks, wrong("data", str(error))]
-    if not any(data.settings) or len(own.data) < 2:
+    if not any(data.settings) or len(own.values) < 2:
         text = (
             "one orbit is the sum of all errors: it determines neither signs nor the order of BPMs"
         )
         return [*checks, fine(GLOBAL, text)]
-    changes = own.data - own.data.mean(axis=0)
+    changes = own.values - own.values.mean(axis=0)
     return [*checks, *_of_orbits(ring, own, changes, "orbit change", WHOLE)]
 
 
@@ -172,7 +171,7 @@ def _of_orbits(
     if what != "dispersion":
         design = design - design.mean(axis=0)
     data = np.where(problem.used, data, np.nan)
-    noise = 2 * float(np.sum(problem.errors[problem.used] ** 2))
+    noise = 2 * float(np.sum(problem.sigma[problem.used] ** 2))
 
     def share(own: Array) -> float:
         """The shares of the readings and of the design beyond the noise."""
@@ -208,14 +207,14 @@ def _of_turns(ring: Ring, data: TurnByTurn, problem: ManyTurns) -> list[Check]:
 
     corrections = [replace(SWAPPED, undo=swaps), *_of_lines()]
     text = [note("lines", one) for one in problem.warnings]
-    tunes = _near(ring, problem.data[:, -2:], problem.used[:, -2:])
+    tunes = _near(ring, problem.values[:, -2:], problem.used[:, -2:])
     return [*text, tunes, *_judged(ring, "line", share, _lines(problem), corrections)]
 
 
 def _lines(problem: ManyTurns) -> ComplexArray:
     """Complex amplitudes [shot, mode, monitor, plane]; NaN where unknown."""
     used = problem.used[:, :LINES]
-    both = np.where(used, problem.data[:, :LINES], np.nan)
+    both = np.where(used, problem.values[:, :LINES], np.nan)
     both = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
     return np.moveaxis(both[..., 0] + 1j * both[..., 1], -1, 1)
 

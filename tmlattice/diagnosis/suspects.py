@@ -9,13 +9,15 @@ fit it is an amount that is an outlier of its family.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from tmlattice.diagnosis.places import between
+from tmlattice.diagnosis.records import OPTIONAL, record_of
 from tmlattice.effects import Cause
+from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation
@@ -68,24 +70,13 @@ class Suspect:
     elements: tuple[str, ...] = ()
     amount: float | None = None
     amount_sigma: float | None = None
-    device: str | None = None
+    device: str | None = field(default=None, metadata=OPTIONAL)
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        return {
-            "kind": self.kind,
-            "effect": self.effect,
-            "element": self.element,
-            "where": {"s_from": self.where[0], "s_to": self.where[1]},
-            "near": list(self.near),
-            "statistic": self.statistic,
-            "threshold": self.threshold,
-            "measure": self.measure,
-            "elements": list(self.elements or (self.element,)),
-            "amount": self.amount,
-            "amount_sigma": self.amount_sigma,
-            **({} if self.device is None else {"device": self.device}),
-        }
+        where = {"s_from": self.where[0], "s_to": self.where[1]}
+        elements = list(self.elements or (self.element,))
+        return {**record_of(self), "where": where, "elements": elements}
 
 
 Candidate = tuple[str | None, str, float]
@@ -142,7 +133,7 @@ def outliers(
             continue
         amounts = np.array([places[0].amount for places, _ in own])
         off = np.abs(amounts - np.median(amounts))
-        scatter = 1.4826 * float(np.median(off))
+        scatter = chi2.MAD * float(np.median(off))
         for (places, sigma), distance in zip(own, off, strict=True):
             times = float(distance / max(scatter, sigma, 1e-30))
             if times > OUTLIER and not any((c.effect, c.element) in known for c in places):

@@ -20,9 +20,8 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
-from tmlattice.inference.distributed import DistributedErrors, DistributedProblem
+from tmlattice.inference.distributed import DistributedErrors, DistributedProblem, posterior
 from tmlattice.inference.metric import Hypothesis
-from tmlattice.inference.posterior import posterior
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
 from tmlattice.observe.orbit_response import Predicted

@@ -6,12 +6,54 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.numbers import NumberRead
+from tmlattice.diagnosis.records import OPTIONAL, named, record_of
+from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Misfit
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.observe.tune_readings import TuneReadings
+
+QUANTITIES = ("tune_x", "tune_y", "chromaticity_x", "chromaticity_y")
+"""Quantities in the order of the columns of `TuneReadings`, named as in the files."""
+
+
+@dataclass(frozen=True)
+class NumberRead:
+    """One number, as measured and by two models. A tune is a fraction.
+
+    Attributes:
+        shot: its place among those of the fit.
+        quantity: one of `QUANTITIES`.
+        read, error: the reading, and its standard error.
+        before, after: of the design and of the result.
+    """
+
+    shot: int
+    quantity: str
+    read: float
+    error: float
+    before: float
+    after: float
+
+
+def numbers_read(own: Problem, before: Point, after: Point) -> tuple[NumberRead, ...]:
+    """The numbers of a problem of tunes; empty for any other.
+
+    Args:
+        own: the problem of one measurement.
+        before, after: of the design and of the result.
+    """
+    if not isinstance(own, TuneReadings):
+        return ()
+    read_numbers = []
+    for shot, column in np.argwhere(own.valid).tolist():
+        values = [float(one[shot, column]) for one in (own.values, before.orbit, after.orbit)]
+        read, *models = (value % 1.0 for value in values) if column < 2 else values
+        error = float(own.sigma[shot, column])
+        read_numbers.append(NumberRead(shot, QUANTITIES[column], read, error, *models))
+    return tuple(read_numbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,25 +114,20 @@ class PartView:
         numbers: of tunes, each as read and as both models have it.
     """
 
-    label: str
+    label: str = field(metadata=named("name"))
     kind: str
     readings: int
     before: Misfit
     after: Misfit
     monitors: tuple[str, ...]
     left: NDArray[np.float64] = field(repr=False)
-    numbers: tuple[NumberRead, ...] = ()
+    numbers: tuple[NumberRead, ...] = field(default=(), metadata=OPTIONAL)
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        return {
-            "name": self.label,
-            "kind": self.kind,
-            "readings": self.readings,
-            "before": dict(vars(self.before)),
-            "after": dict(vars(self.after)),
-            **({"numbers": [n.as_json() for n in self.numbers]} if self.numbers else {}),
-        }
+        own = record_of(self)
+        del own["monitors"], own["left"]
+        return own
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,23 +3,27 @@
 A Gaussian prior spreads one large fault over all magnets that could share it. `Prior.FAULTS` has
 the tails of Student's t with one degree of freedom: most strengths are nearly right, a few have
 large errors.
+
+Gauss-Newton in the space of the readings: with slopes J and prior variances P the amounts are
+P J^T (J P J^T + C)^-1 target. Only products with J are needed (`Shifts`). Heavy tails give each
+amount a variance of its own, which is updated during the fit.
 """
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from tmlattice.beam.shifts import Shifts
-from tmlattice.errors import TmlatticeError, UnstableRingError
+from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.launches import FreeLaunches, launch_slopes
 from tmlattice.fitting.sparse import in_coordinates, sparse_causes, warn_of_launches
-from tmlattice.inference.dual import MostProbable, best_of, most_probable, posterior_base
 from tmlattice.inference.priors import Student
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
@@ -53,7 +57,7 @@ MAX_LAUNCH = 0.01
 
 @dataclass(frozen=True)
 class TurnReadings:
-    """A measured first turn as a function of a space's amounts: `inference.dual.AmountProblem`.
+    """A measured first turn as a function of a space's amounts.
 
     Attributes:
         space: of the amounts; changed by every call.
@@ -110,6 +114,168 @@ class TurnReadings:
         if not sigma.any():
             return np.zeros((len(self.sigma),) * 2)
         return self.slopes(amounts).launch_kernel(sigma)
+
+
+INITIAL_NOISE = 30.0
+"""The residual's rms over the first added noise, which falls to zero: a linear model that is
+believed exactly far from the solution diverges."""
+
+WIDEST, NARROWING = 1000.0, 1.78
+"""Heavy tails have many local maxima: the prior starts wider by the first number, near a Gaussian,
+and narrows by the second at every update of the variances."""
+
+MAX_HALVINGS = 8
+"""Halvings of a step, at most, beyond the linear range."""
+
+SCALE_ITERATIONS = 4
+"""Iterations in which the prior's scale follows the evidence."""
+
+SCALES = np.logspace(-4, 3, 141)
+
+
+@dataclass(frozen=True)
+class MostProbable:
+    """A fit: amounts, residual and history.
+
+    Attributes:
+        amounts: [amount].
+        residual: measured less model, m, [row].
+        prior: with its final width.
+        chi2: of every step.
+        converged: whether the last step was smaller than the noise.
+    """
+
+    amounts: Array
+    residual: Array
+    prior: Student
+    chi2: tuple[float, ...]
+    converged: bool = False
+
+
+def most_probable(
+    problem: TurnReadings,
+    prior: Student,
+    start: Array,
+    *,
+    choose: bool = False,
+    wide: bool = True,
+    iterations: int = 12,
+) -> MostProbable:
+    """Most probable amounts, with an added noise that falls to zero.
+
+    Args:
+        problem: readings as a function of amounts.
+        prior: of each amount.
+        start: first guess, [amount].
+        choose: fit the width of the prior by the evidence.
+        wide: start with wide tails; not where the start is a local maximum to keep.
+        iterations: at most, at each level of added noise.
+    """
+    residual = problem.residual(start)
+    now = MostProbable(start, residual, prior, (_chi2(problem, residual),))
+    widening = WIDEST if wide and np.isfinite(prior.freedom) else 1.0
+    added_noise = float(np.sqrt(np.mean(residual**2))) / INITIAL_NOISE
+    least = float(problem.sigma.min())
+    while True:
+        added_noise = 0.0 if added_noise < least else added_noise
+        for i in range(iterations):
+            now, widening = _iterated(
+                problem, now, added_noise, widening, choose and i < SCALE_ITERATIONS
+            )
+            if now.converged:
+                break
+        if added_noise == 0.0:
+            return now
+        added_noise /= 10
+
+
+def _final_cost(problem: TurnReadings, found: MostProbable) -> float:
+    """Negative log posterior, up to constants, with the readings' own noise."""
+    half = cho_factor(_base(problem, found.amounts, 0.0))
+    return _cost(half, found.residual, found.prior, found.amounts)
+
+
+def _chi2(problem: TurnReadings, residual: Array) -> float:
+    return float(np.sum((residual / problem.sigma) ** 2))
+
+
+def _base(problem: TurnReadings, amounts: Array, added_noise: float) -> Array:
+    return problem.nuisances(amounts) + np.diag(problem.sigma**2 + added_noise**2)
+
+
+def _cost(half: tuple[Array, bool], residual: Array, prior: Student, amounts: Array) -> float:
+    return float(0.5 * residual @ cho_solve(half, residual) + prior.penalty(amounts).sum())
+
+
+def _iterated(
+    problem: TurnReadings, now: MostProbable, added_noise: float, widening: float, choose: bool
+) -> tuple[MostProbable, float]:
+    """Return one step with added noise; converged if the step is smaller than the noise."""
+    slopes, base = problem.slopes(now.amounts), _base(problem, now.amounts, added_noise)
+    target = now.residual + slopes.times(now.amounts)
+    if choose:
+        unit = slopes.kernel(np.ones(len(now.amounts)))
+        now = replace(now, prior=replace(now.prior, width=best_scale(unit, base, target)))
+    wanted, half = now.amounts, cho_factor(base)
+    best = _linear(slopes, base, half, target, len(wanted))
+    for _ in range(MAX_HALVINGS if np.isfinite(now.prior.freedom) else 1):  # along one linear model
+        wide = replace(now.prior, width=now.prior.width * widening)
+        wanted = best(wide.precision(wanted))
+        widening = max(1.0, widening / NARROWING)
+    wide = replace(now.prior, width=now.prior.width * widening)
+    step = np.clip(wanted, -problem.largest, problem.largest) - now.amounts
+    before = _cost(half, now.residual, wide, now.amounts)
+    for _ in range(MAX_HALVINGS):
+        try:
+            residual = problem.residual(now.amounts + step)
+            if _cost(half, residual, wide, now.amounts + step) <= before:
+                break
+        except BeamLostError:
+            pass
+        step = step / 2
+    else:
+        chi2 = (*now.chi2, now.chi2[-1])
+        return replace(now, chi2=chi2, converged=widening == 1.0), widening
+    least = float(np.sqrt((problem.sigma**2).min() + added_noise**2))
+    small = bool(np.abs(slopes.times(step)).max() < 0.1 * least)
+    chi2 = (*now.chi2, _chi2(problem, residual))
+    converged = small and widening == 1.0
+    return MostProbable(now.amounts + step, residual, now.prior, chi2, converged), widening
+
+
+def _linear(
+    slopes: Shifts, base: Array, half: tuple[Array, bool], target: Array, amounts: int
+) -> Callable[[Array], Array]:
+    """Best amounts of a linear model as a function of the prior's precisions [amount], in the space
+    of amounts or of readings, whichever is smaller."""
+    if amounts < len(target):
+        J = slopes.matrix
+        weighed = cho_solve(half, J)
+        inner, gram = weighed.T @ target, J.T @ weighed
+
+        def of_amounts(precision: Array) -> Array:
+            size = np.sqrt(precision)
+            scaled = gram / size / size[:, None] + np.eye(len(size))
+            return np.asarray(cho_solve(cho_factor(scaled), inner / size) / size)
+
+        return of_amounts
+
+    def of_readings(precision: Array) -> Array:
+        factor = cho_factor(slopes.kernel(1 / precision) + base)
+        return slopes.transposed(cho_solve(factor, target)) / precision
+
+    return of_readings
+
+
+def best_scale(kernel: Array, base: Array, target: Array) -> float:
+    """Factor s of the largest evidence, target ~ N(0, s^2 kernel + base)."""
+    half = np.linalg.cholesky(base)
+    inner = np.linalg.solve(half, np.linalg.solve(half, kernel).T)
+    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
+    power = (vectors.T @ np.linalg.solve(half, target)) ** 2
+    spread = SCALES[:, None] ** 2 * np.maximum(values, 0.0) + 1.0
+    evidence = -0.5 * np.sum(power / spread + np.log(spread), axis=1)
+    return float(SCALES[int(evidence.argmax())])
 
 
 def fit_map(
@@ -176,7 +342,7 @@ def fit_map(
     if sparse is not None:  # many maxima: the sparse fit is another start
         amounts = _from_sparse(space, sparse)
         other = most_probable(problem, student, amounts, wide=False, iterations=iterations)
-        found = best_of(problem, (found, other)) if amounts.any() else found
+        found = min((found, other), key=partial(_final_cost, problem)) if amounts.any() else found
     space.put(found.amounts)
     tunes, sigma, errors = _posterior(problem, found)
     changes = {
@@ -241,7 +407,7 @@ def _posterior(
 ) -> tuple[Array | None, Array | None, Array]:
     """Tunes, their standard error, and that of the amounts (of strengths; else empty)."""
     space, slopes = problem.space, problem.slopes(found.amounts)
-    variance, base = 1 / found.prior.precision(found.amounts), posterior_base(problem, found)
+    variance, base = 1 / found.prior.precision(found.amounts), _base(problem, found.amounts, 0.0)
     sizes, errors, spread = np.sqrt(variance), np.zeros(0), None
     if space.names:
         # (1 + A^T A)^-1 by a triangle: prior less data would cancel for small noise

@@ -38,3 +38,12 @@ def estimated(square: float, freedom: float) -> float:
 def isf(rate: ArrayLike, freedom: ArrayLike) -> Any:
     """Quantile of chi-square at an upper tail probability; NaN without a degree of freedom."""
     return np.where(np.asarray(freedom) > 0, chdtri(freedom, rate), np.nan)[()]
+
+
+MAD = 1.4826
+"""rms of a Gaussian over the median of its modulus."""
+
+
+def median_per_freedom(freedom: ArrayLike) -> Any:
+    """Median of chi-square over its degrees of freedom, by Wilson and Hilferty."""
+    return (1 - 2 / (9 * np.asarray(freedom))) ** 3

@@ -14,57 +14,14 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from tmlattice.effects import Cause
 from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
-from tmlattice.inference.root import Root
-from tmlattice.inference.whitening import Projection
+from tmlattice.inference.whitening import Blocks, Projection, Root
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-
-class Blocks(Projection):
-    """Projection of each part's nuisances out of its own rows.
-
-    Args:
-        parts: the projections, one after another.
-    """
-
-    def __init__(self, parts: Sequence[Projection]) -> None:
-        self.parts = tuple(parts)
-        sizes = [len(part.Q) * part.Q.shape[1] for part in parts]
-        self.ends = np.cumsum(sizes)[:-1]
-
-    def split(self, rows: Array) -> list[Array]:
-        """Return the rows [..., row] of each part."""
-        return np.split(rows, self.ends, axis=-1)
-
-    def out(self, rows: Array) -> Array:
-        """Return rows less the part that nuisances explain."""
-        own = zip(self.parts, self.split(rows), strict=True)
-        return np.concatenate([part.out(np.ascontiguousarray(mine)) for part, mine in own], axis=-1)
-
-    @property
-    def log_volume(self) -> float:
-        """Sum over the parts."""
-        return sum(part.log_volume for part in self.parts)
-
-    def matrix(self) -> Array:
-        """The directions of all parts, [row, coordinate]."""
-        return np.asarray(block_diag(*(part.matrix() for part in self.parts)))
-
-    def inside(self, rows: Array) -> Array:
-        """Square of the part of rows that nuisances explain, [...]."""
-        own = zip(self.parts, self.split(rows), strict=True)
-        return np.asarray(sum(part.inside(np.ascontiguousarray(mine)) for part, mine in own))
-
-    def coordinates(self, rows: Array) -> Array:
-        """Changes of the nuisances, part after part."""
-        own = zip(self.parts, self.split(rows), strict=True)
-        return np.concatenate([part.coordinates(mine) for part, mine in own])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,10 +271,9 @@ class _CombinedMetric(Metric):
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
         parts = []
-        sizes = [len(part.Q) * part.Q.shape[1] for part in self.blocks.parts]
         problem = self.problem
         for part, active, metric, size in zip(
-            problem.parts, problem.active, self.metrics, sizes, strict=True
+            problem.parts, problem.active, self.metrics, self.blocks.sizes, strict=True
         ):
             out = np.zeros((len(hypotheses), size))
             seen = [i for i, h in enumerate(hypotheses) if active and part.sees(h)]

@@ -4,24 +4,30 @@ Distributed errors are Gaussian, and too many to be found one by one. With signa
 slope, in rows) the rows have the covariance C = 1 + S^T S. Its inverse root makes them white again,
 so that a search works as before. Signatures are linearised at the most probable errors, which are
 part of the model; a shift of the rows keeps the errors' prior centred at zero.
+
+Posterior of distributed errors from sums over rows, without storing signatures. With signatures S
+(rms times slope, errors x rows) and residual r, the most probable errors are (1 + S S^T)^-1 S r,
+and their covariance is (1 + S S^T)^-1. S S^T and S r are summed some rows at a time: memory grows
+as the square of the errors, whatever the number of readings. `DistributedProblem` keeps all
+signatures, since its search whitens rows by them.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, eigh
 
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.newton import Fit, fit, fit_nuisances
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
-from tmlattice.inference.root import Root, inverse_root
 from tmlattice.inference.variance_components import VarianceComponents, fit_variance_components
-from tmlattice.inference.whitening import Projection
+from tmlattice.inference.whitening import Projection, Root, inverse_root
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -87,6 +93,12 @@ class DistributedErrors:
         return np.asarray(x - self.seen.T @ (left[:, None] * (self.seen @ x.reshape(len(x), -1)))
                           .reshape(-1, *x.shape[1:])) if len(left) else x  # fmt: skip
 
+    def amounts_at(self, x: Array) -> Array:
+        """Amounts at independent errors of size 1 [error], within their bounds, [error]."""
+        amounts = (self.amounts + self.rms * self.correlated(x)).tolist()
+        own = zip(self.hypotheses, amounts, strict=True)
+        return np.array([find(name).floored(amount) for (name, _), amount in own])
+
     def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
         """Return the distribution after more readings.
 
@@ -110,6 +122,11 @@ class DistributedErrors:
         """Standard deviations, [error]."""
         taken = self.share @ self.seen**2 if len(self.share) else 0.0
         return np.asarray(self.rms * np.sqrt(np.maximum(1 - taken, 0.0)))
+
+
+def _of_inner(name: str) -> Any:
+    """A property or a method of the inner problem."""
+    return property(lambda problem: getattr(problem.inner, name))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,26 +165,20 @@ class MarginalProblem(Problem):
         """Rows [..., row] of the inner problem, whitened."""
         return self._root.white(rows)
 
+    # --- as in the inner problem ----------------------------------------------------------------
+    first = _of_inner("first")
+    free = _of_inner("free")
+    freedom = _of_inner("freedom")
+    alone = _of_inner("alone")
+    monitors = _of_inner("monitors")
+    valid = _of_inner("valid")
+    kick_places = _of_inner("kick_places")
+    sees = _of_inner("sees")
+    moved = _of_inner("moved")
+    neighbours = _of_inner("neighbours")
+    owner = _of_inner("owner")
+
     # --- the model ------------------------------------------------------------------------------
-    @property
-    def first(self) -> Array:
-        """As in the inner problem."""
-        return self.inner.first
-
-    @property
-    def free(self) -> int:
-        """As in the inner problem."""
-        return self.inner.free
-
-    @property
-    def freedom(self) -> int:
-        """As in the inner problem."""
-        return self.inner.freedom
-
-    def sees(self, hypothesis: Hypothesis) -> bool:
-        """As in the inner problem."""
-        return self.inner.sees(hypothesis)
-
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return the model's point; its `view` is the inner problem's."""
         point = self.inner.at(causes, nuisances, kicks)
@@ -184,20 +195,11 @@ class MarginalProblem(Problem):
         """Return the whitened slope, [row]."""
         return self.white(self.inner.slope(point.view, cause))
 
-    def moved(self, nuisances: Array, change: Array) -> Array:
-        """As in the inner problem."""
-        return self.inner.moved(nuisances, change)
-
     def metric(self, point: Point) -> Metric:
         """Return the kind's own products, or those of whitened signatures."""
         assert point.projection is not None
         fast = self.inner.metric_among(point.view, self._root, point.projection)
         return _MarginalMetric(self, point) if fast is None else fast
-
-    @property
-    def kick_places(self) -> Sequence[str]:
-        """As in the inner problem."""
-        return self.inner.kick_places
 
     def kick_rows(self, point: Point, place: int) -> Array:
         """Return the whitened rows, [parameter, row]."""
@@ -207,36 +209,13 @@ class MarginalProblem(Problem):
         """As in the inner problem."""
         return replace(self, inner=self.inner.everywhere())
 
-    @property
-    def alone(self) -> bool:
-        """As in the inner problem."""
-        return self.inner.alone
-
     def with_fixed(self, causes: Sequence[Cause]) -> Self:
         """Return the problem with further fixed causes and the same errors."""
         other = replace(self, inner=self.inner.with_fixed(causes))
         vars(other)["_root"] = self._root
         return other
 
-    def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """As in the inner problem."""
-        return self.inner.neighbours(hypothesis, among)
-
     # --- readings -------------------------------------------------------------------------------
-    @property
-    def monitors(self) -> Sequence[str]:
-        """As in the inner problem."""
-        return self.inner.monitors
-
-    @property
-    def valid(self) -> Flags:
-        """As in the inner problem."""
-        return self.inner.valid
-
-    def owner(self) -> NDArray[np.int64]:
-        """As in the inner problem."""
-        return self.inner.owner()
-
     def as_rows(self, readings: Array) -> Array:
         """Return whitened rows, [..., row]."""
         return self.white(self.inner.as_rows(readings))
@@ -287,10 +266,7 @@ class DistributedProblem(MarginalProblem):
 
     def estimate(self, clean: Array) -> Array:
         """Most probable amounts of the errors, given the rows that remain, [error]."""
-        known = self.known
-        amounts = known.amounts + known.rms * known.correlated(self.rows @ self._root.back(clean))
-        own = zip(known.hypotheses, amounts.tolist(), strict=True)
-        return np.array([find(name).floored(amount) for (name, _), amount in own])
+        return self.known.amounts_at(self.rows @ self._root.back(clean))
 
     def learnt(self, explained: Fit) -> DistributedErrors:
         """Distribution of the errors given an explanation."""
@@ -514,3 +490,136 @@ def components_of_rows(
     return fit_variance_components(
         residual[there], basis[there], families, [part[there] for part in noise]
     )
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Distributed errors given these readings.
+
+    Attributes:
+        before: the prior, with its estimated scales.
+        amounts: most probable amounts, [error].
+        visible: errors with a signature.
+        spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
+        errors: relative error of each estimated scale, by effect.
+    """
+
+    before: DistributedErrors = field(repr=False)
+    amounts: Array = field(repr=False)
+    visible: NDArray[np.int64] = field(repr=False)
+    spread: Array = field(repr=False)
+    errors: Mapping[str, float]
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """Estimated rms by effect."""
+        own = zip(self.before.hypotheses, self.before.rms.tolist(), strict=True)
+        return {name: rms for (name, _), rms in own}
+
+    @cached_property
+    def known(self) -> DistributedErrors:
+        """Posterior distribution."""
+        values, vectors = eigh(
+            self.spread, subset_by_value=(MIN_SHARE / (1 - MIN_SHARE), np.inf), check_finite=False
+        )
+        seen = np.zeros((len(values), len(self.amounts)))
+        seen[:, self.visible] = vectors.T
+        return self.before.updated(self.amounts, values / (1 + values), seen)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums of d rows / d amount over all rows, nuisances projected out.
+
+    Attributes:
+        gram: with each other, [error, error].
+        inner: with the residual, [error].
+        some: slopes in a few rows, nuisances not projected out, [error, row].
+    """
+
+    gram: Array
+    inner: Array
+    some: Array
+
+
+def posterior(
+    problem: Problem,
+    known: DistributedErrors,
+    *,
+    learn: bool = True,
+    linearised_at: Array | None = None,
+) -> Posterior:
+    """Return the posterior of distributed errors, linearised at the most probable amounts.
+
+    Args:
+        problem: of the design.
+        known: prior, with initial scales.
+        learn: estimate the scales; else they stay.
+        linearised_at: first point of linearisation, [error]; None: the prior's mean.
+
+    Raises:
+        UnstableRingError: no beam is stored with the most probable errors.
+    """
+    names, belongs = families_of(known)
+    amounts = stored = known.amounts if linearised_at is None else linearised_at
+    nuisances, errors = problem.first, dict[str, float]()
+    for _ in range(LINEARISATIONS):
+        inner, point, amounts = linearise(problem, known, amounts, stored, (), nuisances)
+        assert point.projection is not None
+        stored, nuisances = amounts, point.nuisances
+        keep = sampled_rows(len(point.residual))
+        sums = sums_at(inner, point, known, amounts, keep)
+        beyond = amounts - known.amounts
+        if learn:
+            found = components_of_rows(
+                point.residual[keep] + beyond @ sums.some, point.projection.matrix()[keep],
+                known.correlated(known.rms[:, None] * sums.some), belongs,
+            )  # fmt: skip
+            errors = dict(zip(names, found.error.tolist(), strict=True))
+            known = replace(known, rms=known.rms * found.scale[belongs])
+        spread = known.correlated(known.correlated(known.rms[:, None] * sums.gram * known.rms).T)
+        visible = np.flatnonzero(np.diag(spread) > 0)
+        spread = spread[np.ix_(visible, visible)]
+        pull = known.correlated(known.rms * (sums.inner + sums.gram @ beyond))
+        most_probable = np.zeros(len(pull))
+        factor = cho_factor(spread + np.eye(len(visible)), overwrite_a=True, check_finite=False)
+        most_probable[visible] = cho_solve(factor, pull[visible], check_finite=False)
+        amounts = known.amounts_at(most_probable)
+    return Posterior(known, amounts, visible, spread, errors)
+
+
+def sums_at(
+    problem: Problem,
+    point: Point,
+    known: DistributedErrors,
+    amounts: Array,
+    keep: NDArray[np.int64],
+) -> Sums:
+    """Return the sums at a point.
+
+    Args:
+        problem: with the distributed errors in it.
+        point: of nuisances alone.
+        known: the errors.
+        amounts: amounts of the errors in the problem, [error].
+        keep: rows for `Sums.some`.
+    """
+    assert point.projection is not None
+    clean = point.projection.out(point.residual)
+    directions = np.linalg.qr(point.projection.matrix())[0]
+    slope = chain_factors(known, amounts)
+    count = len(slope)
+    gram, inner = np.zeros((count, count)), np.zeros(count)
+    along, some = np.zeros((count, directions.shape[1])), np.zeros((count, len(keep)))
+    column = np.full(len(clean), -1)
+    column[keep] = np.arange(len(keep))
+    for rows, signatures in problem.everywhere().metric(point).pieces(known.hypotheses):
+        visible = np.flatnonzero(signatures.any(axis=1))
+        own = slope[visible, None] * signatures[visible]
+        gram[np.ix_(visible, visible)] += own @ own.T
+        inner[visible] += own @ clean[rows]
+        along[visible] += own @ directions[rows]
+        here = column[rows]
+        some[np.ix_(visible, here[here >= 0])] = own[:, here >= 0]
+    gram -= along @ along.T
+    return Sums(gram, inner, some)

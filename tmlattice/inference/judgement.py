@@ -7,10 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
-def _shares() -> Mapping[str, float]:
-    return {"named": 0.6, "kick": 0.2, "monitor": 0.1, "reading": 0.1}
-
-
 @dataclass(frozen=True)
 class Judgement:
     """Thresholds of significance, and prior probabilities.
@@ -30,14 +26,15 @@ class Judgement:
         most_outliers, outlier_prior: single readings rejected at most; log probability of one.
         same: largest relative change of amount and orbit with which a slope is reused.
         silent: share of BPMs without signal above which they are taken as not installed.
-        alien: local misfit over the orbit above which the data belong to another ring.
         noise: p-values of the residual for a warning, and for no verdict.
         retaken: times that distributed errors are linearised again at a strong fault.
         rarer: factor by which each cause beyond the first is less probable than the one before.
     """
 
     false_alarm: float = 0.005
-    shares: Mapping[str, float] = field(default_factory=_shares)
+    shares: Mapping[str, float] = field(
+        default_factory=lambda: {"named": 0.6, "kick": 0.2, "monitor": 0.1, "reading": 0.1}
+    )
     mass: float = 0.95
     unknown: float = 0.05
     alternatives: int = 24
@@ -49,7 +46,6 @@ class Judgement:
     outlier_prior: float = -16.0
     same: float = 0.02
     silent: float = 0.2
-    alien: float = 0.35
     noise: tuple[float, float] = (1e-4, 1e-6)
     retaken: int = 2
     rarer: float = 1.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, find
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
-from tmlattice.inference.scan import evidence_of_scale
+from tmlattice.inference.scan import free_scan
 from tmlattice.inference.whitening import Projection
 
 Array = NDArray[np.float64]
@@ -314,9 +314,6 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
 
 def free_evidence(information: Array, values: Array) -> float:
     """Log evidence of free parameters at their best values, less that of their misfit (<= 0)."""
-    weights, vectors = np.linalg.eigh(information)
-    seen = weights > 1e-10 * max(weights[-1], 1e-300)
-    scaled = (vectors.T @ values)[seen] * np.sqrt(weights[seen])
-    relative = weights[seen] / max(weights[-1], 1e-300)
-    gain = evidence_of_scale(scaled[None], relative[None])[0]
-    return float(gain - 0.5 * scaled @ scaled)
+    inner = information @ values
+    found = free_scan(np.zeros(1, dtype=np.int64), information[None, None], inner[None, None])
+    return float(found.gain[0] - 0.5 * found.statistic[0])

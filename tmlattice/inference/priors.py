@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln
-from scipy.stats import chi2
 
 from tmlattice.effects import Cause, find
+from tmlattice.inference import chi2
 
 Array = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ class Group:
         core = np.full(1, self.rms)
         if np.isfinite(self.freedom):
             quantiles = (np.arange(CORE) + 0.5) / CORE
-            core = self.rms * np.sqrt(self.freedom / chi2.ppf(quantiles, self.freedom))
+            core = self.rms * np.sqrt(self.freedom / chi2.isf(1 - quantiles, self.freedom))
         chances = np.full(len(core), 1 / len(core))
         members, least = self.basis.shape[1], FAULT_FROM * self.rms
         faulty = max(1 / max(members, 1), FAULTY_SHARE)

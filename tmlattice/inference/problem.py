@@ -17,8 +17,7 @@ from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.metric import Metric
 from tmlattice.inference.priors import LOG_UNIFORM, AmountPrior
-from tmlattice.inference.root import Root
-from tmlattice.inference.whitening import Projection
+from tmlattice.inference.whitening import Projection, Root
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

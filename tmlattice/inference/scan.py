@@ -171,7 +171,7 @@ def evidence_of_scale(values: Array, information: Array) -> Array:
     return np.asarray(logsumexp(gains, axis=0) - np.log(len(_RATIOS)))
 
 
-def _free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan:
+def free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan:
     """Statistics of groups of parameters.
 
     Args:
@@ -199,10 +199,10 @@ def _free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan
 def scan_kicks(metric: Metric, layers: Sequence[int], residual: Array) -> FreeScan:
     """Scan a free kick (px, py) in every active shot, in the middle of each layer's magnet."""
     places = np.asarray(layers)
-    return _free_scan(places, *metric.free_kicks(places, metric.projection.out(residual)))
+    return free_scan(places, *metric.free_kicks(places, metric.projection.out(residual)))
 
 
 def scan_monitors(metric: Metric, residual: Array) -> FreeScan:
     """Scan monitors with free readings in every active shot and turn."""
     gram, inner = metric.free_monitors(metric.projection.out(residual))
-    return _free_scan(np.arange(len(gram)), gram, inner)
+    return free_scan(np.arange(len(gram)), gram, inner)

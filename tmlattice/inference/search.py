@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Alternative, Detection, alternatives, linear_evidence
 from tmlattice.inference.newton import Fit, Outcome, fit
-from tmlattice.inference.options import Option, Reading, outlier, unnamed
-from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.scan import (
     NO_SCAN,
     FreeScan,
     Scan,
+    free_threshold,
+    look_elsewhere,
     scan,
     scan_kicks,
     scan_monitors,
@@ -33,6 +34,83 @@ from tmlattice.inference.scan import (
 log = logging.getLogger(__name__)
 
 Flags = NDArray[np.bool_]
+
+
+READINGS_PER_OUTLIER = 10
+"""Readings per rejected one, at least: of a few readings, such as two tunes, none is rejected."""
+
+Reading = tuple[int, ...]
+"""Index among the problem's readings."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """Next step of a search: its gain in log evidence, and its significance."""
+
+    kind: str
+    name: str
+    gain: float
+    detection: Detection
+    where: int = -1
+    reading: Reading = ()
+    alternatives: tuple[Alternative, ...] = ()
+
+
+def unnamed(
+    problem: Problem,
+    kind: str,
+    free: FreeScan,
+    names: Sequence[str],
+    taken: Mapping[int, Detection],
+) -> list[Option]:
+    """Free kick or rejected BPM that explains most, if significant.
+
+    Args:
+        problem: model and data.
+        kind: "kick" or "monitor".
+        free: the scan of all places.
+        names: of the places.
+        taken: places that have one.
+    """
+    rate = problem.judgement.rate(kind)
+    place = int(free.gain.argmax())
+    where = int(free.places[place])
+    freedom = max(int(free.freedom[place]), 1)
+    seen = _detection(float(free.statistic[place]), rate, freedom, len(names))
+    if not seen.p_value < rate or where in taken:
+        return []
+    gain = float(free.gain[place]) + problem.unknown_prior(len(names))
+    return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
+
+
+def _detection(statistic: float, rate: float, freedom: int, count: float) -> Detection:
+    """Significance of the largest of a number of chi-squares."""
+    threshold = free_threshold(rate, freedom, count)
+    return Detection(statistic, threshold, look_elsewhere(statistic, freedom, count))
+
+
+def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
+    """Rejection of the reading with the largest residual, if significant.
+
+    Args:
+        problem: model and data.
+        point: the model of the fit.
+        already: number of rejected readings.
+    """
+    thresholds = problem.judgement
+    if int(problem.valid.sum()) < READINGS_PER_OUTLIER * (already + 1):
+        return []
+    clean, size = problem.left(point)
+    statistic = np.where(size > 1e-3, clean**2 / np.maximum(size, 1e-3), 0.0)
+    worst = tuple(int(i) for i in np.unravel_index(int(statistic.argmax()), statistic.shape))
+    value, count = float(statistic[worst]), float(problem.valid.sum())
+    rate = thresholds.rate("reading")
+    seen = _detection(value, rate, 1, count)
+    if not seen.p_value < rate:
+        return []
+    # a log-uniform amount, as for every other cause
+    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + thresholds.outlier_prior
+    return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]
 
 
 @dataclass(frozen=True)
@@ -384,13 +462,8 @@ def _monitor_revised(search: Search, state: AnyState, monitor: int) -> AnyState:
     alone = float(free.gain[monitor]) + back.problem.unknown_prior(len(free.gain))
     if back.fit.outcome is Outcome.STUCK:  # see `_refitted`
         alone += 0.5 * (back.fit.chi2 - state.fit.chi2 - float(free.statistic[monitor]))
-    if alone <= 0:
-        return back
-    tried = alternatives(back.problem, back.fit, _scan(search, back), search.hypotheses, 8)
-    if tried and tried[0].fit.log_evidence - back.fit.log_evidence > alone:
-        named = (*back.named, Identified(state.monitors[monitor], tried))
-        return replace(back, fit=tried[0].fit, named=named)
-    return state
+    evidence = back.fit.log_evidence + alone
+    return _better(search, state, back, evidence, state.monitors[monitor], 8)
 
 
 def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> AnyState:
@@ -402,11 +475,29 @@ def _kick_revised(search: Search, state: AnyState, place: int, count: int) -> An
     without = replace(state, fit=alone, kicks=seen)
     if alone.point.lost:
         return state
-    if alone.log_evidence > now.log_evidence:
+    return _better(search, state, without, now.log_evidence, state.kicks[place], count)
+
+
+def _better(
+    search: Search, state: AnyState, without: AnyState, evidence: float, seen: Detection, count: int
+) -> AnyState:
+    """Return a state without an unnamed choice, or with a cause of the catalogue in its place, if
+    that explains as much as the choice.
+
+    Args:
+        search: what is searched.
+        state, without: with the choice, and without it.
+        evidence: log evidence with the choice.
+        seen: significance of the choice.
+        count: causes that are tried.
+    """
+    alone = without.fit
+    if alone.log_evidence >= evidence:
         return without
-    tried = alternatives(state.problem, alone, _scan(search, without), search.hypotheses, count)
-    if tried and tried[0].fit.log_evidence > now.log_evidence:
-        named = (*state.named, Identified(state.kicks[place], tried))
+    scanned = _scan(search, without)
+    tried = alternatives(without.problem, alone, scanned, search.hypotheses, count)
+    if tried and tried[0].fit.log_evidence > evidence:
+        named = (*without.named, Identified(seen, tried))
         return replace(without, fit=tried[0].fit, named=named)
     return state
 

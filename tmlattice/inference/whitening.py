@@ -4,17 +4,28 @@ Noise is independent, and, if asked for, correlated by distributed errors that a
 shots: C = sigma^2 + sum_h tau_h^2 s_h s_h^T. Launches are nuisance parameters: their directions are
 projected out of data and signatures. Prior knowledge of a launch adds rows: [shot, 2 readings + 5
 coordinates], flattened.
+
+Inverse root of a covariance 1 + S^T S, which whitens rows with distributed errors. The cheaper of
+two roots is used: the Cholesky factor (rows x rows), or, if errors are fewer than rows, the
+symmetric root in the space of the errors: with S S^T = U L U^T
+
+    (1 + S^T S)^(-1/2) = 1 + V ((1 + L)^(-1/2) - 1) V^T,   V = S^T U L^(-1/2),
+
+which costs errors^2 x rows once and errors x rows for each row that is whitened.
 """
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, eigh
 
-from tmlattice.inference.root import inverse_root
+from tmlattice.inference.normal import inverse_of_lower, lower_factor
 
 Array = NDArray[np.float64]
 
@@ -23,6 +34,106 @@ EXACT = 1e-12
 
 ROUNDING = 1e-13
 """Share of a direction below which it is rounding, given the directions before it."""
+
+
+SMALLEST_SHARE = 1e-12
+"""Share of the largest variance below which a variance is rounding."""
+
+
+class Root(ABC):
+    """Matrix W with W^T W = (1 + S^T S)^-1."""
+
+    @abstractmethod
+    def white(self, rows: Array) -> Array:
+        """Rows [..., row] times W^T."""
+
+    @abstractmethod
+    def back(self, rows: Array) -> Array:
+        """Rows [..., row] times W."""
+
+    @property
+    @abstractmethod
+    def matrix(self) -> Array:
+        """W itself, [row, row]."""
+
+    @property
+    @abstractmethod
+    def log_scale(self) -> float:
+        """Logarithm of the determinant of W."""
+
+
+@dataclass(frozen=True)
+class _Triangle(Root):
+    inverse: Array  # of the Cholesky factor, [row, row]
+
+    def white(self, rows: Array) -> Array:
+        return np.asarray(rows @ self.inverse.T)
+
+    def back(self, rows: Array) -> Array:
+        return np.asarray(rows @ self.inverse)
+
+    @property
+    def matrix(self) -> Array:
+        return self.inverse
+
+    @property
+    def log_scale(self) -> float:
+        return float(np.log(np.diagonal(self.inverse)).sum())
+
+
+@dataclass(frozen=True)
+class _Symmetric(Root):
+    directions: Array  # orthonormal, [direction, row]
+    size: Array  # along them, [direction]
+
+    def white(self, rows: Array) -> Array:
+        along = (rows @ self.directions.T) * (self.size - 1)
+        return np.asarray(rows + along @ self.directions)
+
+    def back(self, rows: Array) -> Array:
+        return self.white(rows)
+
+    @property
+    def matrix(self) -> Array:
+        return self.white(np.eye(self.directions.shape[1]))
+
+    @property
+    def log_scale(self) -> float:
+        return float(np.log(self.size).sum())
+
+
+def inverse_root(spread: Array) -> Root:
+    """Return the inverse root of the rows' covariance.
+
+    Args:
+        spread: S, [error, row], signatures of errors of size 1.
+    """
+    errors, rows = spread.shape
+    if errors >= rows:
+        covariance = spread.T @ spread
+        covariance[np.diag_indices(rows)] += 1.0
+        return _Triangle(inverse_of_lower(lower_factor(covariance)))
+    values, directions = directions_of(spread)
+    return _Symmetric(directions, 1 / np.sqrt(1 + values))
+
+
+def directions_of(spread: Array) -> tuple[Array, Array]:
+    """Orthonormal directions of the rows that errors of size 1 move.
+
+    Args:
+        spread: S, [error, row].
+
+    Returns:
+        The variance along each, [direction]; and the directions, [direction, row].
+    """
+    errors, rows = spread.shape
+    if errors >= rows:
+        values, vectors = eigh(spread.T @ spread, overwrite_a=True, check_finite=False)
+        return np.maximum(values, 0.0), vectors.T
+    values, vectors = eigh(spread @ spread.T, overwrite_a=True, check_finite=False)
+    kept = values > SMALLEST_SHARE * values.max(initial=1e-300)
+    values = values[kept]
+    return values, (vectors[:, kept] / np.sqrt(values)).T @ spread
 
 
 class Readings(Protocol):
@@ -158,64 +269,88 @@ class Whitening:
 
 
 class Projection:
-    """Directions of the launches among whitened rows.
+    """Directions of the launches among whitened rows, by blocks of rows.
 
     Args:
         directions: d rows / d launch coordinates by block, see `Whitening.launch`.
+
+    Attributes:
+        Q: orthonormal directions, [block, row, direction].
     """
 
     def __init__(self, directions: Array) -> None:
-        self.Q, self._R = np.linalg.qr(directions)
-        self._seen = np.abs(np.diagonal(self._R, axis1=1, axis2=2))  # [block, column]
+        self.Q, R = np.linalg.qr(directions)
+        seen = np.abs(np.diagonal(R, axis1=1, axis2=2))  # [block, column]
         size = np.linalg.norm(directions, axis=1)
-        if (self._seen <= ROUNDING * size).any():  # QR would give an arbitrary direction
+        if (seen <= ROUNDING * size).any():  # QR would give an arbitrary direction
             scale = np.where(size > 0, size, 1.0)[:, None]
             U, s, V = np.linalg.svd(directions / scale, full_matrices=False)
             kept = s > ROUNDING * max(directions.shape[1:])
             self.Q = U * kept[:, None]
-            self._R = (s * kept)[..., None] * V * scale
-            self._seen = np.where(kept, s, 1.0) * scale[:, 0]
+            R = (s * kept)[..., None] * V * scale
+            seen = np.where(kept, s, 1.0) * scale[:, 0]
+        self._blocks = list(zip(self.Q, R, strict=True))
+        self._log_seen = float(np.log(np.maximum(seen, 1e-300)).sum())
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return sum(len(Q) for Q, _ in self._blocks)
 
     @property
     def log_volume(self) -> float:
         """Log root of the determinant of the launches' covariance, without invisible directions."""
-        return -float(np.log(np.maximum(self._seen, 1e-300)).sum())
+        return -self._log_seen
+
+    def _split(self, rows: Array) -> Iterator[tuple[Array, Array, slice]]:
+        """Rows [data, row] of each block with directions, these, and where they are."""
+        end = 0
+        for Q, _ in self._blocks:
+            own = slice(end, end + len(Q))
+            end = own.stop
+            if Q.shape[1]:
+                yield rows[:, own], Q, own
 
     def out(self, rows: Array) -> Array:
         """Return rows [..., row] less the part that launches explain."""
-        if not self.Q.shape[2]:
-            return rows.copy()
-        blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
-        kept = np.empty_like(blocks)
-        for b, Q in enumerate(self.Q):
-            part = blocks[:, b]
-            kept[:, b] = part - (part @ Q) @ Q.T
+        kept = rows.reshape(-1, rows.shape[-1]).copy()
+        for part, Q, own in self._split(kept):
+            kept[:, own] = part - (part @ Q) @ Q.T
         return kept.reshape(rows.shape)
 
     def matrix(self) -> Array:
         """Directions of all blocks, [row, coordinate]."""
-        return np.asarray(block_diag(*(Q @ R for Q, R in zip(self.Q, self._R, strict=True))))
-
-    def covariance(self) -> Array:
-        """Covariance of the launch coordinates, [block, column, column]; 0 where invisible."""
-        inverse = np.linalg.pinv(self._R)
-        return np.asarray(inverse @ np.swapaxes(inverse, 1, 2))
+        return np.asarray(block_diag(*(Q @ R for Q, R in self._blocks)))
 
     def inside(self, rows: Array) -> Array:
         """Square of the part of rows [..., row] that launches explain, [...]."""
-        if not self.Q.shape[2]:
-            return np.zeros(rows.shape[:-1])
-        blocks = rows.reshape(-1, len(self.Q), self.Q.shape[1])
-        total = np.zeros(len(blocks))
-        for b, Q in enumerate(self.Q):
-            along = blocks[:, b] @ Q
+        total = np.zeros(rows.shape[:-1]).ravel()
+        for part, Q, _ in self._split(rows.reshape(-1, rows.shape[-1])):
+            along = part @ Q
             total += np.einsum("hq,hq->h", along, along)
         return total.reshape(rows.shape[:-1])
 
     def coordinates(self, rows: Array) -> Array:
         """Changes of the launch coordinates that explain rows [row] best, one after another."""
-        blocks = rows.reshape(len(self.Q), -1)
-        inside = np.einsum("bri,br->bi", self.Q, blocks)
-        return np.concatenate(
-            [np.linalg.lstsq(R, c, rcond=None)[0] for R, c in zip(self._R, inside, strict=True)]
-        )
+        blocks = np.split(rows, np.cumsum([len(Q) for Q, _ in self._blocks])[:-1])
+        return np.concatenate([
+            np.linalg.lstsq(R, Q.T @ own, rcond=None)[0]
+            for (Q, R), own in zip(self._blocks, blocks, strict=True)
+        ])  # fmt: skip
+
+
+class Blocks(Projection):
+    """Projection of each part's nuisances out of its own rows.
+
+    Args:
+        parts: the projections, one after another.
+    """
+
+    def __init__(self, parts: Sequence[Projection]) -> None:
+        self._blocks = [block for part in parts for block in part._blocks]
+        self._log_seen = sum(part._log_seen for part in parts)
+        self.sizes = [part.rows for part in parts]
+
+    def split(self, rows: Array) -> list[Array]:
+        """Return the rows [..., row] of each part."""
+        return np.split(rows, np.cumsum(self.sizes)[:-1], axis=-1)

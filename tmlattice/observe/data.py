@@ -73,27 +73,31 @@ def of_measurement(ring: Ring, measurement: Measurement, reference: bool = False
         MeasurementError: no reading.
     """
     names = [monitor.name for monitor in ring.monitors]
-    ordered = measurement.in_order_of(names)
-    shots, turns = ordered.readings.shape[:2]
-    readings = ordered.readings.reshape(shots, -1, 2)
-    valid = np.isfinite(readings)
-    if not valid.any():
+    data = _of_turns(measurement.in_order_of(names), None)
+    if not data.valid.any():
         raise MeasurementError("every reading is missing; nothing can be diagnosed")
-    noise = np.full((len(names), 2), np.nan) if ordered.noise is None else ordered.noise
-    sigma = np.broadcast_to(np.tile(noise, (turns, 1)), readings.shape).copy()
+    return replace(data, active=np.full(data.shots, not reference))
+
+
+def _of_turns(ordered: Measurement, turns: int | None) -> Data:
+    """The first turns of a measurement, or all; unknown launches have exact energies."""
+    own = ordered.readings[:, :turns]
+    shots, turns = own.shape[:2]
+    readings = own.reshape(shots, -1, 2)
+    valid = np.isfinite(readings)
+    noise = np.full(own.shape[2:], np.nan) if ordered.noise is None else ordered.noise
     launch_sigma = ordered.launch_sigma
     if launch_sigma is None:
         launch_sigma = np.tile([np.inf] * 4 + [0.0], (shots, 1))
-    settings = ordered.settings or tuple({} for _ in range(shots))
     return Data(
-        np.where(valid, readings, 0.0),
-        valid,
-        sigma,
-        ordered.launches,
-        launch_sigma,
-        tuple(settings),
-        turns,
-        np.full(shots, not reference),
+        readings=np.where(valid, readings, 0.0),
+        valid=valid,
+        sigma=np.broadcast_to(np.tile(noise, (turns, 1)), readings.shape).copy(),
+        launches=ordered.launches,
+        launch_sigma=launch_sigma,
+        settings=tuple(ordered.settings or ({} for _ in range(shots))),
+        turns=turns,
+        active=np.ones(shots, dtype=bool),
     )
 
 
@@ -162,29 +166,18 @@ def first_turn(
     """
     ordered = measurement.in_order_of(monitors)
     ordered.states(dimension)  # raises if four coordinates are too few
-    readings = ordered.readings[:, 0]
-    valid = np.isfinite(readings)
-    if not valid.any():
+    data = _of_turns(ordered, 1)
+    if not data.valid.any():
         raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
-    stated = ordered.noise if noise is None else np.full((len(monitors), 2), noise)
-    if stated is None or np.isnan(stated[valid.any(axis=0)]).any():
+    sigma = data.sigma if noise is None else np.full(data.sigma.shape, noise)
+    if np.isnan(sigma[:, data.valid.any(axis=0)]).any():
         raise MeasurementError(
             "the measurement does not state its noise; give noise= in m (one reading's rms)"
         )
-    sigma = np.empty_like(readings)
-    sigma[:] = np.maximum(np.nan_to_num(stated, nan=1.0), NOISE_FLOOR)
     width = launch_errors(measurement, dimension, launch_sigma)
-    known = np.zeros((len(readings), 5))
+    known = np.zeros((data.shots, 5))
     known[:, :4] = width[:, :4]
     if dimension == 6:
         known[:, 4] = width[:, 5]
-    return Data(
-        np.where(valid, readings, 0.0),
-        valid,
-        sigma,
-        ordered.launches,
-        known,
-        tuple(ordered.settings or ({} for _ in readings)),
-        1,
-        np.ones(len(readings), dtype=bool),
-    )
+    sigma = np.maximum(np.nan_to_num(sigma, nan=1.0), NOISE_FLOOR)
+    return replace(data, sigma=sigma, launch_sigma=known)

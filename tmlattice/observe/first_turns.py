@@ -18,9 +18,8 @@ from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
-from tmlattice.inference.root import Root
 from tmlattice.inference.validation import Half, HeldOut, cross_predicted
-from tmlattice.inference.whitening import EXACT, Projection, Whitening
+from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import TurnMetric, metric
 from tmlattice.observe.noise import local_misfit

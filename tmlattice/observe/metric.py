@@ -302,18 +302,6 @@ class DenseMetric(TurnMetric):
             inner[k, 0] = flat @ sums[:, m].ravel()
         return gram, inner
 
-    def free_monitors(self, clean: Array) -> tuple[Array, Array]:
-        """The blocks of the active shots' readings."""
-        data = self._data(clean[None])[0]
-        monitors = self.weight.shape[1]
-        size = 2 * len(self.shots)
-        scale = self.weight.swapaxes(0, 1)[:, self.shots].reshape(monitors, size)
-        blocks = np.stack([self._block(m) for m in range(monitors)])
-        own = (2 * self.shots[:, None] + np.arange(2)).ravel()
-        gram = scale[:, :, None] * blocks[:, own][:, :, own] * scale[:, None, :]
-        inner = data[self.shots].swapaxes(0, 1).reshape(monitors, size)
-        return gram[:, None], inner[:, None]
-
 
 def metric(
     model: Model,

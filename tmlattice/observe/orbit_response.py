@@ -22,7 +22,6 @@ from tmlattice.errors import EffectError, UnstableRingError
 from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Hypothesis = tuple[str, str | None]
 

@@ -7,6 +7,7 @@ per cent are exact.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from tmlattice.effects import Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion
-from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.stored import Stored, rf_of, stacked
 
 Array = NDArray[np.float64]
@@ -26,11 +26,6 @@ Array = NDArray[np.float64]
 class Orbits(Stored):
     """Closed orbits, m, [shot, monitor, 2]."""
 
-    @property
-    def first(self) -> Array:
-        """No nuisances."""
-        return NOTHING
-
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the readings; a shot is a state."""
         return stacked(states, "orbit")
@@ -39,11 +34,6 @@ class Orbits(Stored):
 @dataclass(frozen=True, kw_only=True)
 class RfOrbits(Stored):
     """Orbit changes for steps of the RF, m, [step, monitor, 2]."""
-
-    @property
-    def first(self) -> Array:
-        """No nuisances."""
-        return NOTHING
 
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the change from half a step below to half a step above."""
@@ -60,10 +50,9 @@ def closed_orbits(ring: Ring, measured: ClosedOrbit, places: Mapping[str, float]
     """
     whole = measured.in_order_of([monitor.name for monitor in ring.monitors])
     settings: tuple[Settings, ...] = whole.settings or ({},) * len(whole.orbit)
-    data, errors, used, read_by = _of_monitors(whole.orbit, whole.noise, "a closed orbit")
     return Orbits(
-        ring=ring, places=places, data=data, errors=errors, used=used, read_by=read_by,
-        states=tuple((one, rf_of(one)) for one in settings),
+        ring=ring, places=places, states=tuple((one, rf_of(one)) for one in settings),
+        **_of_monitors(whole.orbit, whole.noise, "a closed orbit"),
     )  # fmt: skip
 
 
@@ -75,18 +64,15 @@ def dispersion(ring: Ring, measured: Dispersion, places: Mapping[str, float]) ->
         UnknownNameError: a monitor that is not in the ring.
     """
     whole = measured.in_order_of([monitor.name for monitor in ring.monitors])
-    data, errors, used, read_by = _of_monitors(whole.orbits, whole.noise, "dispersion")
     steps = [step.step / step.frequency for step in whole.steps]
     return RfOrbits(
-        ring=ring, places=places, data=data, errors=errors, used=used, read_by=read_by,
+        ring=ring, places=places, **_of_monitors(whole.orbits, whole.noise, "dispersion"),
         states=tuple(({}, side * step / 2) for step in steps for side in (1, -1)),
     )  # fmt: skip
 
 
-def _of_monitors(
-    orbits: Array, noise: Array | None, kind: str
-) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.int64]]:
-    """Data, errors, validity and monitor of each reading, all [shot, monitor, 2]."""
+def _of_monitors(orbits: Array, noise: Array | None, kind: str) -> dict[str, Any]:
+    """Values, noise, validity and monitor of each reading, all [shot, monitor, 2]."""
     there = np.isfinite(orbits)
     sigma = np.broadcast_to(np.nan if noise is None else noise, orbits.shape)
     if not np.isfinite(sigma[there]).all():
@@ -94,4 +80,5 @@ def _of_monitors(
             f"the noise of {kind} is unknown, and one orbit does not determine it; state it"
         )
     at = np.broadcast_to(np.arange(orbits.shape[1])[:, None], orbits.shape)
-    return np.where(there, orbits, 0.0), np.where(there, sigma, 1.0), there, at
+    values, sigma = np.where(there, orbits, 0.0), np.where(there, sigma, 1.0)
+    return {"values": values, "sigma": sigma, "used": there, "read_by": at}

@@ -1,7 +1,7 @@
 """Global errors of an orbit response: a wrong sign, unit or order of all readings or kicks.
 
 >>> search = ResponseGlobalErrors(ring, measured)
->>> search.verdicts()
+>>> search.verdict()
 
 A machine's response is its design's to a tenth or so, column by column. A wrong sign or unit of all
 readings makes nearly all columns of a plane unrelated to it. A single bad corrector is one column,
@@ -19,7 +19,7 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
-from tmlattice.observe.response_rf import read
+from tmlattice.observe.response_data import read
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
@@ -171,15 +171,6 @@ class ResponseGlobalErrors:
         alike = [own for own in found if own.gain > best - ALIKE]
         first = alike[0]
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
-
-    def verdicts(self, most: int = 4) -> list[ResponseVerdict]:
-        """Return global errors one after another, each with those before it corrected."""
-        found: list[ResponseVerdict] = []
-        search = self
-        while len(found) < most and (own := search.verdict()) is not None:
-            found.append(own)
-            search = search.corrected(own.names)
-        return found
 
     def corrected(self, names: Names) -> "ResponseGlobalErrors":
         """Return the search with assumptions corrected in the data."""

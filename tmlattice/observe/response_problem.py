@@ -5,24 +5,30 @@
 
 A held-out corrector has no rows. The kick of a fitted one is known, so that its calibration is a
 cause like any other.
+
+Products of an orbit response's signatures without forming them. An error of the ring changes a
+response by a few numbers per column and per monitor (`beam.response_derivatives.Factors`). Its
+products with data are those of these numbers with sums over the data. Its square is summed over
+readings, each with its weight. An error of a monitor affects that monitor's readings alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects import Cause, LaunchEffect, RingEffect, find, modelled
-from tmlattice.inference.metric import Hypothesis, Metric
+from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
+from tmlattice.compiled import jit_sums
+from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
+from tmlattice.inference.metric import Hypothesis, Indices, Metric, Products
 from tmlattice.inference.problem import Point
 from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.response_metric import ResponseMetric
-from tmlattice.observe.steady import NOTHING, Steady
+from tmlattice.observe.steady import MAX_NUMBERS, Steady, SteadyMetric
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> list[Hypothesis]:
@@ -58,24 +64,16 @@ class Response(Steady):
     Attributes:
         base: prediction with the known errors, see `Predicted`.
         used: fitted readings, [column, monitor, 2].
+        values, sigma: orbit changes, m, [column, monitor, 2], and noise, m, [monitor, 2].
     """
 
     base: Predicted = field(repr=False)
+    values: Array = field(init=False, repr=False)
+    sigma: Array = field(init=False, repr=False)
 
-    @property
-    def first(self) -> Array:
-        """No nuisances."""
-        return NOTHING
-
-    @property
-    def values(self) -> Array:
-        """Orbit changes, m, [column, monitor, 2]."""
-        return self.base.data.orbits
-
-    @property
-    def sigma(self) -> Array:
-        """Noise, m, [monitor, 2]."""
-        return self.base.data.noise
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", self.base.data.orbits)
+        object.__setattr__(self, "sigma", self.base.data.noise)
 
     def sees(self, hypothesis: Hypothesis) -> bool:
         """Whether a cause acts on a closed orbit; of the beam's, the energies do."""
@@ -111,3 +109,240 @@ class Response(Steady):
     def owner(self) -> NDArray[np.int64]:
         """Monitor of each reading."""
         return np.broadcast_to(np.arange(self.used.shape[1])[:, None], self.used.shape)
+
+
+AT_ONCE = 128
+"""Errors whose factors are in memory: 17 MB for 330 correctors and 246 monitors."""
+
+
+class ResponseMetric(SteadyMetric):
+    """Products at one point of a `Response`, which has no nuisances."""
+
+    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
+        """Put in products of errors of the ring and of monitors; return their indices."""
+        kinds = [find(name) for name, _ in hypotheses]
+        on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
+        if len(on_ring):
+            self._on_ring(hypotheses, on_ring, data, found)
+        of_monitors = np.flatnonzero([isinstance(kind, ReadingEffect) for kind in kinds])
+        if len(of_monitors):
+            self._of_monitors(hypotheses, of_monitors, data, found)
+        return np.concatenate([on_ring, of_monitors])
+
+    def pieces(self, hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[Indices, Array]]:
+        """Yield signatures at some monitors at a time, from the factors of all ring errors."""
+        kinds = [find(name) for name, _ in hypotheses]
+        on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
+        of_monitors = np.flatnonzero([isinstance(kind, ReadingEffect) for kind in kinds])
+        rest = np.setdiff1d(np.arange(len(kinds)), [*on_ring, *of_monitors])
+        whole = self.rows([hypotheses[int(i)] for i in rest])
+        here = _Here(self.point.view, self.problem.used, self.problem.sigma)
+        some = here.read_all([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
+        places = np.array([self.point.view.monitor(hypotheses[int(i)][1]) for i in of_monitors])
+        used, row = self.problem.used, self._numbered()
+        measured = np.flatnonzero(used.any(axis=(0, 2)))
+        count = max(MAX_NUMBERS // max(len(hypotheses) * used[:, 0].size, 1), 1)
+        for start in range(0, len(measured), count):
+            group = measured[start : start + count]
+            out = []
+            for at in group:
+                there = used[:, at]
+                own = np.zeros((len(hypotheses), np.count_nonzero(there)))
+                if some is not None:
+                    own[on_ring] = here.at(int(at), some)[:, there]
+                for i in of_monitors[places == at]:
+                    slope = self.point.view.monitor_slope(hypotheses[int(i)][0], int(at))
+                    own[i] = (slope / self.problem.sigma[at])[there]
+                own[rest] = whole[:, row[:, at][there]]
+                out.append(own)
+            rows = [row[:, at][used[:, at]] for at in group]
+            yield np.concatenate(rows), np.concatenate(out, axis=1)
+
+    def _numbered(self) -> Indices:
+        """Row of each used reading, of the readings' shape."""
+        used = self.problem.used
+        row = np.zeros(used.shape, dtype=np.intp)
+        row[used] = np.arange(np.count_nonzero(used))
+        return row
+
+    def _on_ring(
+        self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
+    ) -> None:
+        """Put in products of ring errors, from their factors."""
+        here = _Here(self.point.view, self.problem.used, self.problem.sigma)
+        sums = here.sums(data)
+        factors = here.slopes.factors([hypotheses[i] for i in which])
+        for start in range(0, len(which), AT_ONCE):
+            part = which[start : start + AT_ONCE]
+            some = here.read([next(factors) for _ in part])
+            found.put(part, here.squares(some), 0.0, some.products(sums))
+
+    def _of_monitors(
+        self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
+    ) -> None:
+        """Put in products of monitor errors, from each monitor's own rows."""
+        used, row = self.problem.used, self._numbered()
+        places = np.array([self.point.view.monitor(hypotheses[i][1]) for i in which])
+        for at in np.unique(places[places >= 0]):
+            own = which[places == at]
+            there = used[:, at]
+            slopes = [self.point.view.monitor_slope(hypotheses[i][0], at) for i in own]
+            rows = (np.stack(slopes) / self.problem.sigma[at])[:, there]
+            inner = rows @ data[:, row[:, at][there]].T
+            found.put(own, np.einsum("hr,hr->h", rows, rows), 0.0, inner)
+
+
+@dataclass(frozen=True)
+class _Stack:
+    """Stacked factors with `seen` in readings over noise, or sums over data that give products of
+    signatures with the data.
+
+    Attributes:
+        seen, before, behind: see `Factors`, [many, ...].
+    """
+
+    seen: Array
+    before: Array
+    behind: Array
+
+    def products(self, sums: "_Stack") -> Array:
+        """[error, data]."""
+        pairs = (
+            (self.seen, sums.seen), (self.before, sums.before), (self.behind, sums.behind),
+        )  # fmt: skip
+        return np.asarray(sum(a.reshape(len(a), -1) @ b.reshape(len(b), -1).T for a, b in pairs))
+
+
+@dataclass(frozen=True)
+class _Here:
+    """A response with its monitors' errors and its columns' steps, in units of the noise.
+
+    Attributes:
+        view: the response.
+        used: fitted readings, [column, monitor, 2].
+        sigma: noise, m, [monitor, 2].
+    """
+
+    view: Predicted
+    used: NDArray[np.bool_]
+    sigma: Array
+
+    @property
+    def slopes(self) -> ResponseSlopes:
+        """Derivatives of the beam's orbit for a unit of each column."""
+        return self.view.response_slopes
+
+    @cached_property
+    def scale(self) -> Array:
+        """Step of each column, [column]."""
+        return (1 + self.view.errors.calibration) * self.view.data.kicks
+
+    @cached_property
+    def first(self) -> NDArray[np.intp]:
+        """First measured monitor behind each column's kick, [column]."""
+        return np.searchsorted(self.view.data.at, self.slopes.first)
+
+    def seen(self, slopes: Array) -> Array:
+        """Readings over noise of orbit slopes at all monitors, [..., monitor, 2, n]."""
+        own = self.view.errors.monitors / self.sigma[:, :, None]
+        return np.asarray(own @ slopes[..., self.view.data.at, :, :])
+
+    @cached_property
+    def readings(self) -> Array:
+        """Readings over noise by launch, [monitor, 2, n]."""
+        return self.seen(self.slopes.readings)
+
+    def read(self, changes: Sequence[Factors]) -> _Stack:
+        """Return the factors as readings of the measured monitors."""
+        seen = self.seen(np.stack([change.seen for change in changes]))
+        before, behind = (
+            np.stack([getattr(change, name) for change in changes]) for name in ("before", "behind")
+        )
+        return _Stack(seen, before, behind)
+
+    def read_all(self, hypotheses: Sequence[Hypothesis]) -> _Stack:
+        """Return the factors of ring errors, formed some at a time."""
+        factors = self.slopes.factors(hypotheses)
+        parts = [
+            self.read([next(factors) for _ in hypotheses[start : start + AT_ONCE]])
+            for start in range(0, len(hypotheses), AT_ONCE)
+        ]
+        return _Stack(*(np.concatenate([getattr(part, name) for part in parts])
+                        for name in ("seen", "before", "behind")))  # fmt: skip
+
+    def at(self, monitor: int, some: _Stack) -> Array:
+        """Signatures at one monitor, [error, column, 2]."""
+        slopes, late = self.slopes, (monitor >= self.first)[:, None]
+        launch = slopes.start + late * slopes.launch_kick
+        orbit = some.seen[:, monitor] @ launch.T  # [error, 2, column]
+        change = np.where(late, some.before + some.behind, some.before)
+        moved = np.swapaxes(orbit, 1, 2) + change @ self.readings[monitor].T
+        return np.asarray(moved * self.scale[:, None])
+
+    def sums(self, data: Array) -> _Stack:
+        """Sums of data [data, row]."""
+        n, columns = self.readings.shape[2], len(self.scale)
+        G = self.readings.reshape(-1, n)
+        behind = np.repeat(np.arange(len(self.readings)) >= self.first[:, None], 2, axis=1)
+        seen = np.empty((len(data), len(G), n))
+        before, added = np.empty((2, len(data), columns, n))
+        whole = np.zeros(self.used.shape)
+        for d, row in enumerate(data):
+            whole[self.used] = row
+            D = whole.reshape(columns, -1) * self.scale[:, None]
+            late = np.where(behind, D, 0.0)
+            seen[d] = D.T @ self.slopes.start + late.T @ self.slopes.launch_kick
+            before[d], added[d] = D @ G, late @ G
+        return _Stack(seen, before, added)
+
+    def squares(self, some: _Stack) -> Array:
+        """Squares of signatures, [error]."""
+        slopes, n = self.slopes, self.readings.shape[2]
+        seen = some.seen.reshape(len(some.seen), -1, n)
+        return np.asarray(
+            _squares(
+                np.ascontiguousarray(np.moveaxis(seen, 2, 1)),
+                np.ascontiguousarray(self.readings.reshape(-1, n).T),
+                np.stack([slopes.start, slopes.start + slopes.launch_kick]),
+                np.stack([some.before, some.before + some.behind]),
+                2 * self.first,
+                self.used.reshape(len(self.scale), -1) * self.scale[:, None] ** 2,
+            )
+        )
+
+
+# `reassoc`: the sum may follow the vector unit's order.
+@jit_sums
+def _squares(seen, readings, start, change, first, weight):  # type: ignore[no-untyped-def]
+    """Weighted sum over all readings of (seen . start + readings . change)^2, [error].
+
+    Args:
+        seen: change of the readings of a launch by an error, [error, n, reading]; n is even.
+        readings: readings of a launch, [n, reading].
+        start: launches of the columns, for the readings before and behind each column's kick,
+            [2, column, n].
+        change: of these by an error, [2, error, column, n].
+        first: the first reading behind each column's kick, [column].
+        weight: of each reading, [column, reading].
+    """
+    errors, n, count = seen.shape
+    out = np.zeros(errors)
+    left = np.empty(count)
+    for h in range(errors):
+        total = 0.0
+        for c in range(len(first)):
+            for side in range(2):
+                low, high = (0, first[c]) if side == 0 else (first[c], count)
+                left[low:high] = 0.0
+                for i in range(0, n, 2):
+                    u, v = start[side, c, i], start[side, c, i + 1]
+                    a, b = change[side, h, c, i], change[side, h, c, i + 1]
+                    for r in range(low, high):
+                        left[r] += (
+                            u * seen[h, i, r] + v * seen[h, i + 1, r]
+                            + a * readings[i, r] + b * readings[i + 1, r]
+                        )  # fmt: skip
+            for r in range(count):
+                total += weight[c, r] * left[r] * left[r]
+        out[h] = total
+    return out

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
+from tmlattice.inference import chi2
 from tmlattice.lattice import Ring
 
 Array = NDArray[np.float64]
@@ -155,7 +156,7 @@ class SectionFits:
         there = self.freedom > 0
         if not there.any():
             return float("nan")
-        usual = (1 - 2 / (9 * self.freedom[there])) ** 3  # median of chi-square over its freedom
+        usual = chi2.median_per_freedom(self.freedom[there])
         return float(np.median(self.misfit[there] / usual))
 
     def share(self, passes: Passes) -> float:

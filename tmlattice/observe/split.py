@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError
 from tmlattice.observe.response_data import ResponseData
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 INNER = 0.2

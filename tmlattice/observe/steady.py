@@ -35,19 +35,12 @@ class Steady(Problem):
 
     Attributes:
         used: fitted readings, of the kind's own shape.
+        values, sigma: measured readings, and their noise, of compatible shapes.
     """
 
     used: Flags = field(repr=False)
-
-    @property
-    @abstractmethod
-    def values(self) -> Array:
-        """Measured readings, of the kind's shape."""
-
-    @property
-    @abstractmethod
-    def sigma(self) -> Array:
-        """Noise of each reading, of a compatible shape."""
+    values: Array = field(repr=False)
+    sigma: Array = field(repr=False)
 
     @abstractmethod
     def view(self, causes: Sequence[Cause]) -> Any:
@@ -71,6 +64,11 @@ class Steady(Problem):
         return np.zeros((0, *self.used.shape))
 
     # --- the model ------------------------------------------------------------------------------
+    @property
+    def first(self) -> Array:
+        """First guess of the nuisances; here none."""
+        return NOTHING
+
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return the model's point, lost without a stored beam."""
         count = int(self.used.sum())

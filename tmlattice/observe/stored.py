@@ -140,7 +140,6 @@ class Stored(Steady):
     Attributes:
         ring: the design.
         states: settings and relative RF frequency of each.
-        data, errors: readings and their noise, of the kind's shape.
         read_by: the monitor of each reading, -1 for none, of the kind's shape.
         cache: of models; measurements of the same ring may share one.
         counts: whether readings are turn by turn.
@@ -150,8 +149,6 @@ class Stored(Steady):
 
     ring: Ring = field(repr=False)
     states: tuple[tuple[Settings, float], ...]
-    data: Array = field(repr=False)
-    errors: Array = field(repr=False)
     read_by: NDArray[np.int64] = field(repr=False)
     cache: ModelCache = field(default_factory=ModelCache, repr=False, compare=False)
 
@@ -167,16 +164,6 @@ class Stored(Steady):
     def one_turn_later(self, states: Sequence[Moved]) -> list[Moved]:
         """Return their change, to first order, by one turn later at every monitor."""
         raise NotImplementedError("this kind of measurement has no turns")
-
-    @property
-    def values(self) -> Array:
-        """Measured readings."""
-        return self.data
-
-    @property
-    def sigma(self) -> Array:
-        """Noise of each reading."""
-        return self.errors
 
     @property
     def monitors(self) -> Sequence[str]:

@@ -11,7 +11,6 @@ from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import Settings, apply
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TuneReading
-from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.stored import Stored, rf_of, stacked
 
 Array = NDArray[np.float64]
@@ -36,11 +35,6 @@ class TuneReadings(Stored):
     """
 
     energies: float
-
-    @property
-    def first(self) -> Array:
-        """No nuisances."""
-        return NOTHING
 
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the tunes, and the chromaticities from the two outer states of each shot."""
@@ -74,8 +68,8 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     return TuneReadings(
         ring=ring,
         states=tuple((one, rf_of(one) + h) for one in settings for h in (0.0, step, -step)),
-        data=np.where(there, data, 0.0),
-        errors=errors,
+        values=np.where(there, data, 0.0),
+        sigma=errors,
         read_by=np.full(data.shape, -1),
         used=there,
         places=places,

@@ -5,21 +5,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.families.energy import EnergyOffset, EnergySpread
 from tmlattice.diagnosis.families.fields import (
     CorrectorPosition,
     EdgeFocusing,
     QuadrupoleGradient,
     SkewGradient,
     VerticalFocusing,
+    straights,
 )
 from tmlattice.diagnosis.families.steps import (
     CorrectorCalibration,
     CorrectorRoll,
+    EnergyOffset,
+    EnergySpread,
     MonitorGain,
     MonitorRoll,
 )
-from tmlattice.diagnosis.families.ways import straights
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.effects import Cause

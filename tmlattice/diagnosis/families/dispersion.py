@@ -3,23 +3,31 @@
 Dispersion by kicks would bias the gradients, because the RF's orbit is fitted, too. Single kicks
 are degenerate, so the parameters are amplitudes of patterns of independent kicks, as many as the
 BPMs separate. They are linearised in the design's optics.
+
+A family of closed-orbit patterns of small kicks, which act in sextupoles. A response is hardly
+sensitive to a kick itself, but off axis sextupoles focus and couple. With usual alignment that
+exceeds the quadrupoles' own errors. Single kicks are degenerate, so the numbers are amplitudes of
+patterns: the combinations of bends' kicks that focus most.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import (
     dispersion_behind,
     dispersion_of_kicks,
     energy_of_way,
     kicking,
+    orbits_of_kicks,
 )
 from tmlattice.diagnosis.families.family import Family, StatedCause
-from tmlattice.inference.priors import Group
+from tmlattice.effects import Cause, find
+from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
@@ -60,14 +68,26 @@ def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
     return Patterns((shapes[:, kept] * size[kept]).T, own, kicks[kept])
 
 
-class _Kicks(Family):
-    per, trust = "ring", 1e-3
-    plane: ClassVar[int]
+class _PatternFamily(Family):
+    """Amplitudes of patterns of kicks, which the data do not separate into single ones."""
+
+    per = "ring"
 
     @property
     def largest(self) -> float:
         """Zero: patterns have no members that could be faulty."""
         return 0.0
+
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
+        """No causes: single kicks are degenerate."""
+        return []
+
+
+class _Kicks(_PatternFamily):
+    trust, rms = 1e-3, USUAL
+    plane: ClassVar[int]
 
     def patterns(self, data: ResponseData) -> Patterns:
         """The kicks in the design."""
@@ -84,10 +104,6 @@ class _Kicks(Family):
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
         return len(self.patterns(data).rf)
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of independent kicks."""
-        return [Group(self.name, np.eye(self.size(data)), USUAL)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """Responses of the RF's orbit, and of the correctors by the energy, see
@@ -120,12 +136,6 @@ class _Kicks(Family):
             dispersion=errors.dispersion + more,
             at_correctors=errors.at_correctors + values @ patterns.at_correctors,
         )
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """No causes: single kicks are degenerate."""
-        return []
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """No effect of the catalogue."""
@@ -222,3 +232,90 @@ def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, floa
     )
     own = correctors[np.arange(len(correctors)), data.plane[:-1]]
     return replace(none, dispersion=monitors * data.energy_of_rf, at_correctors=own)
+
+
+LEAST_FOCUSING = 0.02
+"""Share of the strongest pattern below which one is omitted; quadrupole gradients absorb it."""
+TOGETHER = 32
+"""Number of bends whose derivatives are computed at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Orbit(_PatternFamily):
+    """Patterns of kicks.
+
+    Attributes:
+        places: bends.
+        patterns: usual kicks of each, as the effect's amounts, [pattern, bend].
+    """
+
+    places: tuple[str, ...]
+    patterns: Array
+
+    trust, rms = 1.0, 1.0  # in units of usual kicks
+    effect: ClassVar[str]
+
+    def size(self, data: ResponseData) -> int:
+        """Number of patterns."""
+        return len(self.patterns)
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """Derivatives by the kicks of all bends."""
+        out = np.zeros((len(self.patterns), at.data.orbits[..., 0].size))
+        for start in range(0, len(self.places), TOGETHER):
+            places = self.places[start : start + TOGETHER]
+            pairs = [(self.effect, place) for place in places]
+            slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, pairs)]
+            out += self.patterns[:, start : start + TOGETHER] @ np.stack(slopes)
+        return np.asarray(out.reshape(-1, *at.data.shape) * at.gain(self.block))
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """The errors with the kicks of the bends."""
+        amounts = (values @ self.patterns).tolist()
+        causes = [Cause(self.effect, *one) for one in zip(self.places, amounts, strict=True)]
+        return replace(errors, ring=(*errors.ring, *(c for c in causes if c.amount)))
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Kicks of all bends."""
+        hypotheses: list[Hypothesis] = [(self.effect, place) for place in self.places]
+        return [dict(zip(hypotheses, pattern, strict=True)) for pattern in self.patterns.tolist()]
+
+
+class HorizontalOrbit(_Orbit):
+    """The horizontal orbit by field errors of bends, which focuses in sextupoles."""
+
+    name, effect, effects = "horizontal orbit", "dipole_field", ("dipole_field",)
+    block, variable = 0, "horizontal orbit"
+
+
+class VerticalOrbit(_Orbit):
+    """The vertical orbit by rolls of bends, which couples in sextupoles."""
+
+    name, effect, effects = "vertical orbit", "dipole_roll", ("dipole_roll",)
+    block, variable = 1, "vertical orbit"
+
+
+def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
+    """Return a family for each plane; none without sextupoles or bends.
+
+    Args:
+        ring: the design.
+        model: of the design.
+    """
+    magnets = ring.magnets
+    bends = [i for i, e in enumerate(magnets) if e.kind == "bend" and e.angle]
+    strong = [i for i, e in enumerate(magnets) if e.kind == "sextupole" and e.k2]
+    if not bends or not strong:
+        return []
+    found: list[Family] = []
+    kinds: tuple[Any, ...] = (HorizontalOrbit, VerticalOrbit)
+    for plane, kind in enumerate(kinds):
+        kicks = np.array([abs(magnets[i].angle) for i in bends]) * find(kind.effect).background
+        exits = np.array(strong) + 1
+        moved = orbits_of_kicks(model, bends, exits, model.tangents[exits][:, 2 * plane], plane)
+        moved = moved * kicks
+        focused = moved * np.array([[magnets[i].k2 * magnets[i].length] for i in strong])
+        _, size, patterns = np.linalg.svd(focused, full_matrices=False)
+        kept = patterns[size > LEAST_FOCUSING * size[0]] * find(kind.effect).background
+        found.append(kind(tuple(magnets[i].name for i in bends), kept))
+    return found

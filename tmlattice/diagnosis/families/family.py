@@ -31,6 +31,7 @@ class Family(ABC):
         trust: step bound of a number in one round, rms.
         gross: limit above which a column's number starts from its own estimate; otherwise the
             column would have no weight until the rounds reach that value.
+        rms, tails, most: prior of a single number: rms, degrees of freedom, largest rms.
     """
 
     name: ClassVar[str]
@@ -40,6 +41,9 @@ class Family(ABC):
     variable: ClassVar[str]
     trust: ClassVar[float]
     gross: ClassVar[float] = np.inf
+    rms: ClassVar[float]
+    tails: ClassVar[float] = np.inf
+    most: ClassVar[float] = np.inf
 
     @property
     def title(self) -> str:
@@ -55,9 +59,9 @@ class Family(ABC):
     def size(self, data: ResponseData) -> int:
         """The number of parameters of its variable."""
 
-    @abstractmethod
     def groups(self, data: ResponseData) -> list[Group]:
-        """Its priors, over the variable's numbers."""
+        """Its priors, over the variable's numbers; here that of single numbers."""
+        return [Group(self.name, np.eye(self.size(data)), self.rms, self.tails, most=self.most)]
 
     @abstractmethod
     def rows(self, at: Predicted, values: Array) -> Array:

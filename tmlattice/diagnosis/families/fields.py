@@ -6,13 +6,12 @@ All pieces of a magnet share one number.
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
-from tmlattice.diagnosis.families.ways import between, straights
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
@@ -93,15 +92,11 @@ class QuadrupoleGradient(_Magnets):
     name = effect = "quadrupole_gradient"
     effects: ClassVar[tuple[str, ...]] = ("quadrupole_gradient",)
     block, variable, trust = 0, "gradient", 0.01
+    rms, tails, most = 3e-3, TAILS, LARGEST_GRADIENT
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """Quadrupoles that have a gradient."""
         return [{e.name: 1.0 for e in own} for own in magnets(data.ring, ("quadrupole",), True)]
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of single quadrupoles."""
-        eye = np.eye(self.size(data))
-        return [Group(self.name, eye, 3e-3, TAILS, most=LARGEST_GRADIENT)]
 
     def units(self, values: Array) -> Array:
         """Factors from changes relative to the estimated gradients to changes of the design's."""
@@ -143,6 +138,7 @@ class BendGradient(_Magnets):
     name = effect = "bend_gradient"
     effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
     block, variable, trust = 0, "bend_gradient", 0.01
+    rms = 3e-3
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The bends of each type: single ones are degenerate with neighbouring quadrupoles."""
@@ -150,10 +146,6 @@ class BendGradient(_Magnets):
         for own in magnets(data.ring, ("bend",), powered=True):
             types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
         return list(types.values())
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of types."""
-        return [Group(self.name, np.eye(self.size(data)), 3e-3)]
 
 
 class SkewGradient(_Thin):
@@ -182,13 +174,10 @@ class OtherGradient(_Thin):
     name = effect = "gradient_absolute"
     effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
     block, variable, trust = 0, "other", 3e-3
+    rms, tails = 1e-4, TAILS
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("sextupole", "wiggler"))
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of sextupoles."""
-        return [Group(self.name, np.eye(self.size(data)), 1e-4, TAILS)]
 
 
 class VerticalFocusing(_Thin):
@@ -197,6 +186,7 @@ class VerticalFocusing(_Thin):
     name = effect = "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
     block, variable, trust = 0, "device", 3e-3
+    rms, tails = 1e-4, 1.0
 
     @property
     def title(self) -> str:
@@ -209,10 +199,6 @@ class VerticalFocusing(_Thin):
     def _devices(self, ring: Ring, ways: Sequence[Element]) -> list[tuple[Element, ...]]:
         devices = [*magnets(ring, ("wiggler",)), *((e,) for e in ways)]
         return sorted(devices, key=lambda own: own[0].s)
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of each device."""
-        return [Group(self.name, np.eye(self.size(data)), 1e-4, 1.0)]
 
     def lowest(self, data: ResponseData) -> Array | float:
         """Zero in straights, because a device focuses; a wiggler of the design may focus less."""
@@ -281,6 +267,7 @@ class CorrectorPosition(_Magnets):
     name = effect = "corrector_position"
     effects: ClassVar[tuple[str, ...]] = ("corrector_position",)
     block, variable, trust = 0, "position", 0.02
+    rms, most = 5e-3, FURTHEST
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The correctors of each number."""
@@ -290,10 +277,6 @@ class CorrectorPosition(_Magnets):
         for name, own in zip(measured.correctors, where, strict=True):
             alike.setdefault(own, {})[name] = 1.0
         return [correctors for correctors in alike.values() if len(correctors) > 1]
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of each number."""
-        return [Group(self.name, np.eye(self.size(data)), 5e-3, most=FURTHEST)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The orbit jump in the corrector's own column."""
@@ -307,3 +290,96 @@ class CorrectorPosition(_Magnets):
             own = [column[name] for name in correctors]
             row[own] = jump[own]
         return out
+
+
+STRAIGHT = 1.0
+"""Length of a straight, m, in which an insertion device is possible."""
+
+
+def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> list[str]:
+    """Return the plane of each corrector, with the families of the magnets before and behind it.
+
+    Args:
+        ring: with the magnets.
+        correctors: names.
+        planes: "x" or "y", of each.
+    """
+    others = [e for e in ring.magnets if e.kind not in ("hcorrector", "vcorrector")]
+    places = np.array([e.s for e in others])
+    behind = np.searchsorted(places, [ring[name].s for name in correctors]) % len(others)
+    return [
+        f"{plane} {stem(others[i - 1].name)} {stem(others[i].name)}"
+        for plane, i in zip(planes, behind, strict=True)
+    ]
+
+
+def straights(ring: Ring, beside: bool = False) -> list[Element]:
+    """Return the marker nearest to the middle of each long straight, else its longest drift.
+
+    A straight next to a wiggler of alternating bends has none, because its focusing is degenerate
+    with the wiggler's own.
+
+    Args:
+        ring: the ring.
+        `beside`: whether straights next to such a wiggler are included.
+    """
+    found, ways = list[Element](), list[Element]()
+    within, bends = list[_Placed](), list[float]()
+    begin = np.inf  # the first straight ends at the first magnet of the turn
+    for element, s in _around(ring):
+        if not _parts(element):
+            within.append(_Placed(element, s))
+            continue
+        end = s - element.length / 2
+        if end - begin > STRAIGHT:
+            ways += _middle(within, (begin + end) / 2)
+        within, begin = [], s + element.length / 2
+        if element.kind == "bend":
+            bends.append(element.angle)
+            continue
+        found += ways if beside else _outside(ways, bends)
+        ways, bends = [], []
+    return found + (ways if beside else _outside(ways, bends))
+
+
+class _Placed(NamedTuple):
+    element: Element
+    s: float  # m, one turn further behind the lattice's first element
+
+
+def _parts(element: Element) -> bool:
+    """Whether an element separates two straights."""
+    return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
+
+
+def _around(ring: Ring) -> list[_Placed]:
+    """One turn from a magnet to itself, both included; it starts at no bend if possible, so that a
+    wiggler of alternating bends is not split."""
+    own = ring.elements
+    magnets = sorted(
+        (i for i, e in enumerate(own) if _parts(e)), key=lambda i: (own[i].kind == "bend", i)
+    )
+    if not magnets:
+        return []
+    first = magnets[0]
+    return [
+        *(_Placed(e, e.s) for e in own[first:]),
+        *(_Placed(e, e.s + ring.length) for e in own[: first + 1]),
+    ]
+
+
+def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:
+    """Straights among these bends, without other magnets, except those of a wiggler."""
+    return [] if bends and min(bends) < 0 < max(bends) else list(ways)
+
+
+def _middle(within: Sequence[_Placed], middle: float) -> list[Element]:
+    markers = [own for own in within if own.element.kind == "marker"]
+    drifts = [
+        own.element
+        for own in within
+        if own.element.kind == "drift" and own.element.length >= STRAIGHT / 2
+    ]
+    if markers:
+        return [min(markers, key=lambda own: abs(own.s - middle)).element]
+    return [max(drifts, key=lambda e: e.length)] if drifts else []

@@ -8,13 +8,13 @@ Families with the same numbers (single gradients, and gradients of whole familie
 `variable`: their priors add up.
 """
 
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
-from tmlattice.diagnosis.families.energy import EnergyOffset, EnergySpread
 from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.diagnosis.families.fields import (
     BendGradient,
@@ -27,26 +27,137 @@ from tmlattice.diagnosis.families.fields import (
     SkewGradient,
     VerticalFocusing,
 )
-from tmlattice.effects import Cause, Monitors
+from tmlattice.effects import Cause, Monitors, expected_spread, find
 from tmlattice.inference.priors import Group
 from tmlattice.lattice.alike import families
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.observe.orbit_response import DELTA, Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
 Array = NDArray[np.float64]
 
 
+USUAL_OFFSET = 1e-3
+"""Prior rms: an orbit of a millimetre where the dispersion is a metre."""
+WIDENED, UNKNOWN_SPREAD = 2.0, 1.5e-3
+"""Largest ratio of the energy spread to that of radiation (instabilities, wigglers without a field
+in the lattice), as rms; and the usual spread without radiation."""
+
+
+class _OfBeam(Family):
+    """One number of the beam that acts on all columns."""
+
+    block, per = 0, "ring"
+
+    def size(self, data: ResponseData) -> int:
+        return 1
+
+    @abstractmethod
+    def change(self, at: Predicted) -> Array:
+        """Orbit changes of the beam at the stated kicks, m, [column, monitor, 2]."""
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        scale = (1 + at.errors.calibration)[:, None, None]
+        return np.asarray((at.gain(0) * at.data.pick(self.change(at) * scale))[None])
+
+
+class EnergyOffset(_OfBeam):
+    """The beam's energy relative to that of the magnets' settings, by an RF frequency that does not
+    match the circumference."""
+
+    name, effects = "energy_offset", ("energy_offset",)
+    variable, trust = "energy", 1e-3
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """The usual prior."""
+        return [Group(self.name, np.eye(1), USUAL_OFFSET, fixed=True)]
+
+    def change(self, at: Predicted) -> Array:
+        """The first derivative by the energy."""
+        return at.chromatic
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """The errors with this energy."""
+        return replace(errors, energy=float(values[0]))
+
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
+        """The energy offset as a cause."""
+        return [(Cause(self.name, None, float(values[0])), float(sigma[0]))]
+
+    def doubt(self, values: Array, data: ResponseData) -> str | None:
+        """The message that so large an offset is implausible; None where it is plausible."""
+        offset, most = float(values[0]), find(self.name).largest
+        if abs(offset) <= most:
+            return None
+        return (
+            f"the fitted energy offset of {100 * offset:.2g} % exceeds the plausible "
+            f"{100 * most:.2g} %: the family is rejected"
+        )
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """The effect's own unit."""
+        return [{(self.name, None): 1.0}]
+
+
+class EnergySpread(_OfBeam):
+    """The mean square energy deviation of the beam, in units of `DELTA` squared."""
+
+    name, effects = "energy_spread", ("energy_spread",)
+    variable, trust = "spread", 10.0
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """The largest plausible spread as prior."""
+        return [Group(self.name, np.eye(1), (self._most(data) / DELTA) ** 2, fixed=True)]
+
+    def _most(self, data: ResponseData) -> float:
+        return WIDENED * (expected_spread(data.ring) or UNKNOWN_SPREAD)
+
+    def change(self, at: Predicted) -> Array:
+        """The second derivative by the energy."""
+        return at.curved
+
+    def lowest(self, data: ResponseData) -> Array | float:
+        """Zero: a square is not negative."""
+        return 0.0
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """The errors with this spread."""
+        return replace(errors, spread=float(values[0]))
+
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
+        """The relative rms as a cause; none where it is zero."""
+        if not values[0] > 0:
+            return []
+        amount = DELTA * float(np.sqrt(values[0]))
+        return [(Cause("energy_spread", None, amount), DELTA**2 * float(sigma[0]) / (2 * amount))]
+
+    def doubt(self, values: Array, data: ResponseData) -> str | None:
+        """The message that so large a spread is implausible; None where it is plausible."""
+        rms, most = DELTA * float(np.sqrt(values[0])), self._most(data)
+        if not rms > most:
+            return None
+        usual = "radiation makes" if expected_spread(data.ring) else "a beam has usually"
+        return (
+            f"the fitted energy spread is {100 * rms:.2g} %, where {usual} "
+            f"{100 * most / WIDENED:.2g} %: the family is rejected"
+        )
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """The square of the amount."""
+        return [{("energy_spread", None): DELTA**2}]
+
+
 class _Monitors(Family):
-    per = "monitor"
+    per, rms, tails = "monitor", 0.01, TAILS
 
     def size(self, data: ResponseData) -> int:
         return 2 * len(data.at)
 
     def rows(self, at: Predicted, values: Array) -> Array:
         return at.data.pick(at.kicked)
-
-    def _own(self, data: ResponseData) -> Group:
-        return Group(self.name, np.eye(self.size(data)), 0.01, TAILS)
 
 
 class MonitorGain(_Monitors):
@@ -59,7 +170,7 @@ class MonitorGain(_Monitors):
         """Priors of single BPMs and of all BPMs of a plane."""
         alike = np.zeros((self.size(data), 2))
         alike[0::2, 0] = alike[1::2, 1] = 1
-        return [self._own(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
+        return [*super().groups(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The diagonals of the BPMs' matrices."""
@@ -92,10 +203,6 @@ class MonitorRoll(_Monitors):
 
     name, effects = "monitor_roll", ("monitor_roll", "monitor_coupling")
     block, variable, trust = 1, "mixing", 0.02
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """One number per BPM and plane."""
-        return [self._own(data)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The off-diagonals of the BPMs' matrices."""
@@ -131,7 +238,7 @@ LEAST_KICK = 1e-3
 
 
 class _Columns(Family):
-    per = "column"
+    per, tails = "column", TAILS
 
     def size(self, data: ResponseData) -> int:
         return len(data.kicks)
@@ -158,15 +265,12 @@ class CorrectorCalibration(_Columns):
     """Calibrations of correctors, with priors of single ones and of families."""
 
     name, effects = "corrector_calibration", ("corrector_calibration",)
-    block, variable, trust, gross = 0, "calibration", 0.01, 0.3
+    block, variable, trust, gross, rms = 0, "calibration", 0.01, 0.3, 0.02
 
     def groups(self, data: ResponseData) -> list[Group]:
         """The priors of single correctors and of families."""
         kinds = families([*data.measured.correctors, "\0"])[1]
-        return [
-            Group(self.name, np.eye(self.size(data)), 0.02, TAILS),
-            Group(f"{self.name} of families", kinds, 0.05),
-        ]
+        return [*super().groups(data), Group(f"{self.name} of families", kinds, 0.05)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The column itself; 0 for the RF."""
@@ -189,11 +293,7 @@ class CorrectorRoll(_Columns):
     """Rolls of correctors."""
 
     name, effects = "corrector_roll", ("corrector_roll",)
-    block, variable, trust, gross = 1, "roll", 0.02, 0.1
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """One number per corrector."""
-        return [Group(self.name, np.eye(self.size(data)), 0.01, TAILS)]
+    block, variable, trust, gross, rms = 1, "roll", 0.02, 0.1, 0.01
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The kick in the other plane."""

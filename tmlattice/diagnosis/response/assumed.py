@@ -6,8 +6,8 @@
 import numpy as np
 
 from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.noise import OVERSTATED, stated_and_estimated
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.response_noise import OVERSTATED, stated_and_estimated
 
 UNDERSTATED = 2.0
 """Ratio of measured to stated noise above which a message reports it."""

@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
-from tmlattice.diagnosis.families.energy import EnergyOffset
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
-from tmlattice.diagnosis.families.steps import CHANGES, STEPS, Trial
+from tmlattice.diagnosis.families.steps import CHANGES, STEPS, EnergyOffset, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
     least_certain,

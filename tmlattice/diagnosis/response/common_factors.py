@@ -10,21 +10,27 @@ scatter of single magnets is in every error. Outlier magnets are reported, with 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.diagnosis.records import named
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes
 from tmlattice.diagnosis.support import share_from_data
-from tmlattice.inference.common_factors import MIN_CHI2, FactorModel
+from tmlattice.inference.common_factors import (
+    MIN_CHI2,
+    FactorModel,
+    LikelySet,
+    likely_sets,
+    over_sets,
+)
 from tmlattice.inference.normal import solve
-from tmlattice.inference.sets import LikelySet, likely_sets, over_sets
 from tmlattice.lattice.supplies import magnets
 
 Array = NDArray[np.float64]
@@ -110,7 +116,7 @@ class Instead:
     """
 
     probability: float
-    amounts: tuple[tuple[str, float, float], ...]
+    amounts: tuple[tuple[str, float, float], ...] = field(metadata=named("common_factors"))
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
@@ -160,18 +166,7 @@ class CommonFactors:
     outliers: tuple[Outlier, ...]
     share: float
     scatter: float
-    between: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {
-            "common_factors": [own.as_json() for own in self.common_factors],
-            "instead": [own.as_json() for own in self.instead],
-            "outliers": [own.as_json() for own in self.outliers],
-            "share": self.share,
-            "scatter": self.scatter,
-            "between_families": self.between,
-        }
+    between: float = field(metadata=named("between_families"))
 
 
 def explain_gradients(state: State) -> CommonFactors | None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from tmlattice.diagnosis.families.orbit_modes import HorizontalOrbit, VerticalOrbit
+from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.linear import Linear, linear

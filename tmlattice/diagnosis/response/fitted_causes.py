@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from tmlattice.diagnosis.correlations import Correlation, correlations_of
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import Stated, stated
-from tmlattice.diagnosis.support import Support, share_from_data
+from tmlattice.diagnosis.support import Correlation, Support, correlations_of, share_from_data
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.problem import Hypothesis
 

@@ -11,8 +11,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
-from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.families.ways import between
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient, between
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
 from tmlattice.lattice.alike import families

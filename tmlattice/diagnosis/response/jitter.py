@@ -26,7 +26,7 @@ from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
 from tmlattice.diagnosis.response.weights import weight
-from tmlattice.inference.common import amounts, common, times_precision
+from tmlattice.inference.normal import amounts, common, times_precision
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.response.state import Kept, State
 from tmlattice.diagnosis.response.weights import taken, weighed, weight
-from tmlattice.inference.normal import Normal, normal_equations
+from tmlattice.inference.normal import Normal, Slopes, normal_equations, whole
 from tmlattice.inference.priors import Group
-from tmlattice.inference.slopes import Slopes, whole
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -65,8 +65,8 @@ from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.noise import overstated
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_noise import overstated
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes

@@ -21,7 +21,7 @@ from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.distributed import MarginalProblem
 from tmlattice.inference.newton import Fit, Outcome
 from tmlattice.inference.problem import Hypothesis
-from tmlattice.inference.root import directions_of
+from tmlattice.inference.whitening import directions_of
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

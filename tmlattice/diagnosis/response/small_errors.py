@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from tmlattice.diagnosis.families.dispersion import orbit_families
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient, SkewGradient
-from tmlattice.diagnosis.families.orbit_modes import orbit_families
 from tmlattice.diagnosis.families.steps import (
     CorrectorCalibration,
     CorrectorRoll,

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import Apart, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
-from tmlattice.inference import scale_uncertainty
-from tmlattice.inference.clusters import LinearFit, Rows, cluster_robust_errors
-from tmlattice.inference.heavy_tails import moments
+from tmlattice.inference import errors
+from tmlattice.inference.errors import MAX_MEMBERS, LinearFit, Rows, cluster_robust_errors, moments
 from tmlattice.inference.normal import Posterior
-from tmlattice.inference.scale_uncertainty import MAX_MEMBERS
 
 Array = NDArray[np.float64]
 
@@ -45,7 +43,7 @@ def unwidened(posterior: Posterior) -> Stated:
 
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Stated:
     """Return posterior errors, widened by common-mode noise of the readings (`of_readings`), by
-    unknown prior scales (`of_sizes`), and by possible single faults (`heavy_tails`).
+    unknown prior scales (`of_sizes`), and by possible single faults (`errors.moments`).
 
     Args:
         state: of the fit.
@@ -80,7 +78,7 @@ def of_sizes(state: State, block: int, there: Linear) -> Array:
     ]
     whole = linear(allow(state, tried), block) if tried else there
     gone = [group.name for family in tried for group in family.groups(state.data)]
-    more = scale_uncertainty.scale_covariance(whole.normal, whole.groups, whole.start, gone)
+    more = errors.scale_covariance(whole.normal, whole.groups, whole.start, gone)
     return more[: len(there.start)]  # without the rejected families
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
-from tmlattice.inference.common import amounts, common, times_precision
+from tmlattice.inference.normal import amounts, common, times_precision
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

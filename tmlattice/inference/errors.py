@@ -1,0 +1,481 @@
+"""Errors of a fit, widened for what its posterior leaves out.
+
+Cluster-robust errors of a fit whose readings share model discrepancy, by column or by monitor. A
+posterior takes readings as independent. Model discrepancy of a corrector's column is often a wave
+in all of its readings, and that at a monitor is the same in all columns. Each cluster of readings
+(one column, or one monitor) is therefore taken out of the normal equations and compared with the
+prediction of all others (a jackknife, exact for linear least squares: Bell and McCaffrey, Survey
+Methodology 28 (2002) 169). Errors grow by the ratio of the observed to the expected mismatch.
+
+Posterior moments when any member of a group may be the faulty one. A Gaussian prior at the scale of
+sound members excludes a faulty member, whatever the data. Here each member's prior is a mixture of
+Gaussians (`Group.mixture`), and the posterior's moments are found by expectation propagation
+(Minka, UAI 2001; for sparse linear models Seeger, JMLR 9 (2008) 759): each prior is replaced by a
+Gaussian whose product with the rest has the mean and variance of the exact product. If the data
+cannot distinguish two members, both have large errors.
+
+Uncertainty of numbers that comes from the uncertain scales of their priors. A family's prior scale
+follows the evidence. With few members, or little data on them, the evidence is flat: a scale near
+zero, which fixes the members, is as probable as one twenty times larger. The same holds for a
+family that was rejected. Errors at one scale alone are then far too small. Scales are therefore
+sampled from their posterior with the members integrated out, and the law of total variance gives
+the additional variance of each number.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from copy import copy
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from tmlattice.inference.normal import ROUNDING, Normal, Slopes, shared_by, times_precision
+from tmlattice.inference.priors import Group
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MAX_LEVERAGE = 0.75
+"""Leverage of a cluster above which the other readings know too little to test it. The mean
+mismatch of the others is then used in its place."""
+
+MAX_CLUSTERS = 64
+"""Columns, and monitors, that are taken out at most, drawn at random."""
+
+MIN_SHARE = 1e-11
+"""Smallest share of the information that the other readings have of a quantity."""
+
+
+class Rows(NamedTuple):
+    """Derivatives of readings, as in `normal.normal_equations`.
+
+    Attributes:
+        plane: in which each column is read, [column].
+        by_monitor, by_column: [column, monitor].
+        by_ring: [error, column, monitor].
+    """
+
+    plane: Indices
+    by_monitor: Array
+    by_column: Array
+    by_ring: Array
+
+    def times(self, column: Indices, monitor: Indices, other: Array) -> Array:
+        """Return rows of some readings times [parameter, any], [reading, any]."""
+        columns, monitors = self.by_monitor.shape
+        ring = 2 * monitors + columns
+        out = self.by_ring[:, column, monitor].T @ other[ring:]
+        gain, own = self.by_monitor[column, monitor], self.by_column[column, monitor]
+        out += gain[:, None] * other[2 * monitor + self.plane[column]]
+        out += own[:, None] * other[2 * monitors + column]
+        return np.asarray(out)
+
+
+class LinearFit(NamedTuple):
+    """A linear fit, and quantities that are linear in its parameters.
+
+    Attributes:
+        matrix: of the normal equations, without priors, [parameter, parameter].
+        covariance: of the parameters, [parameter, parameter].
+        along: covariance of parameters and quantities, [parameter, quantity].
+        variance: of the quantities, [quantity].
+    """
+
+    matrix: Array
+    covariance: Array
+    along: Array
+    variance: Array
+
+    @classmethod
+    def of(cls, matrix: Array, covariance: Array) -> "LinearFit":
+        """Return the fit with its parameters as the quantities."""
+        return cls(matrix, covariance, covariance, np.diag(covariance))
+
+
+def cluster_robust_errors(
+    rows: Rows, weight: Array, residual: Array, found: LinearFit, taken: Array | None = None
+) -> Array:
+    """Standard errors of a fit's quantities, larger where clusters of readings disagree.
+
+    For independent readings they are the posterior's errors, up to a few per cent by chance.
+
+    Args:
+        rows: derivatives of all readings.
+        weight: 1 / variance, 0 where missing, [column, monitor].
+        residual: of the fit, [column, monitor].
+        found: the fit.
+        taken: L of `inference.common.common`, the readings' common modes, [column, monitor,
+            pattern]; None: no common modes.
+
+    Returns:
+        Standard deviations, [quantity].
+    """
+    # the readings' part of the variance; the rest is the prior's
+    noise_variance = (found.along * (found.matrix @ found.along)).sum(axis=0)
+    more = np.zeros_like(noise_variance)
+    for clusters in (_of_columns, _of_monitors):
+        shares, mismatch = _mismatches(clusters(rows, weight, residual, taken), found)
+        size = np.maximum(shares.sum(axis=0), 1e-300)
+        more += np.maximum((shares * mismatch).sum(axis=0) / size - 1, 0)
+    return np.asarray(np.sqrt(np.maximum(found.variance + noise_variance * more, 0)))
+
+
+def _drawn(weight: Array, axis: int) -> Indices:
+    """Clusters to take out, of those that have readings along an axis."""
+    found = np.flatnonzero(weight.sum(axis))
+    if len(found) <= MAX_CLUSTERS:
+        return found
+    return np.sort(np.random.default_rng(0).permutation(found)[:MAX_CLUSTERS])
+
+
+class _Cluster(NamedTuple):
+    """Readings that are taken out together, white given all others.
+
+    Attributes:
+        rows, column, monitor: of the readings.
+        root: whitens them, [reading] or [reading, reading].
+        others: prediction from the other readings of their columns, [reading, parameter]; or None.
+        left: whitened residual, [reading].
+    """
+
+    rows: Rows
+    column: Indices
+    monitor: Indices
+    root: Array
+    others: Array | None
+    left: Array
+
+    def times(self, other: Array) -> Array:
+        """White rows times [parameter, any], [reading, any]."""
+        own = self.rows.times(self.column, self.monitor, other)
+        white = self.root[:, None] * own if self.root.ndim == 1 else self.root @ own
+        return np.asarray(white if self.others is None else white - self.others @ other)
+
+
+def _of_columns(
+    rows: Rows, weight: Array, residual: Array, taken: Array | None
+) -> Iterator[_Cluster]:
+    """Clusters of one column each; columns are independent."""
+    for own in _drawn(weight, axis=1):
+        monitor = np.flatnonzero(weight[own])
+        column = np.full(len(monitor), own)
+        root, left = np.sqrt(weight[own, monitor]), residual[own, monitor]
+        if taken is None:
+            yield _Cluster(rows, column, monitor, root, None, root * left)
+        else:
+            shared = taken[own, monitor]
+            root = np.linalg.cholesky(np.diag(root**2) - shared @ shared.T).T
+            yield _Cluster(rows, column, monitor, root, None, root @ left)
+
+
+def _of_monitors(
+    rows: Rows, weight: Array, residual: Array, taken: Array | None
+) -> Iterator[_Cluster]:
+    """Clusters of one monitor each: one reading per column, given the column's other readings."""
+    weighted = weight * residual if taken is None else times_precision(weight, taken, residual)
+    shared = (
+        None if taken is None else (taken, shared_by(*rows[:3], (Slopes(rows.by_ring),), taken))
+    )
+    for own in _drawn(weight, axis=0):
+        column = np.flatnonzero(weight[:, own])
+        monitor, alone, others = np.full(len(column), own), weight[column, own], None
+        root = np.sqrt(alone)
+        if shared is not None:
+            here, noise_variance = shared[0][column, own], shared[1][:, column]
+            root = np.sqrt(alone - np.sum(here**2, axis=1))
+            others = np.einsum("ck,pck->cp", here / root[:, None], noise_variance)
+        left = weighted[column, own] / root
+        yield _Cluster(rows, column, monitor, alone / root, others, left)
+
+
+def _mismatches(clusters: Iterable[_Cluster], found: LinearFit) -> tuple[Array, Array]:
+    """Leverage of each cluster, and its squared mismatch over the expected one, [cluster,
+    quantity]."""
+    known = found.variance > 0
+    shares, mismatch = [], []
+    for cluster in clusters:
+        Y = along = cluster.times(found.covariance)
+        if found.along is not found.covariance:
+            Y = cluster.times(found.along)
+        inside = cluster.times(along.T)
+        solved = _apart((inside + inside.T) / 2, np.column_stack([Y, cluster.left]))
+        moved = Y.T @ solved[:, -1]
+        grown = np.maximum((Y * solved[:, :-1]).sum(axis=0), 1e-300)  # of the variance without it
+        whole = np.where(known, found.variance + grown, 1.0)
+        share = np.where(known, grown / whole, 0.0)
+        own = moved**2 / grown
+        leverage = np.where(share < MAX_LEVERAGE, share, 0.0)
+        elsewhere = float(leverage @ own) / max(float(leverage.sum()), 1e-300)
+        shares.append(share)
+        mismatch.append(np.where(share < MAX_LEVERAGE, own, elsewhere))
+    return np.array(shares), np.array(mismatch)
+
+
+def _apart(inside: Array, right: Array) -> Array:
+    """(1 - inside)^-1 right, with eigenvalues of at least `MIN_SHARE`."""
+    matrix = (1 + MIN_SHARE) * np.eye(len(inside)) - inside
+    try:
+        return np.asarray(cho_solve(cho_factor(matrix), right))
+    except np.linalg.LinAlgError:  # by rounding: readings far above their noise
+        size, vectors = np.linalg.eigh(matrix)
+        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, MIN_SHARE)[:, None]))
+
+
+SWEEPS = 100
+"""Sweeps at most."""
+DAMPING, LARGEST = 0.3, 0.5
+"""Share of each update that is applied, and the largest change of a log precision: all members are
+updated at once, and two that compensate each other would oscillate."""
+DATA_ALONE = 1e3
+"""Information over that of the narrowest prior component above which the prior is ignored."""
+CONVERGED = 1e-2
+"""Largest change in a sweep, of a mean in standard deviations or of a log variance, at the end."""
+
+
+class Moments(NamedTuple):
+    """Mean, [parameter], and covariance, [parameter, parameter], of the base parameters."""
+
+    mean: Array
+    covariance: Array
+
+
+class _Mixtures:
+    """Priors of all members, padded to one number of components, [member, component]."""
+
+    def __init__(self, groups: Sequence[Group]) -> None:
+        each = [group.mixture() for group in groups]
+        width = max(len(chances) for chances, _ in each)
+        size = [group.basis.shape[1] for group in groups]
+        self.log_chance = np.full((sum(size), width), -np.inf)
+        self.square = np.ones((sum(size), width))
+        end = 0
+        for own, (chances, scales) in zip(size, each, strict=True):
+            begin, end = end, end + own
+            self.log_chance[begin:end, : len(chances)] = np.log(chances)
+            self.square[begin:end] = scales[0] ** 2
+            self.square[begin:end, : len(chances)] = scales**2
+        self.variance = np.sum(np.exp(self.log_chance) * self.square, axis=1)
+
+    def some(self, members: NDArray[np.bool_]) -> "_Mixtures":
+        """Return the priors of some members."""
+        made = copy(self)
+        made.log_chance, made.square = self.log_chance[members], self.square[members]
+        return made
+
+    def times(self, precision: Array, pull: Array) -> tuple[Array, Array]:
+        """Mean and variance of each prior times exp(pull x - precision x^2 / 2)."""
+        wider = 1 + precision[:, None] * self.square
+        variance = self.square / wider
+        mean = pull[:, None] * variance
+        weight = self.log_chance - 0.5 * np.log(wider) + 0.5 * pull[:, None] * mean
+        weight = np.exp(weight - weight.max(axis=1, keepdims=True))
+        weight /= weight.sum(axis=1, keepdims=True)
+        center = np.sum(weight * mean, axis=1)
+        spread = np.sum(weight * (variance + (mean - center[:, None]) ** 2), axis=1)
+        return center, spread
+
+
+def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
+    """Mean and covariance of the base parameters under heavy-tailed priors.
+
+    Args:
+        normal: at `start`.
+        groups: priors with their scales.
+        start: base parameters of the residual, [parameter].
+    """
+    basis = np.concatenate([group.basis for group in groups], axis=1)
+    priors = _Mixtures(groups)
+    unit = np.sqrt(priors.variance)  # scales the matrix
+    A = (basis * unit).T @ normal.matrix @ (basis * unit)
+    A[np.diag_indices(len(A))] *= 1 + ROUNDING
+    b = unit * (basis.T @ (normal.vector + normal.matrix @ start))
+    priors.square /= priors.variance[:, None]
+    precision, pull = np.ones(len(A)), np.zeros(len(A))
+    rest = 1 / np.diag(_gaussian(A, b, precision, pull)[1]) - 1
+    open_ = rest * priors.square.min(axis=1) < DATA_ALONE  # the prior matters for these alone
+    if open_.any():
+        follow = np.linalg.solve(
+            A[np.ix_(~open_, ~open_)] + np.eye(int((~open_).sum())), A[np.ix_(~open_, open_)]
+        )
+        within = A[np.ix_(open_, open_)] - A[np.ix_(open_, ~open_)] @ follow
+        precision[open_], pull[open_] = _sites(
+            (within + within.T) / 2, b[open_] - follow.T @ b[~open_], priors.some(open_)
+        )
+    mean, covariance = _gaussian(A, b, precision, pull)
+    scaled = basis * unit
+    return Moments(scaled @ mean, scaled @ covariance @ scaled.T)
+
+
+def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
+    """Precisions and shifts of the Gaussians in place of the priors."""
+    precision, pull = np.ones(len(A)), np.zeros(len(A))
+    for _ in range(SWEEPS):
+        mean, covariance = _gaussian(A, b, precision, pull)
+        variance = np.diag(covariance)
+        rest = np.maximum(1 / variance - precision, 0.0)
+        others = mean / variance - pull
+        center, spread = priors.times(rest, others)
+        wanted = np.maximum(1 / spread - rest, 1.0)  # no wider than the prior
+        drawn = center * (rest + wanted) - others
+        changed = max(
+            np.abs((center - mean) / np.sqrt(variance)).max(),
+            np.abs(np.log((wanted + rest) * variance)).max(),
+        )
+        if changed < CONVERGED:
+            break
+        step = DAMPING * np.log(wanted / precision)
+        precision = precision * np.exp(np.clip(step, -LARGEST, LARGEST))
+        pull = pull + DAMPING * (drawn - pull)
+    return precision, pull
+
+
+def _gaussian(A: Array, b: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
+    """Mean and covariance with Gaussian priors of these precisions and shifts."""
+    factor = cho_factor(A + np.diag(precision), lower=True, check_finite=False)
+    covariance = cho_solve(factor, np.eye(len(A)), check_finite=False)
+    return covariance @ (b + pull), (covariance + covariance.T) / 2
+
+
+KNOWN_MEMBERS = 6.0
+"""Members determined by the data above which the scale is known to 30 %."""
+MAX_MEMBERS = 128
+"""Members above which a scale is not sampled: each draw costs the third power."""
+FACTORS = np.log(np.geomspace(1 / 32, 32, 11))
+"""Log factors of the present scales, the support of the samples."""
+DRAWS, BURN_IN = 420, 20
+"""Gibbs samples, and those of them that are discarded as burn-in."""
+
+
+def scale_covariance(
+    normal: Normal, groups: Sequence[Group], start: Array, gone: Collection[str] = ()
+) -> Array:
+    """Root F of the covariance F F^T that uncertain scales add, [parameter, direction].
+
+    It is relative to the values at the present scales.
+
+    Args:
+        normal: at `start`.
+        groups: the priors.
+        start: base parameters of the residual.
+        gone: groups of at most `MAX_MEMBERS` members that are taken as zero: as probable as not.
+            Their scales are first guesses.
+    """
+    groups = [group for group in groups if group.basis.any()]
+    if not groups:
+        return np.zeros((len(start), 0))
+    basis = np.concatenate([group.basis * group.scale for group in groups], axis=1)
+    own = np.repeat(np.arange(len(groups)), [group.basis.shape[1] for group in groups])
+    absent = np.array([group.name in gone for group in groups])
+    A = basis.T @ normal.matrix @ basis
+    A[np.diag_indices(len(A))] *= 1 + ROUNDING
+    b = basis.T @ (normal.vector + normal.matrix @ start)
+    known = np.where(absent[own], 0.0, 1 - np.diag(np.linalg.inv(A + np.eye(len(A)))))
+    unsure = np.array([
+        absent[i]
+        or (not group.fixed and (own == i).sum() <= MAX_MEMBERS
+            and 0 < known[own == i].sum() < KNOWN_MEMBERS)
+        for i, group in enumerate(groups)
+    ])  # fmt: skip
+    if not unsure.any():
+        return np.zeros((len(start), 0))
+    U = unsure[own]
+    # the other groups with their priors integrated out
+    follow = np.linalg.solve(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())), A[np.ix_(~U, U)])
+    sizes = _Scales(
+        A[np.ix_(U, U)] - A[np.ix_(U, ~U)] @ follow,
+        b[U] - follow.T @ b[~U],
+        (np.cumsum(unsure) - 1)[own[U]],
+        [group for group, here in zip(groups, unsure, strict=True) if here],
+        absent[unsure],
+    )
+    moved = basis[:, U] - basis[:, ~U] @ follow
+    variance, directions = np.linalg.eigh(sizes.more())
+    return np.asarray(moved @ (directions * np.sqrt(np.maximum(variance, 0))))
+
+
+class _Scales:
+    """Scales of some groups, and their members' amounts in units of the present scales.
+
+    Args:
+        information, score: of the members, all others integrated out.
+        group: of each member.
+        groups: with their hyperpriors.
+        absent: whether a group's members are taken as zero, [group].
+    """
+
+    def __init__(
+        self, information: Array, score: Array, group: Indices, groups: Sequence[Group],
+        absent: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        self.information, self.score, self.group = information, score, group
+        self.now = np.where(absent, -np.inf, 0.0)
+        self.choices, self.chances = [], []
+        self.pairs = list(combinations(np.flatnonzero(absent).tolist(), 2))
+        for own, gone in zip(groups, absent, strict=True):
+            largest = own.scale.max()
+            factors = FACTORS[(FACTORS <= 0) | (largest * np.exp(FACTORS) <= own.most)]
+            factors = np.zeros(1) if own.fixed else factors
+            size = np.log(own.rms / own.guess) + factors
+            chances = np.exp(-0.5 * (size / own.guessed) ** 2)
+            chances /= chances.sum()
+            if gone:
+                factors, chances = np.append(-np.inf, factors), np.append(1.0, chances)
+            self.choices.append(factors)
+            self.chances.append(np.log(chances))
+
+    def _root(self, sizes: Array) -> tuple[Array, Array]:
+        """Prior rms of the members, and the root of their posterior precision in these units."""
+        scale = np.exp(sizes)[self.group]
+        inside = scale[:, None] * self.information * scale
+        inside[np.diag_indices(len(inside))] += 1
+        return scale, np.asarray(np.linalg.cholesky(inside))
+
+    def log_evidence(self, sizes: Array) -> float:
+        """Log marginal likelihood with all members integrated out."""
+        scale, root = self._root(sizes)
+        pull = solve_triangular(root, scale * self.score, lower=True, check_finite=False)
+        return float(0.5 * pull @ pull - np.log(np.diag(root)).sum())
+
+    def _chance(self, sizes: Array) -> float:
+        """Log probability of scales; -inf outside their support."""
+        chance = 0.0
+        for size, choices, chances in zip(sizes, self.choices, self.chances, strict=True):
+            (at,) = np.nonzero(choices == size)
+            if not len(at):
+                return -np.inf
+            chance += float(chances[at[0]])
+        return chance + self.log_evidence(sizes)
+
+    def amounts(self, sizes: Array) -> tuple[Array, Array]:
+        """Most probable amounts, and their covariance."""
+        scale, root = self._root(sizes)
+        half = solve_triangular(root, np.diag(scale), lower=True, check_finite=False)
+        covariance = half.T @ half
+        return covariance @ self.score, covariance
+
+    def more(self) -> Array:
+        """Covariance that sampled scales add to that at the present ones, [member, member], by
+        Gibbs sampling."""
+        random = np.random.default_rng(0)
+        here = np.where(np.isinf(self.now), 0.0, self.now)
+        mean, stated = self.amounts(self.now)
+        total = np.zeros_like(stated)
+        for draw in range(DRAWS):
+            for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
+                tried = np.repeat(here[None], len(choices), axis=0)
+                tried[:, i] = choices
+                values = chances + [self.log_evidence(one) for one in tried]
+                weights = np.exp(values - values.max())
+                here = tried[random.choice(len(tried), p=weights / weights.sum())]
+            for a, b in self.pairs:  # swap two groups that compensate each other
+                other = here.copy()
+                other[[a, b]] = here[[b, a]]
+                both = self._chance(other) - self._chance(here)
+                if np.log(random.random()) < both:
+                    here = other
+            if draw >= BURN_IN:
+                then, spread = self.amounts(here)
+                total += spread + np.outer(then - mean, then - mean)
+        return np.asarray(total / (DRAWS - BURN_IN) - stated)
