@@ -1,11 +1,12 @@
 """Measure, diagnose, correct, measure again: what is left of the optics' errors, AT as the machine.
 
-`python benchmarks/correct.py LATTICE [--cases 10] [--kind response|turns] [--out FILE.jsonl]`
+`python benchmarks/correct.py LATTICE [--cases 10] [--kind response|turns|first_turns] [--out FILE]`
 
 Each case is a machine of its own with all usual errors of the catalogue (`--scale`), quadrupoles
 wrong by `--gradient` rms, and its orbit corrected by its correctors up to 5 % of their kicks. Its
 quadrupole supplies, or each quadrupole (`--knobs`), can be set within `--limit` of their strength,
-in steps of 1e-4 of it. The machine is measured with AT, diagnosed with default options and
+in steps of 1e-4 of it; each makes its change with a relative error of 1 %, which the oracle alone
+knows. The machine is measured with AT, diagnosed with default options and
 corrected; the settings are put into the machine, and AT gives the true optics at the BPMs: beta
 beating, dispersion, tunes, coupling. Compared with
 
@@ -16,9 +17,10 @@ beating, dispersion, tunes, coupling. Compared with
   without priors, with the best of three cuts in hindsight, and the fitted ring corrected (of an
   orbit response).
 
-A line a case is written as it comes; cases that FILE has already are not measured again.
-`--keep FOLDER` keeps the estimates (the package's own pickles), for the next run to start from.
-`--summary FILE` prints the table of such a file.
+A line a case is written as it comes, with its study (lattice, kind, knobs); cases that FILE has
+already are not measured again.
+`--keep FOLDER` keeps measurements and diagnoses (the package's own pickles), for the next run to
+start from. `--summary FILE` prints the table of such a file.
 """
 
 import argparse
@@ -42,6 +44,7 @@ from tmlattice.errors import TmlatticeError
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
 from tmlattice.machine.shots import draw_background, stream
+from tmlattice.machine.simulate import simulate
 from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
@@ -53,6 +56,14 @@ CUTS = (1e-2, 1e-3, 1e-5)
 """Of the singular values of a fit without priors, as a share of the largest."""
 LARGEST = 1.0
 """Relative change of a gradient or gain from which on such a fit has diverged."""
+MEASURED = {
+    "response": lambda *machine, seed: (
+        simulate_response(*machine, seed=seed, progress=False).measured
+    ),
+    "turns": lambda *machine, seed: simulate_turns(*machine, seed=seed).measured,
+    "first_turns": lambda *machine, seed: simulate(*machine, shots=20, seed=seed).measurement(),
+}
+"""The measurement of a machine, by its kind."""
 METHODS = ("before", "tmlattice", "oracle", "svd", "loco")
 
 
@@ -122,8 +133,10 @@ def changes(knobs, amounts):
     ]
 
 
-def of_settings(correction):
-    return [c for s in correction.settings for c in s.knob.causes(s.amount)]
+def of_settings(correction, scale=None):
+    """The causes that the settings make; `scale`: made over asked change by knob, else 1."""
+    return [c for s in correction.settings
+            for c in s.knob.causes(s.amount * (scale[s.knob.name] if scale else 1.0))]  # fmt: skip
 
 
 def svd_candidates(ring, data, knobs):
@@ -187,17 +200,11 @@ def safely(run):
         return None
 
 
-def estimated(ring, causes, seed, kind):
-    """The measurement of a machine, its estimate, and the seconds that it took."""
-    simulate = simulate_response if kind == "response" else simulate_turns
-    more = {"progress": False} if kind == "response" else {}
-    data = simulate(ring, causes, seed=seed, **more).measured
-    begun = time.perf_counter()
-    diagnosis = diagnose(ring, data)
-    then = time.perf_counter()
-    estimate = estimate_of(diagnosis)
-    return data, estimate, {"seconds_diagnosis": then - begun,
-                            "seconds_posterior": time.perf_counter() - then}  # fmt: skip
+def diagnosed(ring, causes, seed, kind):
+    """The measurement of a machine, its diagnosis, and the seconds of processor that it took."""
+    data = MEASURED[kind](ring, causes, seed=seed)
+    begun = time.process_time()
+    return data, diagnose(ring, data), time.process_time() - begun
 
 
 def case(ring, seed, options):
@@ -222,6 +229,8 @@ def case(ring, seed, options):
              for c in s.knob.causes(s.amount)]  # fmt: skip
     causes, on_ring = [*causes, *kicks], [*on_ring, *kicks]
     knobs = devices(ring, options.knobs, options.limit)
+    drawn = stream(seed, "knobs").standard_normal(len(knobs))
+    made = {k.name: 1 + k.error * float(d) for k, d in zip(knobs, drawn, strict=True)}
     targets = Targets(ring, OPTICS)
     goal = measured(ring, [], targets.step)
 
@@ -236,17 +245,19 @@ def case(ring, seed, options):
     found = {"seed": seed, "before": left([])}
     kept = options.keep and options.keep / f"{options.kind}-{seed}.pickle"
     if kept and kept.is_file():
-        data, estimate, seconds = pickle.loads(kept.read_bytes())
+        data, diagnosis, seconds = pickle.loads(kept.read_bytes())
     else:
-        data, estimate, seconds = estimated(ring, causes, seed, options.kind)
+        data, diagnosis, seconds = diagnosed(ring, causes, seed, options.kind)
         if kept:
             kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_bytes(pickle.dumps((data, estimate, seconds)))
-    found |= seconds
-    begun = time.perf_counter()
+            kept.write_bytes(pickle.dumps((data, diagnosis, seconds)))
+    begun = time.process_time()
+    estimate = estimate_of(diagnosis)
+    then = time.process_time()
     own = correct(estimate, knobs=knobs, targets=OPTICS)
-    found["seconds_correction"] = time.perf_counter() - begun
-    found |= {"tmlattice": left(of_settings(own)), "refused": own.refused,
+    found |= {"seconds_diagnosis": seconds, "seconds_posterior": then - begun,
+              "seconds_correction": time.process_time() - then}  # fmt: skip
+    found |= {"tmlattice": left(of_settings(own, made)), "refused": own.refused,
               "devices": len(own.settings), "now": own.before, "expected": own.after,
               "iterations": own.iterations,
               "at_limit": sum(s.at_limit for s in own.settings)}  # fmt: skip
@@ -255,14 +266,14 @@ def case(ring, seed, options):
     found["oracle"] = left(of_settings(best))
     if options.kind == "response":
         readings = response_data(ring, data)
-        tried = [
-            left(changes(knobs, clipped(knobs, a))) for a in svd_candidates(ring, readings, knobs)
-        ]
+        ratio = np.array([made[knob.name] for knob in knobs])
+        tried = [left(changes(knobs, ratio * clipped(knobs, a)))
+                 for a in svd_candidates(ring, readings, knobs)]  # fmt: skip
         tried = [one for one in tried if one is not None]
         found["svd"] = min(tried, key=lambda one: one["square"], default=None)
         fits = [
             safely(lambda cut=cut: left(of_settings(correct(
-                loco(ring, readings, cut), goal=ring, knobs=knobs, targets=OPTICS))))
+                loco(ring, readings, cut), goal=ring, knobs=knobs, targets=OPTICS), made)))
             for cut in CUTS
         ]  # fmt: skip
         found["loco"] = min((f for f in fits if f), key=lambda one: one["square"], default=None)
@@ -314,7 +325,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser()
     arguments.add_argument("lattice", nargs="?")
     arguments.add_argument("--cases", type=int, default=10)
-    arguments.add_argument("--kind", choices=("response", "turns"), default="response")
+    arguments.add_argument("--kind", choices=tuple(MEASURED), default="response")
     arguments.add_argument("--scale", type=float, default=1.0)
     arguments.add_argument("--gradient", type=float, default=3e-3)
     arguments.add_argument("--limit", type=float, default=0.03)
@@ -322,11 +333,14 @@ def main() -> None:
     arguments.add_argument("--correctors", default=None, help="patterns, as `load_ring` takes them")
     arguments.add_argument("--monitors", default=None)
     arguments.add_argument("--out", type=Path)
-    arguments.add_argument("--keep", type=Path, help="folder of estimates, for another correction")
+    arguments.add_argument("--keep", type=Path, help="folder of diagnoses, for another correction")
     arguments.add_argument("--summary", type=Path)
     options = arguments.parse_args()
     if options.summary:
-        summary([json.loads(line) for line in options.summary.read_text().splitlines()])
+        rows = [json.loads(line) for line in options.summary.read_text().splitlines()]
+        for study in sorted({tuple(row["study"]) for row in rows}):
+            print("\n" + ", ".join(study))
+            summary([row for row in rows if tuple(row["study"]) == study])
         return
     warnings.simplefilter("ignore")
     logging.disable(logging.WARNING)
@@ -337,12 +351,16 @@ def main() -> None:
     rows = []
     if options.out and options.out.is_file():
         rows = [json.loads(line) for line in options.out.read_text().splitlines()]
+    study = [Path(options.lattice).stem, options.kind, options.knobs]
+    if study[0] == "lattice":  # of `tmlattice import`
+        study[0] = Path(options.lattice).absolute().parent.name
+    rows = [row for row in rows if row["study"] == study]
     done = {row["seed"] for row in rows}
     for seed in range(options.cases):
         if seed in done:
             continue
         try:
-            row = case(ring, seed, options)
+            row = {"study": study, **case(ring, seed, options)}
         except TmlatticeError as error:
             print(f"seed {seed}: {error}", flush=True)
             continue
@@ -351,7 +369,8 @@ def main() -> None:
             f"{m} {100 * beat(row.get(m)):.2f} %" for m in METHODS), flush=True)  # fmt: skip
         if options.out:
             with options.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+                short = json.loads(json.dumps(row), parse_float=lambda n: float(f"{float(n):.4g}"))
+                file.write(json.dumps(short) + "\n")
     summary(rows)
 
 

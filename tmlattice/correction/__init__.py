@@ -14,7 +14,7 @@ import numpy as np
 from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
 from tmlattice.correction.first_turn import Threading
 from tmlattice.correction.knobs import Knob, default_knobs, kinds_for, read_knobs
-from tmlattice.correction.result import Correction, Setting, with_gains
+from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.solve import (
     MAX_EXCESS,
     Point,
@@ -157,22 +157,22 @@ def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     if refused:
         end = begin
     before, after = (_intervals(point) for point in (begin, end))
-    squares, gains = [], []
+    squares, gains = [begin.square], []
     for n in range(1, len(order) + 1 if not refused else 1):
         amounts, square = end.step(np.array(order[:n], dtype=np.int64))
         squares.append(square)
         if n in COUNTS or n == len(order):
             gains.append((n, _expected(amounts, end)))
-    shares = -np.diff([begin.square, *squares]) / max(
-        begin.square - min(squares, default=0.0), 1e-30
-    )
+    shares = -np.diff(squares) / max(begin.square - min(squares), 1e-30)
     settings = [
-        Setting(problem.knobs[k], float(end.amounts[k]),
-                problem.knobs[k].setting(float(end.amounts[k])), 0.0)
-        for k in order if end.amounts[k]
+        Setting(knob, amount, knob.setting(amount), share)
+        for knob, amount, share in zip(
+            (problem.knobs[k] for k in order), end.amounts[order].tolist(), shares.tolist(),
+            strict=False,
+        )
+        if amount
     ]  # fmt: skip
-    by_knob = dict(zip(order, shares.tolist(), strict=False))
-    rows_of = with_gains(settings, [by_knob[k] for k in order if end.amounts[k]])
+    settings.sort(key=lambda own: -own.gain)
     stays = {
         name: (_pair(rms_of(end.errors)[name]), _pair(np.median(own, axis=0)))
         for name, own in rms_of(end.open).items()
@@ -187,7 +187,7 @@ def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
         tunes = {"goal": targets.goal.tunes, "now": begin.shown.values.tunes,
                  "expected": end.shown.values.tunes}  # fmt: skip
     return {
-        "settings": rows_of,
+        "settings": tuple(settings),
         "refused": refused,
         "before": before,
         "after": after,
@@ -201,7 +201,7 @@ def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
         "s": targets.s,
         "counted": targets.tolerance,
         "iterations": _iterations(end),
-        "warnings": tuple(_warnings(end, rows_of)),
+        "warnings": tuple(_warnings(end, settings)),
     }
 
 

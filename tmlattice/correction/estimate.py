@@ -53,7 +53,13 @@ class Estimate:
     def with_beam(
         self, dispersion: Dispersion, energy: float = 0.0, energy_error: float = 0.0
     ) -> "Estimate":
-        """Return the estimate with a measured dispersion and energy beyond the ring's."""
+        """Return the estimate with a measured dispersion and energy beyond the ring's.
+
+        The errors of a posterior with a covariance make the dispersion, and change it with the
+        optics; else it stays.
+        """
+        if self.known is not None and len(self.known.share):
+            dispersion = {}
         names = [monitor.name for monitor in self.ring.monitors]
         more = np.array([dispersion.get(name, (0.0, 0.0)) for name in names]).reshape(-1, 2)
         return replace(self, dispersion=more, energy=energy, energy_error=energy_error)

@@ -9,7 +9,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -201,9 +201,3 @@ def _change(
     factor, unit = (100.0, "%") if target.unit == "relative" else (1.0, target.unit)
     scale = f"{factor * now:.3g} to {factor * then:.3g} ± {factor * (high - low) / 2:.2g} {unit}"
     return now / max(then, 1e-30), f"the {target.words} in {target.planes[p]} from {scale.rstrip()}"
-
-
-def with_gains(settings: list[Setting], shares: list[float]) -> tuple[Setting, ...]:
-    """Return the settings with their shares of the gain, the largest first."""
-    rows = [replace(s, gain=share) for s, share in zip(settings, shares, strict=True)]
-    return tuple(sorted(rows, key=lambda row: -row.gain))

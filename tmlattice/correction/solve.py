@@ -205,7 +205,7 @@ class Point:
         q, r = np.linalg.qr(self.slopes / self.problem.sizes)
         start = self.rows - self.slopes @ self.amounts
         inside = q.T @ start
-        return r, inside, float(start @ start - inside @ inside)
+        return r, inside, max(float(start @ start - inside @ inside), 0.0)
 
     def step(self, knobs: Indices) -> tuple[Array, float]:
         """Return the amounts of some knobs, the others at zero, of the smallest linearised expected

@@ -15,16 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.dispersion import errors_beside
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.diagnosis.views import JointView, ResponseView
+from tmlattice.diagnosis.views import JointView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors, DistributedProblem, posterior
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
-from tmlattice.observe.orbit_response import Predicted
+from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 
@@ -64,7 +63,7 @@ def known_of(diagnosis: Diagnosis) -> DistributedErrors | None:
     own standard deviation, without correlations.
     """
     view = diagnosis.view
-    if isinstance(view, JointView):
+    if isinstance(view, JointView | TrajectoryView):
         found, causes = view.explanation, diagnosis.causes
         if not isinstance(found.problem, DistributedProblem):
             return None
@@ -112,19 +111,14 @@ def _together(
                for name, _ in more}  # fmt: skip
     usual, everywhere = {**usual, **scatter}, [*everywhere, *more]
     problem = Response(
-        base=Predicted(data, errors_beside(data, diagnosis.dispersion)).bend(),
+        base=Predicted(data, Errors.none(data)).bend(),
         used=np.isfinite(data.orbits) & view.good[:, None],
         places={},
         fixed=tuple(c for c in diagnosis.causes if (c.effect, c.element) not in fitted),
     )
     start = np.array([fitted.get(h, 0.0) for h in everywhere])
-    first = posterior(problem, DistributedErrors.usual(everywhere, usual), linearised_at=start)
-    sizes = {
-        name: size if first.errors[name] < HARDLY else max(size, usual[name])
-        for name, size in first.sizes.items()
-    }
     known = posterior(
-        problem, DistributedErrors.usual(everywhere, sizes), learn=False, linearised_at=start
+        problem, DistributedErrors.usual(everywhere, usual), unsure=HARDLY, linearised_at=start
     ).known
     inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the estimated ring has them
     return replace(

@@ -547,6 +547,7 @@ def posterior(
     known: DistributedErrors,
     *,
     learn: bool = True,
+    unsure: float = np.inf,
     linearised_at: Array | None = None,
 ) -> Posterior:
     """Return the posterior of distributed errors, linearised at the most probable amounts.
@@ -555,6 +556,7 @@ def posterior(
         problem: of the design.
         known: prior, with initial scales.
         learn: estimate the scales; else they stay.
+        unsure: relative error of an estimated scale from which it is not below its initial one.
         linearised_at: first point of linearisation, [error]; None: the prior's mean.
 
     Raises:
@@ -562,7 +564,7 @@ def posterior(
     """
     names, belongs = families_of(known)
     amounts = stored = known.amounts if linearised_at is None else linearised_at
-    nuisances, errors = problem.first, dict[str, float]()
+    nuisances, errors, usual = problem.first, dict[str, float](), known.rms
     for _ in range(LINEARISATIONS):
         inner, point, amounts = linearise(problem, known, amounts, stored, (), nuisances)
         assert point.projection is not None
@@ -576,7 +578,8 @@ def posterior(
                 known.correlated(known.rms[:, None] * sums.some), belongs,
             )  # fmt: skip
             errors = dict(zip(names, found.error.tolist(), strict=True))
-            known = replace(known, rms=known.rms * found.scale[belongs])
+            least = np.where(found.error[belongs] < unsure, 0.0, usual)
+            known = replace(known, rms=np.maximum(known.rms * found.scale[belongs], least))
         spread = known.correlated(known.correlated(known.rms[:, None] * sums.gram * known.rms).T)
         visible = np.flatnonzero(np.diag(spread) > 0)
         spread = spread[np.ix_(visible, visible)]

@@ -220,20 +220,6 @@ def dispersion_beside(
     return {name: (float(x), float(y)) for name, (x, y) in zip(names, dispersion, strict=True)}
 
 
-def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, float]]) -> Errors:
-    """The design with the dispersion of `dispersion_beside`, for other correctors and BPMs."""
-    none = Errors.none(data)
-    if not dispersion:
-        return none
-    ring, nothing = data.ring, (0.0, 0.0)
-    monitors, correctors = (
-        np.array([dispersion.get(ring[name].name, nothing) for name in names])
-        for names in (data.measured.monitors, data.measured.correctors)
-    )
-    own = correctors[np.arange(len(correctors)), data.plane[:-1]]
-    return replace(none, dispersion=monitors * data.energy_of_rf, at_correctors=own)
-
-
 LEAST_FOCUSING = 0.02
 """Share of the strongest pattern below which one is omitted; quadrupole gradients absorb it."""
 TOGETHER = 32
