@@ -286,25 +286,27 @@ def table_of_missing(rings):
 
 
 def table_of_seeds(rings):
-    """Median and worst of the seeds of each ring, and by how much what they found scatters."""
-    keys = {"in_plane": "in plane", "with_jump": "with a jump", "coupling": "across",
-            "with_roll": "with a roll", "rf": "RF", "chi2": "chi²"}  # fmt: skip
-    yield f"| ring | seeds | {' | '.join(keys.values())} | gradients scatter | s |"
-    yield "|" + "---|" * (len(keys) + 4)
+    """Medians over the seeds of each ring, and the worst: the table of the page."""
+    yield "| ring | lattice | experts | in plane | worst | $\\chi^2$ | across | RF | s |"
+    yield "|" + "---|" * 9
     for found in rings:
         good = [one for one in found if "error" not in one]
         if len(good) < FEWEST:
             continue
-        cells = []
-        for key in keys:
-            values = [one["steps"][-1][key] for one in good]
+
+        def over(key, how=np.median, good=good, step=-1):
+            values = [one["steps"][step][key] for one in good]
             values = [value for value in values if value is not None]
-            cells.append(f"{np.median(values):.2f} / {max(values):.2f}" if values else "")
-        pull = scatter(good).get("quadrupole_gradient")
-        cells.append("" if pull is None else f"{pull[1]:.2f}")
-        cells.append(f"{np.median([one['seconds'] for one in good]):.0f}")
-        name = found[0]["ring"]
-        yield f"| {name} | {len(good)} of {len(found)} | {' | '.join(cells)} |"
+            return f"{how(values):.3g}" if values else "-"
+
+        experts = good[0].get("experts")
+        cells = [
+            found[0]["ring"], over("in_plane", step=0), f"{experts[0]:.3g}" if experts else "",
+            f"{over('in_plane')} ({over('with_jump')})", over("in_plane", max), over("chi2"),
+            f"{over('coupling')} ({over('with_roll')})", f"{over('rf')} / {over('rf', max)}",
+            f"{np.median([one['seconds'] for one in good]):.0f}",
+        ]  # fmt: skip
+        yield f"| {' | '.join(cells)} |"
 
 
 def scatter(found):

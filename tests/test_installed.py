@@ -27,7 +27,7 @@ def run(*arguments, cwd):
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
-    run("-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT), cwd=folder)
+    run("-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT), cwd=folder)  # sdist first
     (built,) = folder.glob("*.whl")
     return built
 
