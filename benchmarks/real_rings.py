@@ -221,7 +221,7 @@ def picture(result, path):
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=80)
     plt.close(figure)
-    shrink(path)
+    shrink(path, path.stem)
 
 
 def _step(step):

@@ -151,7 +151,7 @@ def schema(name: str) -> str:
 def _fields(
     root: dict[str, Any], node: dict[str, Any], prefix: str
 ) -> Iterator[tuple[str, str, str]]:
-    # a file of one kind, of another; what stands in several is told of the first
+    # a file of one kind, of another; what several have is described by the first
     kinds = [node.get("else", {}), node.get("then", {})]
     kinds += [one.get("then", {}) for one in node.get("allOf", [])]
     found: dict[str, Any] = {}

@@ -47,6 +47,15 @@ def test_a_changed_figure_changes_the_page(tmp_path, monkeypatch):
     assert row.split(" | ")[1:] == ["28.3", "925", "33 |"]
 
 
+def test_the_picture_of_the_blind_table_is_drawn(tmp_path, monkeypatch):
+    main = runpy.run_path(str(ROOT / "docs" / "pictures.py"), run_name="imported")["main"]
+    monkeypatch.setitem(main.__globals__, "FOLDER", tmp_path)
+    main(["tables"])
+    drawn = (tmp_path / "blind-rates.png").read_bytes()
+    assert drawn.startswith(b"\x89PNG")
+    assert len(drawn) < 150_000
+
+
 def test_what_a_benchmark_prints_is_stored_with_its_command(tmp_path):
     code = "print('| a | b |\\n|---|---|\\n| 1 | 2 |\\n\\nmedian 3, \\N{MICRO SIGN}m')"
     command = [sys.executable, "-c", code, "--seed", "7"]
