@@ -12,7 +12,9 @@ time;
 `--missing` weighs what the result still lacks, and tells a table of that; `--pictures FOLDER` makes
 a picture a ring: what is left before and after, and the gradients. `--into FOLDER` writes a file of
 each ring and seed as it comes; what stands there already, of the same options and code, is told and
-not measured again, so that a long study can be stopped, and goes on.
+not measured again, so that a long study can be stopped, and goes on. `--table` prints the table of
+what FOLDER has, of whatever code: `python benchmarks/tables.py --store real_rings python
+benchmarks/real_rings.py --into FOLDER --table` makes it that of the page.
 
 Of several seeds each is told as it comes, and at the end the median and the worst, and by how much
 what was found scatters between them, in units of its stated errors: 0.5 is right where errors are
@@ -291,7 +293,7 @@ def table_of_seeds(rings):
     yield "|" + "---|" * 9
     for found in rings:
         good = [one for one in found if "error" not in one]
-        if len(good) < FEWEST:
+        if not good:
             continue
 
         def over(key, how=np.median, good=good, step=-1):
@@ -346,8 +348,19 @@ def main():
     parser.add_argument("--families", action="store_true")
     parser.add_argument("--missing", action="store_true")
     parser.add_argument("--into", type=Path)
+    parser.add_argument("--table", action="store_true")
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
+    if options.table:
+        stored = [json.loads(path.read_text()) for path in sorted(options.into.glob("*.json"))]
+        for one in stored:
+            print(
+                *(f"{key} {one[key]}" for key in ("ring", "seed", "code", "iteration", "families"))
+            )
+        names = dict.fromkeys(one["ring"] for one in stored)
+        rings = [[one for one in stored if one["ring"] == name] for name in names]
+        print(*table_of_seeds(rings), sep="\n")
+        return
     if options.families:
         procedure.LARGE = 0
     if not os.environ.get("TMLATTICE_DATA"):
