@@ -12,7 +12,9 @@ time;
 `--missing` weighs what the result still lacks, and tells a table of that; `--pictures FOLDER` makes
 a picture a ring: what is left before and after, and the gradients. `--into FOLDER` writes a file of
 each ring and seed as it comes; what stands there already, of the same options and code, is told and
-not measured again, so that a long study can be stopped, and goes on.
+not measured again, so that a long study can be stopped, and goes on. `--table` prints the table of
+what FOLDER has, of whatever code: `python benchmarks/tables.py --store real_rings python
+benchmarks/real_rings.py --into FOLDER --table` makes it that of the page.
 
 Of several seeds each is told as it comes, and at the end the median and the worst, and by how much
 what was found scatters between them, in units of its stated errors: 0.5 is right where errors are
@@ -221,7 +223,7 @@ def picture(result, path):
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=80)
     plt.close(figure)
-    shrink(path)
+    shrink(path, path.stem)
 
 
 def _step(step):
@@ -286,25 +288,27 @@ def table_of_missing(rings):
 
 
 def table_of_seeds(rings):
-    """Median and worst of the seeds of each ring, and by how much what they found scatters."""
-    keys = {"in_plane": "in plane", "with_jump": "with a jump", "coupling": "across",
-            "with_roll": "with a roll", "rf": "RF", "chi2": "chi²"}  # fmt: skip
-    yield f"| ring | seeds | {' | '.join(keys.values())} | gradients scatter | s |"
-    yield "|" + "---|" * (len(keys) + 4)
+    """Medians over the seeds of each ring, and the worst: the table of the page."""
+    yield "| ring | lattice | experts | in plane | worst | $\\chi^2$ | across | RF | s |"
+    yield "|" + "---|" * 9
     for found in rings:
         good = [one for one in found if "error" not in one]
-        if len(good) < FEWEST:
+        if not good:
             continue
-        cells = []
-        for key in keys:
-            values = [one["steps"][-1][key] for one in good]
+
+        def over(key, how=np.median, good=good, step=-1):
+            values = [one["steps"][step][key] for one in good]
             values = [value for value in values if value is not None]
-            cells.append(f"{np.median(values):.2f} / {max(values):.2f}" if values else "")
-        pull = scatter(good).get("quadrupole_gradient")
-        cells.append("" if pull is None else f"{pull[1]:.2f}")
-        cells.append(f"{np.median([one['seconds'] for one in good]):.0f}")
-        name = found[0]["ring"]
-        yield f"| {name} | {len(good)} of {len(found)} | {' | '.join(cells)} |"
+            return f"{how(values):.3g}" if values else "-"
+
+        experts = good[0].get("experts")
+        cells = [
+            found[0]["ring"], over("in_plane", step=0), f"{experts[0]:.3g}" if experts else "",
+            f"{over('in_plane')} ({over('with_jump')})", over("in_plane", max), over("chi2"),
+            f"{over('coupling')} ({over('with_roll')})", f"{over('rf')} / {over('rf', max)}",
+            f"{np.median([one['seconds'] for one in good]):.0f}",
+        ]  # fmt: skip
+        yield f"| {' | '.join(cells)} |"
 
 
 def scatter(found):
@@ -344,8 +348,19 @@ def main():
     parser.add_argument("--families", action="store_true")
     parser.add_argument("--missing", action="store_true")
     parser.add_argument("--into", type=Path)
+    parser.add_argument("--table", action="store_true")
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
+    if options.table:
+        stored = [json.loads(path.read_text()) for path in sorted(options.into.glob("*.json"))]
+        for one in stored:
+            print(
+                *(f"{key} {one[key]}" for key in ("ring", "seed", "code", "iteration", "families"))
+            )
+        names = dict.fromkeys(one["ring"] for one in stored)
+        rings = [[one for one in stored if one["ring"] == name] for name in names]
+        print(*table_of_seeds(rings), sep="\n")
+        return
     if options.families:
         procedure.LARGE = 0
     if not os.environ.get("TMLATTICE_DATA"):

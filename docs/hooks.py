@@ -1,10 +1,11 @@
 """What the pages take from the package when they are built: the catalogue, what may be assumed of
-data, the schemas, example files.
+data, the schemas, example files, the packages and their imports.
 
-A page says `<!-- effects -->`, `<!-- assumptions -->`, `<!-- schema measurement -->` or
-`<!-- example trajectory -->` where one is to stand.
+A page has `<!-- effects -->`, `<!-- assumptions -->`, `<!-- schema measurement -->`,
+`<!-- example trajectory -->` or `<!-- packages -->` where one is to be shown.
 """
 
+import ast
 import json
 import re
 from collections.abc import Iterator
@@ -13,13 +14,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-MARK = re.compile(r"^<!-- (effects|assumptions|schema|example) ?([\w-]*) -->$", re.MULTILINE)
+MARK = re.compile(
+    r"^<!-- (effects|assumptions|schema|example|packages) ?([\w-]*) -->$", re.MULTILINE
+)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace the marks of a page."""
     made = {"effects": lambda _: effects(), "assumptions": lambda _: assumptions(),
-            "schema": schema, "example": example}  # fmt: skip
+            "schema": schema, "example": example, "packages": lambda _: packages()}  # fmt: skip
     return MARK.sub(lambda mark: made[mark[1]](mark[2]), markdown)
 
 
@@ -73,6 +76,43 @@ def assumptions() -> str:
     return table(["--assume", "what is written down wrongly", "first turns", "responses"], rows)
 
 
+ROOT = Path(__file__).parent.parent
+IMPORTED = re.compile(r"^ *(?:from|import) tmlattice\.(\w+)", re.MULTILINE)
+
+
+def packages() -> str:
+    """The packages in the order of their imports, with an arc to each that one needs directly."""
+    tree = ast.parse((ROOT / "tests" / "test_walls.py").read_text(encoding="utf-8"))
+    (order,) = (ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)
+                and ast.unparse(node.targets[0]) == "ORDER")  # fmt: skip
+    needs: dict[str, set[str]] = {name: set() for name in order}
+    for path in (ROOT / "tmlattice").rglob("*.py"):
+        own = path.relative_to(ROOT / "tmlattice").parts[0].removesuffix(".py")
+        found = IMPORTED.findall(path.read_text(encoding="utf-8"))
+        needs.get(own, set()).update(set(found) & set(order) - {own})
+    every: dict[str, set[str]] = {}
+    shown = []
+    for row, own in enumerate(order):
+        below = set().union(*(every[name] for name in needs[own]))
+        every[own] = needs[own] | below
+        y = 14 + 24 * row
+        shown.append(f'<text x="0" y="{y + 4}">{own}</text>')
+        for name in needs[own] - below:
+            other = 14 + 24 * order.index(name)
+            shown.append(
+                f'<path data-from="{own}" data-to="{name}" marker-end="url(#tip)" '
+                f'd="M 110 {y} C {130 + y - other} {y}, {130 + y - other} {other}, 114 {other}"/>'
+            )
+    return (
+        f'<svg viewBox="0 0 420 {24 * len(order) + 8}" role="img" style="max-width: 32em" '
+        'fill="currentColor" font-size="13"><defs><marker id="tip" refX="8" refY="4" '
+        'markerWidth="8" markerHeight="8" orient="auto"><path d="M 8 0 L 0 4 L 8 8 z" '
+        'transform="rotate(180 4 4)"/></marker></defs><g fill="none" stroke="currentColor" '
+        f'stroke-opacity="0.6">{"".join(s for s in shown if s[1] == "p")}</g>'
+        f"{''.join(s for s in shown if s[1] == 't')}</svg>"
+    )
+
+
 def example(name: str) -> str:
     """The files of a measurement of two shots, or steps, and two monitors, as they are written."""
     import numpy as np
@@ -111,7 +151,7 @@ def schema(name: str) -> str:
 def _fields(
     root: dict[str, Any], node: dict[str, Any], prefix: str
 ) -> Iterator[tuple[str, str, str]]:
-    # a file of one kind, of another; what stands in several is told of the first
+    # a file of one kind, of another; what several have is described by the first
     kinds = [node.get("else", {}), node.get("then", {})]
     kinds += [one.get("then", {}) for one in node.get("allOf", [])]
     found: dict[str, Any] = {}

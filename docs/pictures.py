@@ -1,7 +1,7 @@
 """The pictures of README and documentation, from real results: `python docs/pictures.py`.
 
 `python docs/pictures.py tunes response` makes some. Each is a PNG below 150 kB in `docs/pictures/`.
-`real_ring` needs `TMLATTICE_DATA`: of the data it shows what is left of them, as a picture.
+`real_ring` needs `TMLATTICE_DATA`; it shows residuals of the data, as a picture.
 """
 
 import os
@@ -22,6 +22,7 @@ from tmlattice.machine.response import simulate_response
 from tmlattice.report.page import shrink
 
 FOLDER = Path(__file__).parent / "pictures"
+RESULTS = Path(__file__).parent / "results"
 SMALL = Path(__file__).parent.parent / "tests" / "lattices" / "small_ring.py"
 WEAK = Cause("quadrupole_gradient", "qd::12", -0.2)
 
@@ -43,7 +44,7 @@ def diagnosis():
 
 
 def where_and_what(result):
-    """Where the gap begins, and the scan about the culprit."""
+    """Where the gap begins, and the scan near the faulty element."""
     from tmlattice.plots.diagnosis import plot_scan_near
     from tmlattice.plots.readings import AFTER, BEFORE, design_readings, mark
 
@@ -54,12 +55,16 @@ def where_and_what(result):
     before = data.readings - design_readings(result)
     after = data.readings - result.trajectories.after
     shot = int(np.square(before).sum(axis=(1, 2)).argmax())
-    ax.plot(s, 1e3 * before[shot, :, 1], color=BEFORE, linewidth=1, label="the design leaves")
-    ax.plot(s, 1e3 * after[shot, :, 1], color=AFTER, linewidth=1, label="the ring as found leaves")
+    ax.plot(s, 1e3 * before[shot, :, 1], color=BEFORE, linewidth=1, label="readings less design")
+    ax.plot(
+        s, 1e3 * after[shot, :, 1], color=AFTER, linewidth=1, label="readings less estimated ring"
+    )
     mark(ax, result)
     ax.set(xlabel="s [m]", ylabel="y [mm]", xlim=(0, result.ring.length))
     ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize="small", frameon=False)
-    ax.set_title("One first turn: the gap begins at the culprit", loc="left", fontsize="medium")
+    ax.set_title(
+        "One first turn: the gap begins at the faulty magnet", loc="left", fontsize="medium"
+    )
     ax.grid(alpha=0.25)
     plot_scan_near(result, result.findings[0], below)
     return figure
@@ -117,7 +122,7 @@ def response():
 
 
 def together():
-    """Turns, dispersion and tunes of one machine: what was read, and what each leaves."""
+    """Turns, dispersion and tunes of one machine: readings, and the residuals of each."""
     from tmlattice.machine.stored_beam import simulate_dispersion, simulate_tunes, simulate_turns
     from tmlattice.plots.parts import plot_parts
 
@@ -133,7 +138,7 @@ def together():
 
 
 def real_ring():
-    """SOLEIL, 2012: its response less the lattice of the file, and less the ring as found."""
+    """SOLEIL, 2012: its response less the lattice of the file, and less the estimated ring."""
     from tmlattice.importers import bring_in
     from tmlattice.plots.response import plot_left
 
@@ -176,7 +181,7 @@ def report():
 
 def table(page, first):
     """The rows of the table of a results page whose head begins so: lists of texts, head first."""
-    text = (FOLDER.parent / "results" / page).read_text(encoding="utf-8")
+    text = (RESULTS / page).read_text(encoding="utf-8")
     lines = text[text.index(f"| {first} |") :].split("\n\n")[0].splitlines()
     return [
         [cell.strip().strip("*`") for cell in line.strip("|").split("|")]
@@ -218,7 +223,7 @@ def main(names):
             path = FOLDER / f"{name}.png"
             figure.savefig(path, dpi=100)
             plt.close(figure)
-            shrink(path)
+            shrink(path, name)
             print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB")
 
 

@@ -1,13 +1,19 @@
 #!/usr/bin/env bash
-# packaging/check.sh PYTHON...: build sdist and wheel, check them, install the wheel into an empty
-# environment of each PYTHON (outside the source), and use it there.
+# packaging/check.sh PYTHON...: render the conda recipe, build sdist and wheel, check them, install
+# the wheel into an empty environment of each PYTHON (outside the source), and use it there.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$(pwd) scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 
 "${1:-python3}" -m venv "$scratch/build"
-"$scratch/build/bin/pip" install --quiet build twine
+"$scratch/build/bin/pip" install --quiet build twine py-rattler-build
+"$scratch/build/bin/python" - << 'END'
+import rattler_build as conda
+
+recipe = conda.Stage0Recipe.from_file("packaging/conda/recipe.yaml")
+print(*(str(one.recipe.to_dict()["package"]) for one in recipe.render(conda.VariantConfig())))
+END
 "$scratch/build/bin/python" -m build --outdir "$scratch/dist" .
 "$scratch/build/bin/twine" check --strict "$scratch"/dist/*
 

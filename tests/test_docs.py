@@ -10,12 +10,14 @@ from pathlib import Path
 
 import click
 import pytest
+from test_walls import FILES, ORDER, PACKAGE, imported
 
 import tmlattice
 from tmlattice.cli.command import tmlattice as command
 from tmlattice.effects import CATALOGUE
 
 ROOT = Path(__file__).parent.parent
+PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,29 @@ def test_no_mark_is_left_and_shots_are_in_the_format(site):
     assert "<!-- schema" not in page
     for field in ("shots[].launch_sigma.px", "columns[].kick", "findings[].credible_set[].effect"):
         assert f"<code>{field}</code>" in page, field
+
+
+def test_packages_are_drawn_in_their_order_and_every_import_is_a_way_up(site):
+    page = text(site, "contributing")
+    assert tuple(re.findall(r"<text [^>]*>(\w+)</text>", page)) == ORDER
+    arcs = re.findall(r'data-from="(\w+)" data-to="(\w+)"', page)
+    assert len(arcs) > len(ORDER)
+    reached = {name: {name} for name in ORDER}
+    for own, other in sorted(arcs, key=lambda arc: ORDER.index(arc[0])):
+        assert ORDER.index(other) < ORDER.index(own)
+        reached[own] |= reached[other]
+    for path in FILES:
+        own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if own in reached:
+            needed = {parts[0] for parts, _ in imported(path) if parts and parts[0] in reached}
+            assert needed <= reached[own], path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_scripts_and_tests_that_a_page_names_are_there(page):
+    named = re.findall(r"\b(?:benchmarks|tests|lattices)/[\w/]+\.py",
+                       page.read_text(encoding="utf-8"))  # fmt: skip
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_commands_have_no_default_where_they_have_none(site):

@@ -1,6 +1,6 @@
 """The report in a real browser: Chromium, driven by playwright, without a network.
 
-Debian's package `chromium` and `pip install '.[test]'` are all that it takes.
+Debian's package `chromium`, which `.ci/run` installs, and `pip install '.[test]'` are all it takes.
 """
 
 import json
@@ -21,7 +21,8 @@ from tmlattice.report.page import draw, page
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed: pip install '.[test]'"
 )
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+BROWSERS = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
+CHROMIUM = next(filter(None, BROWSERS), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt install chromium")
 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)

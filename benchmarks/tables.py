@@ -1,0 +1,120 @@
+"""The tables of the results' pages, from stored JSON: `python benchmarks/tables.py`.
+
+`docs/results/NAME.json` holds what one benchmark measured, with its command, seed, version and
+machine; a page shows it between `<!-- table NAME -->` and `<!-- end -->`. With `--store NAME
+COMMAND ...` a benchmark is run first and what it prints is stored, its last Markdown table as rows.
+"""
+
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+FOLDER = Path(__file__).parent.parent / "docs" / "results"
+PLACE = re.compile(r"(<!-- table (\w+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
+GPU = (
+    ("a turn of 100,000 particles (mean of ten)", "track 100000, a turn of ten",
+     "torch loop 100000, one turn"),
+    ("a turn of 1,000,000 particles (mean of ten)", "track 1000000, a turn of ten",
+     "torch loop 1000000, one turn"),
+    ("the same, design (65 % of its layers are linear)",
+     "track 1000000, the design, a turn of ten", None),
+    ("training step, 100,000 launches, 246 BPMs, all gradients", "training step 100000",
+     "torch loop, training step 100000"),
+    ("the same with the symplectic penalty", "training step 100000, with penalty", None),
+)  # fmt: skip
+OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling", "square")
+CORRECTED = ("before", "tmlattice", "oracle", "svd", "loco")
+BLIND = {"tool": "`diagnose`", "oracle": "oracle", "omp": "matching pursuit", "lasso": "LASSO",
+         "svd_gradients": "SVD, gradients"}  # fmt: skip
+BANDS = {"above 20": "20 and more", "10-20": "10 to 20", "5-10": "5 to 10"}
+
+
+def of_gpu(stored):
+    """Kernels and torch loop of `gpu.py`."""
+    yield ["H100, times in ms", "kernels", "torch loop", "ratio"]
+    for words, ours, plain in GPU:
+        both = (stored[plain], stored[plain] / stored[ours]) if plain else ()
+        yield [words, f"{stored[ours]:.3g}", *(f"{v:.0f}" for v in both), *[""] * (2 - len(both))]
+
+
+def of_corrections(machines):
+    """Medians over the machines of `correct.py`."""
+    yield ["quantity", *(m.upper() if m in ("svd", "loco") else m for m in CORRECTED)]
+    for key in OPTICS:
+        own = [[np.sqrt(np.mean(np.square(one[m][key]))) for one in machines] for m in CORRECTED]
+        yield [key.replace("_", " "), *(f"{np.median(values):.3g}" for values in own)]
+
+
+def of_score(scored):
+    """Rates of `tmlattice dev challenge score --json`, by signal to noise and method."""
+    yield ["single faults (tier A)", *BLIND.values()]
+    for band, words in BANDS.items():
+        found = scored["bands"][band]
+        cases = found["tool"]["detected"]["cases"]
+        yield [f"**signal to noise {words} ({cases} cases)**", *[""] * len(BLIND)]
+        for rate in found["tool"]:
+            text = rate.replace("_", " ")
+            yield [text, *(f"{100 * found[name][rate]['share']:.1f} %" for name in BLIND)]
+
+
+SOURCES = {"gpu_raw.json": of_gpu, "correct.jsonl": of_corrections, "blind_score.json": of_score}
+
+
+def filled(text):
+    """A page's text with its tables as they are stored."""
+
+    def made(place):
+        stored = json.loads((FOLDER / f"{place[2]}.json").read_text(encoding="utf-8"))
+        rows = stored.get("rows")
+        if rows is None:
+            source = (FOLDER / stored["source"]).read_text(encoding="utf-8")
+            if stored["source"].endswith(".jsonl"):
+                source = f"[{','.join(source.splitlines())}]"
+            rows = SOURCES[stored["source"]](json.loads(source))
+        head, *others = rows
+        table = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *others)]
+        return "\n".join([place[1], *table, place[3]])
+
+    return PLACE.sub(made, text)
+
+
+def store(name, command, folder=FOLDER):
+    """Run a benchmark and store its lines and its table, with what it was made with."""
+    from tmlattice.files import write_json
+    from tmlattice.version import __version__
+
+    lines = []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
+        for line in running.stdout or ():
+            print(line, end="", flush=True)
+            lines.append(line.rstrip())
+    if running.returncode:
+        sys.exit(f"it ended with {running.returncode}: nothing is stored")
+    tables = re.findall(r"(?:^\|.*\n)+", "\n".join([*lines, ""]), re.MULTILINE)
+    rows = [[cell.strip() for cell in line.strip("|").split("|")]
+            for line in (tables[-1].splitlines() if tables else ())]  # fmt: skip
+    commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=FOLDER, text=True,
+                            stdout=subprocess.PIPE, check=False)  # fmt: skip
+    seed = re.search(r"--(?:seeds?|first) ([\d ]*\d)", " ".join(command))
+    stored = {
+        "command": " ".join(command),
+        "seed": seed[1] if seed else "the command's default",
+        "version": f"{__version__}, commit {commit.stdout.strip() or 'unknown'}",
+        "machine": f"{platform.platform()}, {os.cpu_count()} cores, {platform.python_version()}",
+        "lines": lines,
+        "rows": rows[:1] + rows[2:],
+    }
+    write_json(folder / f"{name}.json", stored)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--store"]:
+        store(sys.argv[2], sys.argv[3:])
+    for page in FOLDER.glob("*.md"):
+        page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
