@@ -9,8 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.checks import check_energy, check_values, places_of, spread
-from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.monitors import (
+    Names,
+    check_energy,
+    check_values,
+    noise_table,
+    places_of,
+    spread,
+)
 from tmlattice.measurement.orbit_response import RfStep, check_rf
 from tmlattice.measurement.shown import Shown
 

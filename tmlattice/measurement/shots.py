@@ -1,25 +1,28 @@
-"""Shots as the monitors read them: checks, a part of them, and other monitors."""
+"""Shots as monitors read them; those of a stored beam are closed orbits and turns after a kick."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.checks import (
+from tmlattice.measurement.monitors import (
+    Names,
     Settings,
     check_energy,
     check_values,
     checked_shots,
+    noise_table,
     places_of,
     shot_places,
     spread,
 )
-from tmlattice.measurement.monitors import Names, noise_table
 from tmlattice.measurement.shown import Shown
+
+Array = NDArray[np.float64]
 
 
 class Shots(Shown):
@@ -122,3 +125,75 @@ class Shots(Shown):
             **{name: None if values is None else values[at] for name, values in of_shots.items()},
         }
         return replace(own, **changed)  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ClosedOrbit(Shots):
+    """Closed orbits, absolute: what the monitors read, offsets and all.
+
+    Attributes:
+        orbit: (x, y) in m, [shot, monitor, 2]; NaN where missing.
+        monitors: names, in the order of the readings.
+        noise: rms of one (averaged) reading, m, [monitor, 2], NaN where unknown; None: all unknown.
+            A pair (x, y), or a mapping of pairs by monitor, is taken too.
+        settings: of each shot, see `Measurement`; () for the design's in every shot.
+        shots: their ids; () for 0, 1, ...
+        lattice, energy: what the data state about them (GeV); hints.
+
+    Raises:
+        MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
+    """
+
+    READ: ClassVar[str] = "orbit"
+    AXES: ClassVar[tuple[str, ...]] = ("shot",)
+
+    orbit: Array
+    monitors: tuple[str, ...]
+    noise: Array | None = None
+    settings: tuple[Settings, ...] = ()
+    shots: tuple[int, ...] = ()
+    lattice: str | None = None
+    energy: float | None = None
+
+
+FEWEST, MOST = 16, 10_000
+"""Turns: fewer have no line, more have lines that no decohering beam keeps."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TurnByTurn(Shots):
+    """Readings of a stored beam that was kicked before turn 0, on each of many turns.
+
+    Attributes:
+        readings: (x, y) in m, [shot, turn, monitor, 2]; NaN where missing, as behind a lost beam.
+        monitors: names, in the order of the readings.
+        noise: rms of one reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
+            (x, y), or a mapping of pairs by monitor, is taken too.
+        settings: of each shot, see `Measurement`; () for the design's in every shot.
+        shots: their ids; () for 0, 1, ...
+        lattice, energy: what the data state about them (GeV); hints.
+        devices: names that the control system has for monitors and correctors, by the names here;
+            empty: unknown.
+
+    Raises:
+        MeasurementError: shapes that do not fit, numbers that cannot be, no reading at all, or
+            less than 16 or more than 10,000 turns.
+    """
+
+    readings: Array
+    monitors: tuple[str, ...]
+    noise: Array | None = None
+    settings: tuple[Settings, ...] = ()
+    shots: tuple[int, ...] = ()
+    lattice: str | None = None
+    energy: float | None = None
+    devices: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        turns = self.readings.shape[1]
+        if not FEWEST <= turns <= MOST:
+            raise MeasurementError(
+                f"{turns} turns are no turn-by-turn measurement, which has {FEWEST} to {MOST}; "
+                + ("give fewer" if turns > MOST else "first turns are of the kind 'trajectory'")
+            )

@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement.checks import Settings, check_settings
-from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import located
 from tmlattice.measurement.header import header, read_noise
+from tmlattice.measurement.monitors import Settings, check_settings
 from tmlattice.measurement.orbit_response import RfStep
 from tmlattice.measurement.rows import Rows, check_size, dense, match_names, read_rows
+from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.tune_reading import TuneReading
-from tmlattice.measurement.turn_by_turn import TurnByTurn
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]

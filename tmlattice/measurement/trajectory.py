@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.checks import Settings
+from tmlattice.measurement.monitors import Settings
 from tmlattice.measurement.shots import Shots
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement.checks import Settings, check_energy, checked_shots
+from tmlattice.measurement.monitors import Settings, check_energy, checked_shots
 from tmlattice.measurement.shown import Shown
 
 Array = NDArray[np.float64]

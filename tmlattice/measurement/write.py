@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
-from tmlattice.measurement.checks import Settings, check_settings
 from tmlattice.measurement.documents import Digest
 from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
 from tmlattice.measurement.header import finite, header
-from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.monitors import Names, Settings, check_settings, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse
 from tmlattice.measurement.rows import check_size
 from tmlattice.measurement.stored_files import (
