@@ -177,9 +177,9 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
 
 
 def fitted_orbit_kicks(at: Predicted) -> Array | None:
-    """What makes the dispersion that the errors have beside the ring's, as kicks behind each magnet
-    in x and y, rad, [magnet, 2]: see `ResponseModel`. In the ring with its errors, in which other
-    kicks make it than in the design. None where there is no such dispersion.
+    """Return the kicks behind each magnet that make the dispersion beyond the ring's own, rad, [magnet,
+    2], see `ResponseModel`; None without such a dispersion. They are those of the ring with its
+    errors.
     """
     ring, orbit_kicks = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
     beside = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))

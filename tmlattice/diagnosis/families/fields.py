@@ -324,7 +324,7 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
 
     Args:
         ring: the ring.
-        beside: ways beside such a wiggler too.
+        beside: include straights next to such a wiggler.
     """
     found, ways = list[Element](), list[Element]()
     within, bends = list[_Placed](), list[float]()

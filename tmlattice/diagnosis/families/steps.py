@@ -1,8 +1,8 @@
 """Families of errors of a hierarchical fit of an orbit response: each is one object.
 
 To add one, write a class with its places, prior, rows, how its values are put among the errors and
-how they are told as causes (`family.Family`; those of fields in the ring stand in `fields`, of the
-beam's energies in `energy`); and name it in `STEPS`, which says when it is tried.
+how they are reported as causes (`family.Family`; those of fields in the ring are in `fields`); and
+name it in `STEPS`, which is the order of the trials.
 
 Families with the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
@@ -318,7 +318,7 @@ class Trial:
     """Families that are tried together.
 
     Attributes:
-        families: the first one's block says who judges.
+        families: the first one's block has the validation set.
         own, across: rounds in-plane, and before them rounds of the other plane.
     """
 
