@@ -219,8 +219,8 @@ class Diagnosis(Speaks):
         hypotheses: effects that may be missing, with scores; None: not tested.
         suspects: first places to inspect for an undetected fault.
         dispersion: additional to that of the estimated ring, for `write_calibration`.
-        rejected_channels: those that the model cannot describe: (monitor, "x" or "y"), or (corrector,
-            None).
+        rejected_channels: those that the model cannot describe: (monitor, "x" or "y"), or
+            (corrector, None).
         compared: blocks of readings with their prediction by the result.
         correlations: pairs of amounts that the data hardly separate.
         covariance: of the amounts of the causes, [cause, cause]; None where none is stated, as of

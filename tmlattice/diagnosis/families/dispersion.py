@@ -177,9 +177,10 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
 
 
 def fitted_orbit_kicks(at: Predicted) -> Array | None:
-    """Return the kicks behind each magnet that make the dispersion beyond the ring's own, rad, [magnet,
-    2], see `ResponseModel`; None without such a dispersion. They are those of the ring with its
-    errors.
+    """Return the kicks behind each magnet that make the dispersion beyond the ring's own, rad.
+
+    They are those of the ring with its errors, [magnet, 2], see `ResponseModel`; None without such
+    a dispersion.
     """
     ring, orbit_kicks = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
     beside = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))
