@@ -531,8 +531,8 @@ DEFECTS = (
     defect(
         "a corrector resembles nothing", readings(random_corrector), "v5", others=1, verdicts=ANY
     ),
-    defect("the beam moves in y", moved(1, 20), "the beam moved"),
-    defect("the beam moves little in x", moved(0, 5), "the beam moved"),
+    defect("the beam moves in y", moved(1, 20), "beam jitter between"),
+    defect("the beam moves little in x", moved(0, 5), "beam jitter between"),
     defect("the energy drifts", drifting),
     *(
         defect(

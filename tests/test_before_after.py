@@ -7,7 +7,6 @@ from collections import Counter
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -16,7 +15,6 @@ from click.testing import CliRunner
 
 from tmlattice import diagnose, load_ring
 from tmlattice.cli.command import tmlattice
-from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
@@ -183,25 +181,6 @@ def test_the_largest_drift_is_no_finding(small_ring, before):
     broken = Cause("monitor_gain_y", "bpm::6", 0.2)
     (own,) = diagnose(small_ring, machine(small_ring, [broken], seed=2), reference=before).findings
     assert (own.effect, own.element) == ("monitor_gain_y", "bpm::6")
-
-
-def test_a_fit_of_everything_is_held_against_few_causes_in_the_planes_that_were_read():
-    """NaN of a plane that nobody read counts for neither."""
-
-    def fit(in_plane, coupling):
-        said = SimpleNamespace(in_plane=in_plane, coupling=coupling)
-        split = SimpleNamespace(held=None)
-        state = SimpleNamespace(good=None, split=split, said=said)
-        return SimpleNamespace(state=state, heldout=(None, said))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sparse, "score", lambda state, held: state.said)
-        patch.setattr(sparse, "replace", lambda state, good: state)
-        knows = sparse.outperforms
-        assert knows(fit(1e-6, np.nan), fit(2e-6, np.nan))
-        assert not knows(fit(2e-6, np.nan), fit(2e-6, np.nan))
-        assert knows(fit(2e-6, 1e-6), fit(2e-6, 2e-6))
-        assert not knows(fit(2e-6, 2e-6), fit(1e-6, 2e-6))
 
 
 def test_the_changed_supply_and_the_changed_magnet_are_found_and_no_other(change):

@@ -212,7 +212,7 @@ def test_a_file_that_was_found_runs_no_code(tmp_path):
                       ["import", "a.csv", "--out", "I"]):  # fmt: skip
             (tmp_path / "a.csv").write_text("shot,end_1 x [mm]\n0,1\n")
             done = tmlattice(*words, cwd=tmp_path, check=2)
-            assert "is Python code, which would be run; if you trust both" in done.stderr
+            assert "is Python code, which would be run; if you trust that file, and" in done.stderr
             assert not (tmp_path / "MARK").exists()
     tmlattice("info", "--machine", "tmlattice.toml", cwd=tmp_path, check=0)
     assert (tmp_path / "MARK").exists()

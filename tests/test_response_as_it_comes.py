@@ -95,7 +95,7 @@ def test_readings_of_the_rf_that_went_wrong_are_named(ring, measured):
     result = diagnose(ring, rf_zero(measured, ring))
     assert left(result) < 1.25
     assert not result.findings
-    words = "readings of the RF's orbit that stick out"
+    words = "outlier readings of the RF's orbit"
     (sentence,) = (own for own in result.warnings if words in own)
     named = set(sentence.rstrip(".").rsplit(": ", 1)[1].split(", "))
     assert named

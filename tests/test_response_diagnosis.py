@@ -312,7 +312,7 @@ def test_options_act_and_are_told(small_ring, measured):
     assert options["effects"] == ["corrector_calibration", "monitor_gain_x", "quadrupole_gradient"]
     assert options["max_effects"] == 1
     assert options["false_alarm"] == 0.01
-    with pytest.raises(MeasurementError, match="does not see monitor_offset_x"):
+    with pytest.raises(MeasurementError, match="not sensitive to monitor_offset_x"):
         diagnose(small_ring, measured, effects=["monitor_offset_x"])
     with pytest.raises(MeasurementError, match="'radiation' has no meaning for an orbit response"):
         diagnose(small_ring, measured, radiation=True)

@@ -91,7 +91,7 @@ def test_reversed_monitors_and_correctors_are_fitted_and_named(small_ring, whole
     fit = fit_steps(response_data(small_ring, data), split, STEPS[:3])
     assert fit.steps[-1].heldout_rms_in_plane < 3e-8
     assert reversed_ones(fit.state) == [
-        "monitors that read with the wrong sign: "
+        "BPMs that read with the wrong sign: "
         f"{data.monitors[7]} in x, {data.monitors[7]} in y, {data.monitors[20]} in y",
         f"correctors that kick with the wrong sign: {data.correctors[3]}",
     ]
@@ -170,6 +170,6 @@ def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_
         response[place] += 20 * np.nanstd(response)
     data = replace(whole, response=response)
     measured, (said,) = without_gross(data, response_data(small_ring, data))
-    assert said.endswith(f"left out: 4; most at {whole.correctors[2]} (2)")
+    assert said.endswith(f"rejected: 4; most at {whole.correctors[2]} (2)")
     gone = np.isnan(measured.response) & np.isfinite(response)
     assert [tuple(place) for place in np.argwhere(gone)] == places

@@ -91,8 +91,8 @@ def test_readings_that_went_wrong_are_left_out_by_the_fit_and_their_monitors_sta
     split = split_columns(data, 0.2, np.random.default_rng(1))
     fit = fit_steps(data, split, STEPS[:3])
     (said,) = fit.messages
-    assert said.startswith("single readings that differ from the fit by 20 times")
-    assert "left out: 12" in said
+    assert said.startswith("outlier readings, which differ from the fit by more than 20 times")
+    assert "rejected: 12" in said
     assert np.isnan(fit.state.data.orbits).sum() == 12
     assert fit.state.good.all()
     assert fit.steps[-1].heldout_chi2_per_dof < 1.5
@@ -111,7 +111,7 @@ def test_a_tenth_of_the_readings_that_a_step_has_are_no_single_ones(
     data = response_data(small_ring, replace(clean, response=response))
     split = split_columns(data, 0.2, np.random.default_rng(1))
     fit = fit_steps(data, split, STEPS[:3])
-    assert any(said.startswith("single readings") for said in fit.messages) == alone
+    assert any(said.startswith("outlier readings") for said in fit.messages) == alone
 
 
 def lagging(response, planes, columns, late):
@@ -134,7 +134,7 @@ def test_steps_that_some_monitors_read_too_early_are_left_out_and_named(small_ri
     assert not fit_steps(data, split, [STEPS[0], STEPS[2]]).messages  # gains may break triples, too
     fit = fit_steps(data, split, STEPS[:3])
     (said,) = fit.messages
-    told_of = said.split("left out: ")[1].split(";")[0].split(", ")
+    told_of = said.split("rejected: ")[1].split(";")[0].split(", ")
     assert sorted(told_of) == sorted(names[c] for c in columns)
     assert fit.steps[-1].heldout_chi2_per_dof < 1.5
     assert not fit.state.split.held[columns].any()
@@ -273,8 +273,8 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
 
     still, told = found(measured), found(moved)
     assert still.state.jitter is None
-    (said,) = (one for one in told.messages if "the beam moved" in one)
-    assert f"rms in {plane} (as from " in said
+    (said,) = (one for one in told.messages if "beam jitter" in one)
+    assert f"rms in {plane} (as by kicks behind " in said
     assert f"rms in {'xy'[rests]}" not in said
     patterns = told.state.jitter[moves]
     assert not told.state.jitter[rests].any()

@@ -124,6 +124,16 @@ def test_usual_errors_are_no_fault(small_ring, measured_with):
     assert result.verdict == "distributed"
 
 
+def test_gradient_errors_that_three_causes_explain_in_part_are_distributed(small_ring):
+    """Three causes left noise in most readings, but neither in plane nor in the RF's orbit."""
+    measured = simulate_response(
+        small_ring, background={"quadrupole_gradient": 1e-3}, progress=False, seed=0
+    ).measured
+    result = diagnose(small_ring, measured)
+    assert (result.verdict, result.findings) == ("distributed", ())
+    assert result.unexplained["p_value"] > 1e-3
+
+
 def test_exchanged_planes_of_a_monitor_are_put_back_and_told(small_ring, measured_with):
     """They were a bad monitor, left out without a reason."""
     measured = measured_with(Cause("monitor_swap", "end_6", 1.0))

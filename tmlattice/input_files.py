@@ -5,6 +5,7 @@ Everything that a user or another program hands over is opened here, or by
 """
 
 import difflib
+import gc
 import json
 import math
 import os
@@ -101,6 +102,25 @@ def zip_of(path: Path, error: type[TmlatticeError], wanted: str) -> BytesIO:
     return content
 
 
+def check_no_code(file: Path, lattice: str, error: type[TmlatticeError], instead: str) -> None:
+    """Whether a lattice that a file of data names is data too.
+
+    Args:
+        file: names it.
+        lattice: a built-in name or a path.
+        error: raised.
+        instead: how a user who trusts it has it run.
+
+    Raises:
+        error: it is Python code.
+    """
+    if Path(lattice).suffix.casefold() == ".py":
+        raise error(
+            f"{file}: its lattice '{plain(lattice, 60)}' is Python code, which would be run; "
+            f"if you trust that file, {instead}"
+        )
+
+
 def text_of(path: Path, error: type[TmlatticeError]) -> str:
     """The text of a file in UTF-8.
 
@@ -126,9 +146,12 @@ def json_of(path: Path, error: type[TmlatticeError], finite: bool = True) -> Any
         error: as of `text_of`, or no JSON, with the line; a key that stands twice in one object;
             a number of hundreds of digits; or lists in lists without end.
     """
+    text = text_of(path, error)
+    collects = gc.isenabled()
+    gc.disable()  # finalizers that run where the recursion is deepest print past everybody
     try:
         return json.loads(
-            text_of(path, error),
+            text,
             object_pairs_hook=_once,
             parse_int=_whole,
             parse_constant=_no_constant if finite else float,
@@ -138,8 +161,13 @@ def json_of(path: Path, error: type[TmlatticeError], finite: bool = True) -> Any
             f"{path}, line {problem.lineno}: not JSON ({problem.msg}); correct it, or write it "
             "again"
         ) from problem
-    except (ValueError, RecursionError) as problem:
+    except ValueError as problem:
         raise error(f"{path}: {problem}") from problem
+    except RecursionError as problem:
+        raise error(f"{path}: nested too deep; write it flatter") from problem
+    finally:
+        if collects:
+            gc.enable()
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

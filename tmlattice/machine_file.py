@@ -18,7 +18,7 @@ from tmlattice.correction.knobs import Knob, knobs_of, read_knobs
 from tmlattice.errors import MachineFileError, plain
 from tmlattice.importers import Options, Told, bring_in
 from tmlattice.importers.imported import Imported
-from tmlattice.input_files import check_shape, toml_of
+from tmlattice.input_files import check_no_code, check_shape, toml_of
 from tmlattice.lattice import Ring, builtin_lattices, load_ring
 from tmlattice.measurement import AnyMeasurement, read_measurement
 from tmlattice.measurement.arrays import METRES
@@ -60,11 +60,9 @@ class MachineFile:
         path = Path(self.lattice)
         if self.lattice.casefold() in builtin_lattices():
             return self.lattice
-        if path.suffix.casefold() == ".py" and not self.trusted:
-            raise MachineFileError(
-                f"{self.path}: its lattice '{plain(self.lattice, 60)}' is Python code, which would "
-                f"be run; if you trust both files, give --machine {self.path}"
-            )
+        if not self.trusted:
+            instead = f"and this one, give --machine {self.path}"
+            check_no_code(self.path, self.lattice, MachineFileError, instead)
         if not path.is_file():
             raise MachineFileError(
                 f"{self.path}: no lattice file '{plain(self.lattice, 60)}'; correct `file` in "

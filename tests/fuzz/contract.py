@@ -30,6 +30,7 @@ from damage import (
     damaged_mat,
     damaged_names,
     damaged_sizes,
+    damaged_toml,
     damaged_yaml,
 )
 
@@ -37,7 +38,10 @@ SECONDS = 5.0
 HANG = 60
 """s, of a clock."""
 BYTES = 1 << 30
-VALUES = {".json": damaged_json, ".mat": damaged_mat, ".h5": damaged_hdf5, ".yaml": damaged_yaml}
+VALUES = {
+    ".json": damaged_json, ".mat": damaged_mat, ".h5": damaged_hdf5, ".yaml": damaged_yaml,
+    ".toml": damaged_toml,
+}  # fmt: skip
 """By what a file is: damage to its types and values, every second time."""
 BINARY = (".mat", ".h5", ".sdds", ".npz", ".pt")
 """Files with sizes in them; the others have names in them."""

@@ -115,6 +115,22 @@ def damaged_json(rng, content):
     return _damaged_document(rng, json.loads(content))
 
 
+def damaged_toml(rng, content):
+    """The same of TOML, whose values are written in one line each."""
+    import tomllib
+
+    made = json.loads(_damaged_document(rng, tomllib.loads(content.decode())))
+    return "\n".join(f"{json.dumps(k)} = {_as_toml(v)}" for k, v in made.items()).encode()
+
+
+def _as_toml(value):
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {_as_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_as_toml, value)) + "]"
+    return {"NaN": "nan", "Infinity": "inf"}.get(json.dumps(value), json.dumps(value))
+
+
 ODD_YAML = (
     "a: &a [x, x]\nb: &b [*a, *a]\nnames: [*b, *b]\n", "names: " + "[" * 9000, "unit: [mm]\n",
     "noise: 2001-13-45\n", "noise: " + "9" * 6000, "? [a, b]\n: c\n", "names: !!binary =\n",

@@ -191,6 +191,82 @@ def write_calibration(folder):
     return {"calibration": (words, "calibration.json")}
 
 
+def write_results(folder):
+    """Diagnoses with all that they leave: read again, compared, corrected with a table of knobs."""
+    for kind in ("response", "closed-orbit"):
+        words = ["diagnose", "ring.json", kind, "--background", "all"][: 3 if kind[0] == "r" else 5]
+        tmlattice(*words, "--out", f"of {kind}", "--lattice-out", f"{kind}.json", "-q",
+                  cwd=folder, check=0)  # fmt: skip
+    estimated = ["correct", "response.json", "--design", "ring.json"]
+    tmlattice(*estimated, "--example", "knobs.csv", cwd=folder, check=0)
+    (folder / "knobs.yaml").write_text(
+        "- {knob: qf, unit: A, present: 100, low: 80, high: 120, step: 0.1,\n"
+        "   curve: ['0:0', '150:1.35']}\n- {knob: new, members: ['qd::1'], step: 1e-5}\n"
+    )
+    (folder / "supplies.toml").write_text(SUPPLIES)
+    settle = [*estimated, "--out", "settled", "-q"]
+    of_folder = ["correct", "of response", "--out", "settled", "-q"]
+    report = ["report", "of response"]
+    compare = ["compare", "of response", "of closed-orbit"]
+    change = ["diagnose", "ring.json", "closed-orbit", "--reference", "earlier", "--settings",
+              "asked.csv"]  # fmt: skip
+    (folder / "asked.csv").write_text(
+        "device,present,new,change,unit,low,high,gain\nch::0,0,0.0001,0.0001,rad,,,1\n"
+    )
+    init = ["init", "ring.json", "room/readings.h5", "--machine", "new.toml", "--force", "-q"]
+    shutil.copytree(folder / "response", folder / "other")
+    for words in (settle, report, init):
+        tmlattice(*words, cwd=folder, check=0)
+    return {
+        "report": (report, "of response/diagnosis.json"),
+        "report, lattice": (report, "of response/diagnosis.lattice.json"),
+        "compare, diagnoses": (compare, "of closed-orbit/diagnosis.json"),
+        "compare, responses": (["compare", "response", "other"], "other/response.csv"),
+        "compare, lattices": (["compare", "own.json", "response.json"], "own.json"),
+        "correct, diagnosis": (of_folder, "of response/diagnosis.json"),
+        "correct, known": (settle, "response.json.known.json"),
+        "correct, calibration": (settle, "response.json.calibration.json"),
+        "knobs .csv": ([*settle, "--knobs", "knobs.csv"], "knobs.csv"),
+        "knobs .yaml": ([*settle, "--knobs", "knobs.yaml"], "knobs.yaml"),
+        "supplies": ([*of_folder, "--machine", "supplies.toml"], "supplies.toml"),
+        "settings of a correction": (change, "asked.csv"),
+        "init": (init, "room/readings.h5"),
+    }
+
+
+SUPPLIES = """
+[lattice]
+file = "ring.json"
+energy = 3.0
+particle = "electron"
+monitors = ["m*"]
+correctors = ["c*"]
+[data]
+unit = "mm"
+noise = "20 um"
+bad = ["m::5"]
+in_order = true
+assume = ["x-reversed"]
+columns = {monitor = "pv", shot = "cycle"}
+[channels]
+"SR:1" = "m::0"
+[[supplies]]
+knob = "qf"
+unit = "A"
+present = 100.0
+low = 80
+high = 120
+step = 0.1
+curve = [[0, 0], [150, 1.35]]
+error = 0.01
+[[supplies]]
+knob = "trim"
+kind = "quadrupole"
+members = ["qd::1"]
+step = 1e-5
+"""
+
+
 def write_lattices(ten, folder):
     """MAD-X's TWISS table, and OCELOT's code, which is run: what is wrong in it is a sentence."""
     from test_other_codes import table
@@ -213,5 +289,6 @@ def write_measured(ten, folder):
         **write_turns_of_others(folder),
         **write_together(folder),
         **write_calibration(folder),
+        **write_results(folder),
         **write_lattices(ten, folder),
     }

@@ -26,7 +26,7 @@ from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError, plain, unknown_choice
 from tmlattice.files import output_file, write_json
-from tmlattice.input_files import check_shape, json_of, zip_of
+from tmlattice.input_files import check_no_code, check_shape, json_of, zip_of
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.load import contents
 from tmlattice.measurement import (
@@ -223,11 +223,9 @@ def check_lattice(place: Path, lattice: Any, trusted: str | None) -> str:
     """
     if not isinstance(lattice, str) or not lattice:
         raise TmlatticeError(f"{place}: its lattice is {lattice!r:.40}; it should be a name")
-    if Path(lattice).suffix.casefold() == ".py" and lattice != trusted:
-        raise TmlatticeError(
-            f"{place}: its lattice '{lattice}' is Python code, which would be run; if you trust "
-            f"that file, give --lattice {lattice} (in Python: lattice=)"
-        )
+    if lattice != trusted:
+        instead = f"give --lattice {plain(lattice, 60)} (in Python: lattice=)"
+        check_no_code(place, lattice, TmlatticeError, instead)
     return lattice
 
 

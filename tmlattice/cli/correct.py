@@ -114,9 +114,9 @@ def correct(
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out)) if out else None
         extra = files.enter_context(output_file(json_file)) if json_file else None
-        path, named = _sources(estimated)
+        path, start = _sources(estimated, design)
         machine = machine_file()
-        start = design or named or (machine.lattice_name() if machine else None)
+        start = start or (machine.lattice_name() if machine else None)
         if not start:
             raise click.UsageError(f"name the lattice that was diagnosed with --design{HINT}")
         settings = open_ring(start)
@@ -146,27 +146,36 @@ def correct(
             screen.print(f"\nwritten: {'; '.join(written)}", soft_wrap=True)
 
 
-def _sources(estimated: Path) -> tuple[Path, str | None]:
-    """The estimated lattice's file, and the design where a diagnosis names it.
+def _sources(estimated: Path, design: str | None) -> tuple[Path, str | None]:
+    """The estimated lattice's file, and the design: the one that is given, else a diagnosis's.
 
     Raises:
-        MeasurementError: no such file, or a diagnosis that wrote no estimated lattice.
+        MeasurementError: no such file, no diagnosis, or one that wrote no estimated lattice or
+            names Python code.
     """
-    from tmlattice.errors import MeasurementError
-    from tmlattice.input_files import json_of
+    from tmlattice.diagnosis.load import DOCUMENT, FORMAT, LATTICE, VERSION
+    from tmlattice.errors import MeasurementError, plain
+    from tmlattice.input_files import check_no_code
+    from tmlattice.measurement.documents import read_document
 
     if not estimated.exists():
         raise MeasurementError(f"'{estimated}' is not there; check the path")
-    document = estimated / "diagnosis.json" if estimated.is_dir() else estimated
-    if document.name != "diagnosis.json":
-        return estimated, None
-    made = json_of(document, MeasurementError).get("provenance", {})
+    document = estimated / DOCUMENT if estimated.is_dir() else estimated
+    if document.name != DOCUMENT:
+        return estimated, design
+    made = read_document(document, "diagnosis", FORMAT, VERSION)["provenance"]
     if not made.get("lattice_out"):
         raise MeasurementError(
             f"'{document}' names no estimated ring; run `tmlattice diagnose` with --lattice-out, "
             "and give that file"
         )
-    return Path(made["lattice_out"]), made.get("lattice")
+    found, named, kept = made["lattice_out"], made["lattice"], document.with_name(LATTICE)
+    check_no_code(document, found, MeasurementError, f"give it instead of {estimated}")
+    if design is None and named.casefold().endswith(".py") and kept.is_file():
+        design = str(kept)  # the same ring, as data
+    if design is None:
+        check_no_code(document, named, MeasurementError, f"give --design {plain(named, 60)}")
+    return Path(found), design or named
 
 
 def _devices(knobs: str | None, settings: "Ring", targets: dict[str, float | None]) -> list[Any]:

@@ -27,6 +27,7 @@ from tmlattice.diagnosis.views import PartView, StoredView
 from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.inference.validation import Gap, Misfit
+from tmlattice.input_files import check_no_code
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.measurement.documents import read_document
 
@@ -69,6 +70,9 @@ def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diag
 
 def _ring(file: Path, document: Mapping[str, Any]) -> Ring:
     beside, named = file.with_name(LATTICE), str(document["provenance"].get("lattice"))
+    if not beside.is_file():
+        instead = f"put {LATTICE} next to it, or give the lattice (in Python: ring=)"
+        check_no_code(file, named, MeasurementError, instead)
     try:
         ring = load_ring(beside if beside.is_file() else named)
     except TmlatticeError as error:

@@ -22,6 +22,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, TurnByTurn
 from tmlattice.measurement.arrays import METRES
 from tmlattice.measurement.lost_beam import about_sums, no_beam
+from tmlattice.measurement.rows import LARGEST_READING
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
@@ -76,7 +77,8 @@ def bring_readings(
         monitors: names to look for, instead of the lattice's.
 
     Raises:
-        MeasurementError: no table, no monitor of the ring, or a field that is no number.
+        MeasurementError: no table, no monitor of the ring, a field that is no number, or most
+            readings above 0.2 m.
         UnknownNameError: `told` names a monitor that the ring does not have.
     """
     told = told or Told()
@@ -113,6 +115,7 @@ def bring_readings(
     readings, silent = both[..., :SUM], no_beam(both[..., SUM])
     before = np.isfinite(readings).any(axis=3)
     readings[silent] = np.nan
+    said_of_large = _without_large(path, readings, names)
     left = [device for device in devices if monitor.get(device) is None]
     bad = sorted({names[at] for at in finder.bad if np.isfinite(readings[:, :, at]).any()})
     taken[:, :, sorted(finder.bad)] = False
@@ -149,11 +152,27 @@ def bring_readings(
             devices=devices_of,
         )
     sums = about_sums(both[..., SUM], silent, before, names)
-    said = [of_unit, beam, of_noise, *finder.said, *sums]
+    said = [of_unit, beam, of_noise, *finder.said, *sums, *said_of_large]
     if bad:
         said.append(f"bad monitors, left out as stated: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
     return Imported(data, ring, tuple(said), doubts, guessed)
+
+
+def _without_large(path: str, readings: Array, names: Sequence[str]) -> list[str]:
+    """Make readings that no pipe is wide enough for NaN, and return a sentence about them."""
+    large = np.abs(readings) > LARGEST_READING
+    count = int(large.sum())
+    if not count:
+        return []
+    if 2 * count > np.isfinite(readings).sum():
+        raise MeasurementError(
+            f"{path}: most readings are above {LARGEST_READING} m; state the unit of the file "
+            "(`unit` in [data] of tmlattice.toml)"
+        )
+    readings[large] = np.nan
+    of = [name for name, some in zip(names, large.any(axis=(0, 1, 3)), strict=True) if some]
+    return [f"rejected readings, above {LARGEST_READING} m: {count}, of {counted(of)}"]
 
 
 Found = tuple[list[str], list[int], list[Place], Array, list[str]]

@@ -1,17 +1,20 @@
 """What records of a stored beam's measurements have in common: checks, and monitors in order."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError, first_of
-from tmlattice.measurement.monitors import Names
-from tmlattice.measurement.trajectory import Settings, check_settings
+from tmlattice.errors import MeasurementError, first_of, unknown_name
+from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names
 
 Array = NDArray[np.float64]
+Settings = Mapping[str, Mapping[str, float]]
 Values = TypeVar("Values", Array, None, Array | None)
+
+SETTINGS = ("kick", "k1_relative", "k2_relative", "frequency_relative")
+"""What may be changed on purpose: rad, relative strengths, and the RF's relative frequency."""
 
 
 def check_values(values: Array, one: str) -> None:
@@ -29,8 +32,33 @@ def check_values(values: Array, one: str) -> None:
 
 def check_energy(energy: float | None) -> None:
     """Raises a MeasurementError for an energy that is not above zero, GeV."""
-    if energy is not None and not 0 < energy < np.inf:
-        raise MeasurementError(f"an energy of {energy:g} GeV cannot be; it is above zero")
+    if energy is not None and not 0 < energy < HIGHEST_ENERGY:
+        raise MeasurementError(
+            f"an energy of {energy:g} GeV cannot be; it is above zero, and in GeV"
+        )
+
+
+def check_settings(shot: int, settings: Settings) -> None:
+    """Settings of a shot are known, finite, and each element's own.
+
+    Raises:
+        MeasurementError: states which is not.
+        UnknownNameError: a setting that no element has.
+    """
+    Names("element", settings)
+    for element, changed in settings.items():
+        for name, amount in changed.items():
+            if name not in SETTINGS:
+                raise unknown_name("setting", name, SETTINGS)
+            if (name == "frequency_relative") != (element.casefold() == "rf"):
+                raise MeasurementError(
+                    f"shot {shot} sets '{name}' of '{element}'; frequency_relative belongs to "
+                    "the name 'rf', and nothing else does"
+                )
+            if not abs(amount) < np.inf:
+                raise MeasurementError(
+                    f"shot {shot} sets '{name}' of '{element}' to {amount}; give a finite number"
+                )
 
 
 def checked_shots(
@@ -66,13 +94,13 @@ def shot_places(shots: Sequence[int], wanted: Sequence[int]) -> list[int]:
     return [index[shot] for shot in wanted]
 
 
-def monitor_places(monitors: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Where the wanted monitors stand.
+def places_of(kind: str, known: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Where the wanted monitors, or correctors, stand among the known ones.
 
     Raises:
         UnknownNameError: one that is not there.
     """
-    names = Names("monitor", monitors)
+    names = Names(kind, known)
     return [names[name] for name in wanted]
 
 

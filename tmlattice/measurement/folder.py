@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement.arrays import Unit
+from tmlattice.measurement.checks import Settings, check_settings
 from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import check_table, located, read_document
@@ -24,13 +25,7 @@ from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.rows import dense, match_names, read_rows
 from tmlattice.measurement.stored_files import KINDS, TURNS, places_of
 from tmlattice.measurement.tables import read_table, read_turn_by_turn
-from tmlattice.measurement.trajectory import (
-    COORDINATES,
-    UNKNOWN_LAUNCH,
-    Measurement,
-    Settings,
-    check_settings,
-)
+from tmlattice.measurement.trajectory import COORDINATES, UNKNOWN_LAUNCH, Measurement
 from tmlattice.measurement.tune_reading import TuneReading
 from tmlattice.measurement.turn_by_turn import TurnByTurn
 from tmlattice.temporaries import locked

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
+from tmlattice.measurement.checks import Settings, check_settings
 from tmlattice.measurement.documents import Digest
 from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
 from tmlattice.measurement.header import finite, header
@@ -27,12 +28,7 @@ from tmlattice.measurement.stored_files import (
     quoted,
     reading_lines,
 )
-from tmlattice.measurement.trajectory import (
-    COORDINATES,
-    Measurement,
-    Settings,
-    check_settings,
-)
+from tmlattice.measurement.trajectory import COORDINATES, Measurement
 
 Array = NDArray[np.float64]
 

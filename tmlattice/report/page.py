@@ -4,10 +4,12 @@
 """
 
 import json
+import logging
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +17,16 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tmlattice.correction import Correction
 from tmlattice.diagnosis import Diagnosis
+from tmlattice.errors import TmlatticeError
+from tmlattice.input_files import content_of
 from tmlattice.report import correction_texts, response_text, tables
 from tmlattice.report import text as report
 from tmlattice.report.interactive import figures, strip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
 
 DPI = 130
 
@@ -60,8 +66,11 @@ def _rounded(value: Any) -> Any:
     return round(value, 1) if isinstance(value, float) else value
 
 
-def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Picture]:
-    """Figures (name, caption, figure) as PNG files in the folder, one open at a time."""
+def save(
+    figures: Iterable[tuple[str, str, "Figure"]], folder: Path, source: str = ""
+) -> list[Picture]:
+    """Figures (name, caption, figure) as PNG files in the folder, one open at a time; each with
+    its caption and its `source`, see `_source`."""
     import matplotlib.pyplot as plt
 
     pictures = []
@@ -70,7 +79,7 @@ def save(figures: Iterable[tuple[str, str, "Figure"]], folder: Path) -> list[Pic
         _no_formulas(figure)
         figure.savefig(path, dpi=DPI)
         plt.close(figure)
-        shrink(path, caption)
+        _shrink(path, caption, source)
         pictures.append(Picture(name, caption, path))
     return pictures
 
@@ -89,17 +98,15 @@ def _no_formulas(figure: "Figure") -> None:
             formatter.seq = [str(text).replace("$", r"\$") for text in formatter.seq]
 
 
-def shrink(path: Path, caption: str) -> None:
-    """Write a PNG file with a palette, a third as large, with its caption inside.
-
-    Rare colours are kept. The caption is for a report that is rendered again.
-    """
+def _shrink(path: Path, caption: str, source: str) -> None:
+    """Write a PNG file with a palette, a third as large, with texts for a report that is rendered
+    again; rare colours are kept."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     about = PngInfo()
     about.add_itxt("Description", caption)
-
+    about.add_itxt("Source", source)
     with Image.open(path) as picture:
         few = picture.convert("RGB").quantize(
             method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
@@ -107,19 +114,26 @@ def shrink(path: Path, caption: str) -> None:
     few.save(path, optimize=True, pnginfo=about)
 
 
-def pictures_in(folder: Path) -> list[Picture]:
-    """The figures of an earlier report that a folder holds."""
-    from PIL import Image, UnidentifiedImageError
+def _source(diagnosis: Diagnosis) -> str:
+    """A text that only figures of the same diagnosis have: its misfits."""
+    fits = (diagnosis.fit_before, diagnosis.fit_after)
+    return " ".join(repr(float(value)) for fit in fits for value in (fit.rms, fit.chi2_per_dof))
+
+
+def pictures_in(folder: Path, diagnosis: Diagnosis) -> list[Picture]:
+    """The figures of a diagnosis that a folder holds."""
+    from PIL import Image
 
     found = []
     for path in sorted(folder.glob("*.png")):
         try:
-            with Image.open(path) as picture:
-                caption = picture.info.get("Description")
-        except (UnidentifiedImageError, OSError, ValueError):
+            with Image.open(BytesIO(content_of(path, TmlatticeError))) as picture:
+                about = picture.info
+        except Exception:  # another program's, or damaged
+            log.info("%s is no figure", path, exc_info=True)
             continue
-        if isinstance(caption, str):
-            found.append(Picture(path.stem, caption, path))
+        if about.get("Source") == _source(diagnosis):
+            found.append(Picture(path.stem, str(about.get("Description")), path))
     return found
 
 
@@ -127,7 +141,8 @@ def draw(diagnosis: Diagnosis, folder: Path, correction: Correction | None = Non
     """Draw every figure of a diagnosis and of its correction as a PNG file in the folder."""
     from tmlattice.plots import diagnosis as drawn
 
-    return [*save(drawn.figures(diagnosis), folder), *draw_correction(correction, folder)]
+    own = save(drawn.figures(diagnosis), folder, _source(diagnosis))
+    return [*own, *draw_correction(correction, folder)]
 
 
 def draw_correction(correction: Correction | None, folder: Path) -> list[Picture]:

@@ -80,7 +80,7 @@ def render(path: str | PathLike[str], out: str | PathLike[str] | None = None) ->
     with output_folder(folder if out is None else Path(out)) as temporary:
         pictures = draw(diagnosis, temporary)
         drawn = {picture.name for picture in pictures}
-        pictures += [kept for kept in pictures_in(folder) if kept.name not in drawn]
+        pictures += [kept for kept in pictures_in(folder, diagnosis) if kept.name not in drawn]
         html = page(diagnosis, pictures)
         (temporary / "report.html").write_text(html, encoding="utf-8")
         (temporary / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")

@@ -96,7 +96,7 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(small_ring, further
     jsonschema.validate(json.loads(json.dumps(document)), schema)
     assert document["findings"][0]["to_check"].startswith("Check its position")
     assert f"LOCALISED: {one.words[0].upper()}{one.words[1:]}." in " ".join(found.report().split())
-    assert not any("kicked the beam" in said for said in found.warnings)
+    assert not any("spurious kick" in said for said in found.warnings)
     assert (found.steps[-1].heldout_chi2_per_dof > 10) == held
     assert not any(c.element == "v5" and abs(c.amount) > 0.01 for c in found.causes)
 

@@ -1,6 +1,6 @@
 """Families of closed-orbit kicks that change the dispersion, see `beam.kicks`.
 
-Dispersion from kicks would bias the gradients, because the RF's orbit is fitted too. Single kicks
+Dispersion by kicks would bias the gradients, because the RF's orbit is fitted, too. Single kicks
 are degenerate, so the parameters are amplitudes of patterns of independent kicks, as many as the
 BPMs separate. They are linearised in the design's optics.
 
@@ -44,9 +44,9 @@ class Patterns(NamedTuple):
 
     Attributes:
         rf: of the RF's orbit, m/rad, [pattern, monitor].
-        at_correctors: of the dispersion at those that kick in the plane, 0 at the others, m per
-            relative energy and rad, [pattern, corrector].
-        kicks: that make them, of a size of 1, [pattern, source].
+        at_correctors: of the dispersion at correctors of the plane, 0 at others, m per relative
+            energy and rad, [pattern, corrector].
+        kicks: relative kicks of each pattern, of norm 1, [pattern, source].
     """
 
     rf: Array
@@ -55,7 +55,7 @@ class Patterns(NamedTuple):
 
 
 def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
-    """The dispersion patterns of independent kicks of one size, as many as the BPMs separate."""
+    """Return the dispersion patterns of independent kicks of one size that the BPMs separate."""
     data, model = at.data, at.model
     if not np.isfinite(data.orbits[-1, :, plane]).any():
         return Patterns(*(np.zeros((0, n)) for n in (len(data.at), len(data.kicks) - 1, 0)))
@@ -75,7 +75,7 @@ class _PatternFamily(Family):
 
     @property
     def largest(self) -> float:
-        """Zero: a pattern has no members."""
+        """Zero: patterns have no members that could be faulty."""
         return 0.0
 
     def causes_of(
@@ -159,10 +159,10 @@ class VerticalKicks(_Kicks):
 
 
 def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
-    """A sentence for each plane in which the RF's orbit has something that no gradient makes.
+    """Yield a message for each plane in which kicks contribute to the RF's orbit.
 
     Args:
-        values: that were found, by variable.
+        values: fitted, by variable.
         data: the response.
     """
     for family, gradient in ((HorizontalKicks(), "gradient"), (VerticalKicks(), "skew gradient")):
@@ -177,17 +177,15 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
 
 
 def fitted_orbit_kicks(at: Predicted) -> Array | None:
-    """Return the kicks behind each magnet that make the dispersion beyond the ring's own, rad.
-
-    They are those of the ring with its errors, [magnet, 2], see `ResponseModel`; None without such
-    a dispersion.
-    """
+    """Return the kicks behind each magnet that make the fitted additional dispersion, in x and y,
+    rad, [magnet, 2], see `ResponseModel`; None without such dispersion. They are computed in the
+    estimated ring, where they differ from those in the design."""
     ring, orbit_kicks = at.data.ring, np.zeros((len(at.data.ring.magnets), 2))
-    beside = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))
+    added = np.broadcast_to(at.errors.dispersion, (len(at.data.at), 2))
     for plane in (0, 1):
-        if beside[:, plane].any():
+        if added[:, plane].any():
             patterns = patterns_of_kicks(at, plane)
-            amounts = np.linalg.lstsq(patterns.rf.T, beside[:, plane], rcond=None)[0]
+            amounts = np.linalg.lstsq(patterns.rf.T, added[:, plane], rcond=None)[0]
             orbit_kicks[kicking(ring, plane), plane] = amounts @ patterns.kicks
     return orbit_kicks if orbit_kicks.any() else None
 
@@ -199,7 +197,7 @@ def dispersion_beside(
     relative energy in x and y; empty where none was fitted.
 
     Args:
-        values: that were found, by variable.
+        values: fitted, by variable.
         data: the response.
     """
     found = [
@@ -223,8 +221,7 @@ def dispersion_beside(
 
 
 def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, float]]) -> Errors:
-    """The design with the additional dispersion of `dispersion_beside`, for other correctors and
-    BPMs."""
+    """The design with the dispersion of `dispersion_beside`, for other correctors and BPMs."""
     none = Errors.none(data)
     if not dispersion:
         return none
@@ -238,9 +235,9 @@ def errors_beside(data: ResponseData, dispersion: Mapping[str, tuple[float, floa
 
 
 LEAST_FOCUSING = 0.02
-"""Share of the strongest pattern below which a pattern is omitted; quadrupoles take it up."""
+"""Share of the strongest pattern below which one is omitted; quadrupole gradients absorb it."""
 TOGETHER = 32
-"""Bends whose rows are computed at a time."""
+"""Number of bends whose derivatives are computed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,25 +282,25 @@ class _Orbit(_PatternFamily):
 
 
 class HorizontalOrbit(_Orbit):
-    """The horizontal orbit by fields of bends: it focuses."""
+    """The horizontal orbit by field errors of bends, which focuses in sextupoles."""
 
     name, effect, effects = "horizontal orbit", "dipole_field", ("dipole_field",)
     block, variable = 0, "horizontal orbit"
 
 
 class VerticalOrbit(_Orbit):
-    """The vertical orbit by rolls of bends: it couples."""
+    """The vertical orbit by rolls of bends, which couples in sextupoles."""
 
     name, effect, effects = "vertical orbit", "dipole_roll", ("dipole_roll",)
     block, variable = 1, "vertical orbit"
 
 
 def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
-    """One family of each plane; none without sextupoles or bends.
+    """Return a family for each plane; none without sextupoles or bends.
 
     Args:
         ring: the design.
-        model: of it.
+        model: of the design.
     """
     magnets = ring.magnets
     bends = [i for i, e in enumerate(magnets) if e.kind == "bend" and e.angle]

@@ -23,14 +23,14 @@ class Family(ABC):
     """One kind of error, at all of its places.
 
     Attributes:
-        name: in options and logs; its priors' names begin so.
+        name: in options and logs; the names of its priors begin with it.
         effects: of the catalogue, as which it is reported.
         block: 0 in-plane, 1 coupling.
-        per: whose numbers they are: "monitor", "column" or "ring".
-        variable: the numbers that it moves; families that share one add up.
+        per: what has a number each: "monitor", "column" or "ring".
+        variable: the numbers that it changes; families that share one add up.
         trust: step bound of a number in one round, rms.
-        gross: limit above which a column's number starts from its own estimate; else
-            the column would have no weight until the rounds reach it.
+        gross: limit above which a column's number starts from its own estimate; otherwise the
+            column would have no weight until the rounds reach that value.
         rms, tails, most: prior of a single number: rms, degrees of freedom, largest rms.
     """
 
@@ -52,7 +52,7 @@ class Family(ABC):
 
     @property
     def largest(self) -> float:
-        """The largest fault of one member, in the unit of the numbers; 0: no members."""
+        """The largest fault of one member, in the unit of the numbers; 0: no single faults."""
         return find(self.effects[0]).largest
 
     @abstractmethod
@@ -80,15 +80,14 @@ class Family(ABC):
 
     @abstractmethod
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """The catalogue's effects (amounts, to their powers) of a unit of each number, for small
-        numbers."""
+        """Amounts of effects, to their powers, of a unit of each number, for small numbers."""
 
     def count(self, data: ResponseData) -> int:
         """The number of its parameters for a report."""
         return self.size(data)
 
     def lowest(self, data: ResponseData) -> Array | float:
-        """The lower bound of each number; any can be zero."""
+        """The lower bounds of the numbers, at most zero."""
         return -np.inf
 
     def doubt(self, values: Array, data: ResponseData) -> str | None:

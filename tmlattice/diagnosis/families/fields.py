@@ -1,6 +1,6 @@
 """Families of errors of fields in the ring: gradients, skew gradients, vertical focusing.
 
-The pieces of a magnet are one number of a family.
+All pieces of a magnet share one number.
 """
 
 from abc import abstractmethod
@@ -23,10 +23,9 @@ from tmlattice.observe.response_data import ResponseData
 Array = NDArray[np.float64]
 
 LARGEST_GRADIENT = 0.02
-"""Largest prior rms of one magnet, relative: a larger error is a broken magnet."""
+"""Largest prior rms of one magnet, relative: larger errors are faults."""
 FURTHEST = 0.05
-"""Largest prior rms of the distance to a corrector's field, m: beyond is another corrector's
-field."""
+"""Largest prior rms of the displacement of a corrector's field, m: beyond is another corrector."""
 
 
 class _Magnets(Family):
@@ -57,7 +56,7 @@ class _Magnets(Family):
         return out
 
     def units(self, values: Array) -> Array:
-        """The effect, unit and relative strength of each number."""
+        """Derivative of each gradient error by its number."""
         return np.ones(len(values))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
@@ -100,7 +99,7 @@ class QuadrupoleGradient(_Magnets):
         return [{e.name: 1.0 for e in own} for own in magnets(data.ring, ("quadrupole",), True)]
 
     def units(self, values: Array) -> Array:
-        """Gradients relative to the design's strength, not to the estimated one."""
+        """Factors from changes relative to the estimated gradients to changes of the design's."""
         return np.asarray(1 / (1 + values))
 
 
@@ -134,7 +133,7 @@ class _Thin(_Magnets):
 
 
 class BendGradient(_Magnets):
-    """Gradients of combined-function bends, relative to the design's: one number a type."""
+    """Gradients of combined-function bends, relative to the design's: one number per type."""
 
     name = effect = "bend_gradient"
     effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
@@ -142,7 +141,7 @@ class BendGradient(_Magnets):
     rms = 3e-3
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
-        """Zero: single bends of a type are degenerate with neighbouring quadrupoles."""
+        """The bends of each type: single ones are degenerate with neighbouring quadrupoles."""
         types: dict[str, dict[str, float]] = {}
         for own in magnets(data.ring, ("bend",), powered=True):
             types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
@@ -150,8 +149,7 @@ class BendGradient(_Magnets):
 
 
 class SkewGradient(_Thin):
-    """Skew gradients in rolled quadrupoles, and in sextupoles: of windings, and of a vertical
-    orbit."""
+    """Skew gradients of rolled quadrupoles, and of sextupoles: by windings, or a vertical orbit."""
 
     name = effect = "skew_gradient"
     effects: ClassVar[tuple[str, ...]] = ("skew_gradient",)
@@ -171,7 +169,7 @@ class SkewGradient(_Thin):
 
 
 class OtherGradient(_Thin):
-    """Gradients outside quadrupoles: of the orbit in sextupoles, of wigglers."""
+    """Gradients outside quadrupoles: by the orbit in sextupoles, and of wigglers."""
 
     name = effect = "gradient_absolute"
     effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
@@ -192,7 +190,7 @@ class VerticalFocusing(_Thin):
 
     @property
     def title(self) -> str:
-        """The family in dipoles includes it."""
+        """The name of its effect, and where: `EdgeFocusing` has the same effect."""
         return f"{self.effect} in straights"
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
@@ -203,14 +201,14 @@ class VerticalFocusing(_Thin):
         return sorted(devices, key=lambda own: own[0].s)
 
     def lowest(self, data: ResponseData) -> Array | float:
-        """Zero: a device focuses; only one of the design may focus less."""
+        """Zero in straights, because a device focuses; a wiggler of the design may focus less."""
         kinds = [data.ring[place].kind for place in self.places(data)]
         return np.where([kind == "wiggler" for kind in kinds], -np.inf, 0.0)
 
 
 class FocusingChange(VerticalFocusing):
-    """Lower bounds: an open device focuses less; one of bends in the lattice has no other
-    number."""
+    """Changes of the focusing of devices, without lower bounds: an opened device focuses less. They
+    include straights next to wigglers of bends, whose focusing has no other number."""
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return self._devices(ring, straights(ring, beside=True))
@@ -221,10 +219,10 @@ class FocusingChange(VerticalFocusing):
 
 
 class EdgeFocusing(_Thin):
-    """Vertical focusing of dipoles, by their edges and fringe fields: one number a type.
+    """Vertical focusing of dipoles, by their edges and fringe fields: one number per type.
 
-    Both edges of a rectangular magnet focus by angle^2 / length together, and a sector's not at
-    all: hardly more than that is wrong with them, and next to nothing where angles are small.
+    Both edges of a rectangular magnet together focus by angle^2 / length, those of a sector magnet
+    not at all. Errors are hardly larger than that, and negligible for small angles.
     """
 
     name, effect = "edge_focusing", "vertical_focusing"
@@ -233,21 +231,21 @@ class EdgeFocusing(_Thin):
 
     @property
     def largest(self) -> float:
-        """Zero: the edges of all bends of a type have one design."""
+        """Zero: bends of a type have the same edges, none can be faulty alone."""
         return 0.0
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("bend",))
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
-        """Zero: single dipoles of a type have no edge errors of their own."""
+        """The bends of each type: single ones have no edge errors of their own."""
         types: dict[str, dict[str, float]] = {}
         for pieces in super().shares(data):
             types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
         return list(types.values())
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """The prior of types, as a share of a rectangular magnet's edges."""
+        """The prior of types, relative to a rectangular magnet's edges."""
         ring = data.ring
         largest = []
         for pieces in self.shares(data):
@@ -260,8 +258,8 @@ class EdgeFocusing(_Thin):
 
 
 class CorrectorPosition(_Magnets):
-    """Positions of correctors' fields: one number for all of a plane between the same two families
-    of magnets, whose iron shifts their fields alike.
+    """Positions of correctors' fields: one number for all correctors of a plane between the same
+    two families of magnets, whose iron shifts their fields alike.
 
     A single corrector there has no number, because no other one could confirm it.
     """
@@ -281,7 +279,7 @@ class CorrectorPosition(_Magnets):
         return [correctors for correctors in alike.values() if len(correctors) > 1]
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """The jump of the orbit in the corrector's own column."""
+        """The orbit jump in the corrector's own column."""
         data = at.data
         kicks = data.kicks * (1 + at.errors.calibration)
         jump = -at.gain(0) * data.pick(at.jumps) * kicks[:, None]
@@ -299,7 +297,7 @@ STRAIGHT = 1.0
 
 
 def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> list[str]:
-    """Plane of each corrector, with the families of the magnets before and behind it.
+    """Return the plane of each corrector, with the families of the magnets before and behind it.
 
     Args:
         ring: with the magnets.
@@ -316,19 +314,18 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
 
 
 def straights(ring: Ring, beside: bool = False) -> list[Element]:
-    """Markers nearest to the middle of each long straight, or its longest drift where there is no
-    marker.
+    """Return the marker nearest to the middle of each long straight, else its longest drift.
 
-    A straight next to a wiggler of alternating bends has none, because it is degenerate with
-    the wiggler's own focusing.
+    A straight next to a wiggler of alternating bends has none, because its focusing is degenerate
+    with the wiggler's own.
 
     Args:
         ring: the ring.
-        beside: include straights next to such a wiggler.
+        `beside`: whether straights next to such a wiggler are included.
     """
     found, ways = list[Element](), list[Element]()
     within, bends = list[_Placed](), list[float]()
-    begin = np.inf  # of the first way, which ends the last turn's
+    begin = np.inf  # the first straight ends at the first magnet of the turn
     for element, s in _around(ring):
         if not _parts(element):
             within.append(_Placed(element, s))
@@ -347,17 +344,17 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
 
 class _Placed(NamedTuple):
     element: Element
-    s: float  # m, one turn further where the way to it goes through the lattice's first place
+    s: float  # m, one turn further behind the lattice's first element
 
 
 def _parts(element: Element) -> bool:
-    """Whether the straights at both ends differ."""
+    """Whether an element separates two straights."""
     return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
 
 
 def _around(ring: Ring) -> list[_Placed]:
-    """A turn from a magnet to itself, both included; it starts at no bend if possible, because
-    alternating bends are a wiggler."""
+    """One turn from a magnet to itself, both included; it starts at no bend if possible, so that a
+    wiggler of alternating bends is not split."""
     own = ring.elements
     magnets = sorted(
         (i for i, e in enumerate(own) if _parts(e)), key=lambda i: (own[i].kind == "bend", i)

@@ -1,8 +1,8 @@
 """Families of errors of a hierarchical fit of an orbit response: each is one object.
 
-To add one, write a class with its places, prior, rows, how its values are put among the errors and
-how they are reported as causes (`family.Family`; those of fields in the ring are in `fields`); and
-name it in `STEPS`, which is the order of the trials.
+To add one, write a class with its places, prior and derivatives, and with how its values enter the
+errors and are reported as causes (`family.Family`; those of fields in the ring are in `fields`, of
+the beam's energy in `energy`). Add it to `STEPS`, which is the order of the trials.
 
 Families with the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 
 USUAL_OFFSET = 1e-3
-"""Prior rms: a millimetre of orbit where the dispersion is a metre."""
+"""Prior rms: an orbit of a millimetre where the dispersion is a metre."""
 WIDENED, UNKNOWN_SPREAD = 2.0, 1.5e-3
 """Largest ratio of the energy spread to that of radiation (instabilities, wigglers without a field
 in the lattice), as rms; and the usual spread without radiation."""
@@ -61,7 +61,7 @@ class _OfBeam(Family):
 
 
 class EnergyOffset(_OfBeam):
-    """The beam's energy relative to the one of the magnets' settings: the RF frequency does not
+    """The beam's energy relative to that of the magnets' settings, by an RF frequency that does not
     match the circumference."""
 
     name, effects = "energy_offset", ("energy_offset",)
@@ -161,7 +161,7 @@ class _Monitors(Family):
 
 
 class MonitorGain(_Monitors):
-    """Gains, x and y of each BPM: free but for a mean of each plane."""
+    """Gains of BPMs, x and y of each, with a common mean in each plane."""
 
     name, effects = "monitor_gain", ("monitor_gain_x", "monitor_gain_y")
     block, variable, trust, gross = 0, "gain", 0.01, 0.5
@@ -190,12 +190,12 @@ class MonitorGain(_Monitors):
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """One number a BPM and plane."""
+        """One number per BPM and plane."""
         return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
 
 
 LEAST_GAIN = 1e-3
-"""The rotation of a BPM with an angle."""
+"""Least gain in the errors of rolls."""
 
 
 class MonitorRoll(_Monitors):
@@ -213,7 +213,7 @@ class MonitorRoll(_Monitors):
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """For small values x reads (coupling + roll) y, y reads (coupling - roll) x."""
+        """Causes: for small values x reads (coupling + roll) y, and y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
         own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
         spread = np.hypot(*(sigma.reshape(-1, 2) / own).T) / 2
@@ -224,7 +224,7 @@ class MonitorRoll(_Monitors):
         ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """The share of y in x, and of x in y."""
+        """The share of y in x, then of x in y."""
         roll, coupling = self.effects
         return [
             {(roll, name): side / 2, (coupling, name): 0.5}
@@ -234,7 +234,7 @@ class MonitorRoll(_Monitors):
 
 
 LEAST_KICK = 1e-3
-"""Calibration relative to the stated kick, of a corrector at an angle to its plane."""
+"""Least kick, relative to the stated one, in the errors of rolls."""
 
 
 class _Columns(Family):
@@ -247,7 +247,7 @@ class _Columns(Family):
         return len(data.kicks) - 1  # the RF step is exact
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """One number a corrector; none of the RF."""
+        """One number per corrector; none of the RF."""
         own: list[dict[Hypothesis, float]] = [
             {(self.name, name): 1.0} for name in data.measured.correctors
         ]
@@ -262,31 +262,30 @@ class _Columns(Family):
 
 
 class CorrectorCalibration(_Columns):
-    """Priors of single correctors and of families."""
+    """Calibrations of correctors, with priors of single ones and of families."""
 
     name, effects = "corrector_calibration", ("corrector_calibration",)
     block, variable, trust, gross, rms = 0, "calibration", 0.01, 0.3, 0.02
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """Numbers of single correctors and of families."""
+        """The priors of single correctors and of families."""
         kinds = families([*data.measured.correctors, "\0"])[1]
         return [*super().groups(data), Group(f"{self.name} of families", kinds, 0.05)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """The column itself."""
+        """The column itself; 0 for the RF."""
         out = at.gain(0) * at.data.pick(at.beam)
         out[-1] = 0
         return out
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The calibrations as causes."""
+        """The errors with these calibrations."""
         return replace(errors, calibration=values)
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """The calibration of the whole kick; a rolled corrector has a part of it in the other
-        plane."""
+        """The calibration of the whole kick; a rolled corrector has a part in the other plane."""
         return self._causes_of(errors.kick - 1, sigma, data)
 
 
@@ -301,13 +300,13 @@ class CorrectorRoll(_Columns):
         return np.asarray(at.gain(1) * at.data.pick(at.across, 1))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The kick in the other plane, as a share of the stated kick."""
+        """The errors with these kicks in the other plane, as a share of the stated kick."""
         return replace(errors, roll=values)
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """The angle of the kick to the corrector's plane: 90 degrees without a part in it."""
+        """The angle of the kick to the corrector's plane, up to 90 degrees."""
         return self._causes_of(
             errors.angle, sigma / np.maximum(np.abs(errors.kick), LEAST_KICK), data
         )
@@ -318,8 +317,8 @@ class Trial:
     """Families that are tried together.
 
     Attributes:
-        families: the first one's block has the validation set.
-        own, across: rounds in-plane, and before them rounds of the other plane.
+        families: the block of the first one determines which readings validate them.
+        own, across: rounds in-plane, and rounds of coupling before them.
     """
 
     families: tuple[Family, ...]
@@ -343,9 +342,8 @@ STEPS = (
     Trial((EnergyOffset(),), 2, 0),
     Trial((VerticalKicks(),), 0, 2),
 )
-"""What is tried, one after another. Skew gradients move the tunes to second order, which the
-gradients then take back. A beam off its energy has another dispersion: it comes in once that has
-what else may be wrong with it."""
+"""The trials, in order. Skew gradients move the tunes to second order, which the gradients correct.
+The energy offset changes the dispersion, and comes after the kicks that do so, too."""
 
 CHANGES = (
     Trial((CorrectorCalibration(),), 3, 0),
@@ -355,4 +353,4 @@ CHANGES = (
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),
 )
-"""What may have changed between two measurements of one ring."""
+"""Families that may change between two measurements of one ring."""

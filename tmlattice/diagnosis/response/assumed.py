@@ -10,11 +10,11 @@ from tmlattice.observe.noise import OVERSTATED, stated_and_estimated
 from tmlattice.observe.response_data import ResponseData
 
 UNDERSTATED = 2.0
-"""Ratio of stated and measured noise from which on it is reported."""
+"""Ratio of measured to stated noise above which a message reports it."""
 
 
 def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
-    """The missing quantities of a measurement, and the assumptions instead."""
+    """Return messages about missing quantities of a measurement, and the assumptions instead."""
     messages = []
     if measured.noise is None or np.isnan(measured.noise).any():
         x, y = (f"{1e6 * size:.2g} µm" for size in np.median(data.noise, axis=0))

@@ -3,13 +3,13 @@
 >>> change = diagnose_change(ring, before, after)
 >>> [(own.effect, own.element, own.amount, own.amount_sigma) for own in change.findings]
 
-The ring, its BPMs and its correctors are fitted to the first measurement. The residual is in both
-measurements and cancels in their difference (`observe.response_change`), which is fitted in turn,
-with the dispersion and the energy of the first fit. Drifts of BPMs and correctors are nuisances
-whose scales are learnt. The scatter of the magnets of one supply in their change is learnt, and is
-in the error of every amount; so are undetermined errors of the first fit (`undetermined`). Findings
-are supplies (magnets whose names begin alike), single magnets, gradients in sextupoles and wigglers
-(of the orbit there), and insertion devices, by the marginal likelihood, see `inference.levels`.
+The ring, its BPMs and its correctors are fitted to the first measurement. Its residual cancels in
+the difference of both (`observe.response_change`), which is fitted in turn, with the dispersion and
+the energy of the first fit. Drifts of BPMs and correctors are nuisances with learnt scales. Stated
+errors include the scatter of the magnets of one supply, which is learnt, and the undetermined
+errors of the first fit (`undetermined`). Findings are supplies (magnets whose names begin alike),
+single magnets, gradients in sextupoles and wigglers (by the orbit there), and insertion devices,
+selected by the marginal likelihood, see `inference.levels`.
 """
 
 import time
@@ -64,9 +64,9 @@ Array = NDArray[np.float64]
 ANY = 6.0
 """rms of the logarithm of a change's scale about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
-"""Relative scatter of magnets from which on it is reported without a single detected change."""
+"""Relative scatter of magnets above which it is reported without a single detected change."""
 SEEN = 3.0
-"""Standard deviations from which on an energy offset of the reference is reported."""
+"""Standard deviations above which an energy offset of the reference is reported."""
 LEAST_NOISE = 0.2
 """Least noise of the difference of two measurements, as a share of the stated noise."""
 
@@ -88,22 +88,21 @@ def diagnose_change(
 
     Args:
         ring: the design.
-        before, after: of the same machine; correctors and monitors of only one of them are left
-            out.
+        before, after: of the same machine; correctors and BPMs of only one of them are excluded.
         holdout: share of the correctors that validate the gap; amounts are fitted to all of them.
-        effects: only changes of these are looked for.
-        max_effects: findings at most.
+        effects: only changes of these are sought.
+        max_effects: most findings.
         false_alarm: probability of a finding in two measurements of an unchanged machine.
         assume: what is recorded wrongly everywhere in both, see `measurement.assume`.
         seed: of the split.
         progress: called with the name of each stage.
 
     Returns:
-        Its ring is the one fitted to the first measurement, its steps are of the change.
+        Its ring is the one fitted to the first measurement; its steps are those of the change.
 
     Raises:
         MeasurementError: data that cannot be used, or that are not of one machine.
-        UnknownNameError: an effect, a monitor or a corrector that does not exist.
+        UnknownNameError: an effect, a BPM or a corrector that does not exist.
         UnstableRingError: no closed orbit.
     """
     started = time.perf_counter()
@@ -162,16 +161,16 @@ def diagnose_change(
     named = strongest_first(wanted)[:max_effects]
     causes = tuple(cause_of(own) for own in named)
     known = [own.amount_sigma or 0.0 for own in named]
-    told: list[StatedCause] = list(zip(causes, known, strict=True))
+    reported: list[StatedCause] = list(zip(causes, known, strict=True))
     found = strongest_first([*named, *pairs])
     have = {(cause.effect, cause.element) for cause in causes}
-    supports = [FREE] * len(told)
+    supports = [FREE] * len(reported)
     for row, support in drifts(whole):
         if (row[0].effect, row[0].element) not in have:
-            told.append(row)
+            reported.append(row)
             supports.append(support)
     return as_diagnosis(
-        there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], told,
+        there, fit, [c for c in causes if isinstance(find(c.effect), RingEffect)], reported,
         verdict=least_certain(found, _verdict(whole)),
         findings=with_consequences(there, found, causes),
         warnings=(*messages, *_messages(data, fit, whole, scatter)),
@@ -182,8 +181,7 @@ def diagnose_change(
 
 
 def changes() -> list[str]:
-    """Effects that may change between two measurements: every usual one, and all supplies of
-    families."""
+    """Return the effects that may change between two measurements: usual ones, and all supplies."""
     families = [name for name, effect in CATALOGUE.items() if isinstance(effect, FamilyEffect)]
     return list(dict.fromkeys([*modelled(), *families]))
 
@@ -196,16 +194,16 @@ def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
     ):
         alone = sorted({n.casefold() for n in a} ^ {n.casefold() for n in b})
         if alone:
-            messages.append(f"{what} of one measurement alone, left out: {', '.join(alone)}")
+            messages.append(f"{what} in only one of the measurements, excluded: {', '.join(alone)}")
     return messages
 
 
 # --- the fits -------------------------------------------------------------------------------------
 def _not_validated(split: Split) -> Split:
     """A split in which all correctors, and all of the RF's orbit, are fitted."""
-    nobody, half = np.zeros_like(split.held), split.half.copy()
+    none, half = np.zeros_like(split.held), split.half.copy()
     half[-1] = True
-    return Split(nobody, nobody, half, np.zeros_like(split.inner_rf))
+    return Split(none, none, half, np.zeros_like(split.inner_rf))
 
 
 def _same(first: ResponseData, second: ResponseData) -> bool:
@@ -218,8 +216,7 @@ def _same(first: ResponseData, second: ResponseData) -> bool:
 def _reference(
     data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
 ) -> tuple[State, list[str]]:
-    """The errors of the lattice, fitted to the first measurement, and messages. The design where
-    the fit diverges."""
+    """The state fitted to the first measurement, and messages; the design if the fit diverges."""
     nothing = replace(begin(data, _not_validated(split)), exploring=False)
     if not steps:
         return nothing, []
@@ -227,11 +224,11 @@ def _reference(
         fit = fit_steps(data, split, steps, len(steps), progress)
         return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.messages)
     except (TmlatticeError, np.linalg.LinAlgError):
-        return nothing, ["it could not be fitted, and the change is one of the design"]
+        return nothing, ["its fit diverged; the change is relative to the design"]
 
 
 def _of_the_ring(fitted: State) -> Iterator[str]:
-    """Messages about the ring of the reference that no list of causes shows."""
+    """Messages about the ring of the reference that are in no list of causes."""
     energy, where = fitted.at.errors.energy, EnergyOffset.variable
     if energy:
         there = linear(fitted, EnergyOffset.block)
@@ -248,13 +245,12 @@ def _of_the_ring(fitted: State) -> Iterator[str]:
 def _by_good_monitors(
     ring: Ring, fitted: State, before: OrbitResponse, after: OrbitResponse, messages: list[str]
 ) -> tuple[ResponseData, ResponseData, Errors]:
-    """Both measurements, and the errors of the first, without BPMs and outliers that are bad in it;
-    messages go to `said`."""
+    """Both measurements, and the errors of the first, without BPMs that are bad in the first."""
     errors = replace(fitted.at.errors, monitors=fitted.at.errors.monitors[fitted.good])
     if not fitted.good.all():
         names = np.array(fitted.data.measured.monitors)
         messages.append(
-            f"monitors left out, bad in the reference: {', '.join(names[~fitted.good])}"
+            f"BPMs that are bad in the reference, excluded: {', '.join(names[~fitted.good])}"
         )
         kept = names[fitted.good].tolist()
         before, after = (one.select(monitors=kept) for one in (before, after))
@@ -265,7 +261,7 @@ def _by_good_monitors(
 def _fit_change(
     data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
 ) -> StepwiseFit:
-    """All that may have changed, with the noise that the two measurements have."""
+    """The fit of all possible changes, with the estimated noise of the difference."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
     before = score(design, split.held)
     steps = [Step.scored("reference", 0, before)]
@@ -285,8 +281,8 @@ def _fit_change(
 
 
 def _learnt_noise(state: State) -> State:
-    """Data with less noise where two measurements agree better than stated; the misfit of each
-    column covers the opposite."""
+    """The state with less noise where two measurements agree better than stated; if they agree
+    less, the model discrepancy of each column grows."""
     scales = []
     data = state.data
     for block in (0, 1):
@@ -320,7 +316,7 @@ def _sparse_or_all(
     progress: Callable[[str], Any],
     open_: Undetermined,
 ) -> SparseFit | StepwiseFit:
-    """The few causes that explain a change, or the fit of everything that may have changed."""
+    """The sparse solution of a change, or the fit of all possible changes."""
     asked = changes() if effects is None else effects
     sparse = sparse_fit(
         data, split, asked, MOST, judgement, seed, progress, and_orbits(data.ring, open_)
@@ -330,7 +326,7 @@ def _sparse_or_all(
     if sparse is not None and sparse.noise:
         return sparse
     fit = _fit_change(data, split, trials, progress)
-    return fit if sparse is None or outperforms(fit, sparse.fit) else sparse
+    return fit if sparse is None or outperforms(fit, sparse, judgement) else sparse
 
 
 def _verdict(state: State) -> str:
@@ -346,8 +342,8 @@ def _messages(
     agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
     stated = 1e6 * float(np.median(data.noise))
     messages = [
-        f"with what changed the two measurements agree to {agree:.2g} µm (their stated noise makes "
-        f"{stated:.2g})"
+        f"given the changes, the two measurements agree to {agree:.2g} µm (by their stated noise "
+        f"{stated:.2g} µm are expected)"
     ]
     if scatter:
         size = scatter[QuadrupoleGradient.name]
@@ -358,6 +354,6 @@ def _messages(
     if size := scatter.get(FamilyGradient.name, 0.0):
         messages.append(
             f"other supplies changed, too, by {size:.1g} (rms, relative), which is in the errors: "
-            "which ones, and by how much each, these readings do not tell"
+            "the readings do not determine which ones, nor by how much each"
         )
     return messages

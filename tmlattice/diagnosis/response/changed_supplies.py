@@ -2,10 +2,9 @@
 
 >>> findings, scatter = changed_supplies(state, judgement, undetermined_of(reference))
 
-The magnets of a supply scatter in their change, and the scatter limits the precision of a supply's
-change. A hierarchical fit of every magnet includes changes of single magnets in it. So the scatter
-is learnt again given the candidates, and in the same way that of undetermined changes of other
-supplies.
+The magnets of a supply scatter in their change, which limits the precision of a supply's change. In
+a hierarchical fit of every magnet this scatter includes changes of single magnets. So it is learnt
+again given the candidates, and likewise that of undetermined changes of other supplies.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,7 +35,7 @@ from tmlattice.observe.response_problem import Response
 Array = NDArray[np.float64]
 
 MOST = 40
-"""Changes of a plane at most: many supplies may be changed on purpose."""
+"""Most changes of a plane: many supplies may be changed on purpose."""
 REPRODUCED = 1e-4
 """Relative reproducibility of a magnet, and twice that of a supply; smaller changes are ignored."""
 STRAY = 3e-5
@@ -46,12 +45,11 @@ USUAL = 1e-2
 ALONE = 2.0
 """Log odds of a changed supply against one of its magnets alone, or a field elsewhere."""
 AGAIN = 3
-"""Repetitions of the selection with the undetermined errors of the ring linearised at the
-findings."""
+"""Repetitions of the selection, with undetermined errors of the ring linearised at the findings."""
 FINER = 0.5
-"""Steps in which less scatter is tried."""
+"""Factor between the smaller scatters that are tried."""
 OTHERS = tuple(float(own) for own in np.geomspace(1e-4, 1e-2, 9))
-"""Rms of undetermined changes of supplies, relative, that are tried."""
+"""Rms of undetermined changes of supplies that are tried, relative."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,7 @@ class _Weighed:
 def changed_supplies(
     state: State, judgement: Judgement, open_: Undetermined | None = None
 ) -> tuple[list[Finding], dict[str, float]]:
-    """Return all supplies, magnets and devices that changed; the rest is scatter.
+    """Return findings on all supplies, magnets and devices that changed, and the remaining scatter.
 
     Args:
         state: of a fit of the change.
@@ -83,9 +81,8 @@ def changed_supplies(
         open_: undetermined errors of the ring that changed; None: none.
 
     Returns:
-        The findings; and by how much magnets of a supply scatter in their change, rms, relative,
-        and undetermined supplies (0: none), by the effects' names; empty where no
-        quadrupoles were fitted.
+        The findings; and the rms scatter, relative, of magnets of a supply and of undetermined
+        supplies (0: none), by the effects' names; empty if no quadrupoles were fitted.
     """
     found, scatter = _found(state, judgement, {})
     if open_ is None or not found:
@@ -106,8 +103,7 @@ def changed_supplies(
 
 
 def _blurred(problem: Response, open_: Undetermined, found: Sequence[Finding]) -> dict[int, Array]:
-    """Effects of undetermined errors of the ring on the changes, m, of each block [error, column,
-    monitor]."""
+    """Effects of undetermined errors on the changes, m, by block, [error, column, monitor]."""
     data = problem.base.data
     causes = [cause_of(own) for own in found]
     spread = Blur(problem, strongest(problem, open_, causes)).of(causes)
@@ -142,8 +138,7 @@ def _found(
 def _by_evidence(
     state: State, block: int, there: Linear, fitted: Mapping[str, Family]
 ) -> tuple[dict[str, float], _Weighed]:
-    """The scatter of each family, at most that of the hierarchical fit, and the selected
-    candidates."""
+    """The scatter of each family, at most that of the fit, and the selected candidates."""
     information, pull = marginal(there, list(fitted))
     wider = _widened(state, block, there)
 

@@ -3,11 +3,10 @@
 >>> found = explain_gradients(fit.state)
 >>> [(own.kind, own.name, own.amount, own.amount_sigma) for own in found.common_factors]
 
-A hierarchical fit ends in an error of every quadrupole. The same readings are explained again by
+A hierarchical fit estimates an error of every quadrupole. The same readings are explained again by
 common factors, numbers that many magnets share. Candidates of every level are compared by the
 marginal likelihood (`inference.levels`), with alternative sets (`inference.sets`). The learnt
-scatter of single magnets is in every error. Outlier magnets are reported with their correlated
-neighbours.
+scatter of single magnets is in every error. Outlier magnets are reported, with their neighbours.
 """
 
 from collections.abc import Sequence
@@ -47,15 +46,15 @@ BETWEEN = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
 MORE = 3.0
 """Log evidence required for a scatter of families."""
 FEWEST = 3
-"""Families required for their scatter."""
+"""Fewest families for their scatter."""
 MOST = 20
-"""Common factors at most."""
+"""Most common factors."""
 SETS, LIKELY = 3, 0.05
-"""Alternative sets that are reported at most, and their least probability."""
+"""Most alternative sets that are reported, and their least probability."""
 AGAINST = 0.4
-"""Correlation from which on neighbours of an outlier are named."""
+"""Correlation above which neighbours of an outlier are named."""
 SHOWN = 3
-"""Neighbours that are named."""
+"""Most neighbours that are named."""
 COST = {"all": 0.0, "focusing": 1.0, "region": 1.0, "type": 1.0, "family": 1.0, "magnet": 3.0}
 """Log prior odds against a common factor of each kind."""
 MAKES = {
@@ -75,18 +74,18 @@ MAKES = {
 
 @dataclass(frozen=True)
 class Reason:
-    """One number that many magnets share, or one magnet.
+    """One number that many magnets share, or one magnet's.
 
     Attributes:
         kind: see `MAKES`.
-        name: of what shares it.
+        name: of the group.
         members: the magnets, by their first pieces.
-        amount, amount_sigma: relative change of the gradients; in the error are the scatter of
+        amount, amount_sigma: relative change of the gradients; the error includes the scatter of
             single magnets, and the amounts in alternative sets, weighted by their probability.
         probability: that it is present, over all sets.
-        statistic: chi-square that it explains given all the others.
-        makes: what would make it.
-        rivals: alternatives that the data do not exclude, with probabilities.
+        statistic: chi-square that it explains given all others.
+        makes: its possible causes.
+        `rivals`: alternatives that the data do not exclude, with probabilities.
         share_from_data: of the amount, 1 - posterior variance / prior variance.
     """
 
@@ -153,13 +152,13 @@ class CommonFactors:
     """The common factors of the gradients.
 
     Attributes:
-        common_factors: by falling chi-square; the most probable set.
+        common_factors: of the most probable set, by falling chi-square.
         instead: alternative sets, by falling probability.
         outliers: by falling size.
-        share: of the gradients' mean square, that the common factors explain.
+        share: of the gradients' mean square that the common factors explain.
         scatter: rms of single magnets about them, relative.
-        between: rms of families about what they share, relative; 0 where they are alike, or are
-            common factors one by one.
+        between: rms of families about what they share, relative; 0 if families are alike, or are
+            separate common factors.
     """
 
     common_factors: tuple[Reason, ...]
@@ -171,7 +170,7 @@ class CommonFactors:
 
 
 def explain_gradients(state: State) -> CommonFactors | None:
-    """Return the common factors of a hierarchical fit's gradients; None where none were fitted."""
+    """Return the common factors of a hierarchical fit's gradients; None if none were fitted."""
     family = QuadrupoleGradient()
     if family.variable not in state.values or not family.size(state.data):
         return None
@@ -186,16 +185,15 @@ def explain_gradients(state: State) -> CommonFactors | None:
     rows = there.where[family.variable]
     spread = posterior.spread[rows]
     covariance = spread @ posterior.covariance @ spread.T
-    # the excess of the stated errors over the posterior's is no scatter of the magnets, but
-    # it is in every error
+    # the excess of stated errors over posterior ones is in every error, but is no scatter
     plain = np.maximum(np.diag(covariance), 1e-24)
     wider = of_readings(state, 0, there, posterior)[rows] / np.sqrt(plain)
     sizes = of_sizes(state, 0, there)[rows]
     more = np.sqrt(np.maximum(wider**2 - 1, 0))
-    beside = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
+    single = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
     covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
-    between, levels, sets = weighed(information, pull, among, beside)
+    between, levels, sets = weighed(information, pull, among, single)
     found = [
         (one, chance)
         for one, chance in over_sets(levels, sets)
@@ -243,25 +241,24 @@ def explain_gradients(state: State) -> CommonFactors | None:
 
 
 def weighed(
-    information: Array, pull: Array, among: Candidates, beside: Array
+    information: Array, pull: Array, among: Candidates, single: Array
 ) -> tuple[float, FactorModel, list[LikelySet]]:
-    """Return the scatter of families, by the marginal likelihood, and the sets of common factors
-    given it.
+    """Return the scatter of families by the marginal likelihood, and the sets of common factors.
 
-    Where families differ by no more than their magnets, an outlier family is a common factor like
-    others. Where each family has its own calibration, all are in every set, with their scatter as
-    prior; else the errors of numbers that many of them share would be too small. A magnet without a
-    family is one of its own.
+    If families differ by no more than their magnets, an outlier family is a common factor like
+    others. If each family has its own calibration, all families are in every set, with their
+    scatter as prior; otherwise the errors of numbers that many of them share would be too small. A
+    magnet without a family is its own family.
 
     Args:
-        information: J^T W J of the gradients, nuisances taken out, [magnet, magnet].
-        pull: J^T W y with all gradients at zero, [magnet].
+        information: J^T W J of the gradients, nuisances integrated out, [magnet, magnet].
+        pull: J^T W y at zero gradients, [magnet].
         among: the candidates.
-        beside: covariance of the scatter of single magnets, [magnet, magnet].
+        single: covariance of the scatter of single magnets, [magnet, magnet].
 
     Returns:
-        Rms of families about what they share, relative, 0 where they are alike; the candidates
-        compared together; the probable sets of them.
+        Rms of families about what they share, relative, 0 if they are alike; the model of all
+        candidates; and the probable sets of them.
     """
     cost = np.array([COST[kind] for kind in among.kinds])
     families, others = np.flatnonzero(among.families), np.flatnonzero(~among.families)
@@ -269,7 +266,7 @@ def weighed(
 
     def levels(at: NDArray[np.int64], between: float) -> FactorModel:
         share = among.members[:, families] * between
-        scatter = beside + share @ share.T + between**2 * alone
+        scatter = single + share @ share.T + between**2 * alone
         slab = np.full(len(at), max(USUAL, between))
         return FactorModel(information, pull, among.members[:, at], scatter, slab, cost[at])
 
@@ -284,7 +281,7 @@ def weighed(
         return 0.0, alike, likely_sets(alike, MOST)
     slab = np.full(len(cost), max(USUAL, best))
     slab[families] = best
-    whole = FactorModel(information, pull, among.members, beside + best**2 * alone, slab, cost)
+    whole = FactorModel(information, pull, among.members, single + best**2 * alone, slab, cost)
     sets = []
     for one in likely_sets(levels(others, best), MOST):
         chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())

@@ -3,8 +3,8 @@
 >>> found = detected_faults(data, split, fit.state, hypotheses, judgement)
 >>> [(one.cause, one.sigma, one.statistic) for one in found.faults]
 
-One cause after another is given a prior of its own together with all usual distributed errors
-(`small_errors`). Their scales are learnt again without it, and everything is fitted again, not
+One cause after another is given a prior of its own, together with all usual distributed errors
+(`small_errors`). Their scales are learnt without it, and everything is fitted again, not
 linearised. A cause is detected at five standard deviations of its family's scatter, and above the
 chance level of so many causes and families.
 """
@@ -49,24 +49,23 @@ log = logging.getLogger(__name__)
 
 ORBITS = (HorizontalOrbit.name, VerticalOrbit.name)
 FAULTS = 8
-"""Faults at most: more are a family."""
+"""Most faults: more of them are distributed errors."""
 WORTH, HIDDEN = 15.0, 8.0
 """Least statistic of a candidate, with scales not yet learnt without it: for one number of a
 family, and for other causes, which increase the scales of all patterns of an orbit."""
 TRIES = 3
-"""Candidates that are tried at a step; one in a response of many readings."""
+"""Most candidates per step; one in a response of many readings."""
 NEAR, SHARE = 8.0, 0.1
 """Log evidence by which an alternative may be behind and still be tried; and the error of the
 linear model, as a share of the statistic."""
 BEHIND = 2.0
 """Log evidence by which an alternative must be ahead to replace an accepted cause."""
 LISTED = 24
-"""Alternatives of a fault that are compared."""
+"""Most alternatives of a fault that are compared."""
 BEYOND = 1.5
 """Ratio to the largest fault above which an amount is implausible."""
 LACKS = 2.0
-"""Chi-square per reading of each plane, with distributed errors, up to which faults are always
-sought."""
+"""Largest chi-square per reading of a plane, given distributed errors, for a search in any case."""
 WORSE = 1.02
 """Largest ratio of held-out residuals with and without the faults."""
 MEMBERS = 16
@@ -153,8 +152,7 @@ class _Search:
     def left_beside(
         self, cause: Hypothesis, amount: float, information: Array
     ) -> tuple[Chi2, Chi2, Chi2]:
-        """Chi-square with one more cause, nothing else changed; infinite where no beam is
-        stored."""
+        """Chi-square with one more cause, all else unchanged; infinite without a closed orbit."""
         state, suspect = _as_number(self.state, cause, information)
         assert suspect.members is not None
         values = state.values[suspect.variable] + amount * suspect.members
@@ -218,14 +216,14 @@ class _Search:
         """The converged state with one more cause; None where no beam is stored.
 
         Args:
-            state: without.
-            cause: of the suspects.
-            information: of each block on it, [2].
+            state: without the cause.
+            cause: effect and place.
+            information: of each block on its amount, [2].
         """
         return _settled(_apart(_as_number(state, cause, information)[0], cause))
 
     def better(self, state: State, one: Apart) -> State:
-        """The state with an alternative in the place of a cause, where it explains more."""
+        """The state with an alternative instead of a cause, if that explains more."""
         seen = self.seen(state)
         own = seen.beside(one.name)
         evidence = self.evidence(seen, own)
@@ -244,8 +242,7 @@ class _Search:
         return other if gained > 0 else state
 
     def revised(self, state: State) -> State:
-        """The state with each cause compared with its alternatives again, without redundant
-        ones."""
+        """The state with each cause compared with its alternatives, less redundant causes."""
         for one in state.apart[:-1]:
             state = self.better(state, one)
         while len(state.apart) > 1:
@@ -261,8 +258,8 @@ class _Search:
         return state
 
     def members(self, state: State, one: Apart) -> int:
-        """Number of amounts that determine the scale in the statistic: of the family, or of the
-        orbit patterns."""
+        """Number of amounts that determine the statistic's scale, of the family or orbit
+        patterns."""
         if one.variable not in (kind.variable for kind in KINDS):
             return max(len(one.members) - 1, 1)
         orbit = [len(state.values[f.variable]) for f in state.of_block(one.block)
@@ -303,8 +300,7 @@ class _Search:
 
 
 def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Suspect]:
-    """The state with a number for the cause, in the block that is more sensitive, and that
-    number."""
+    """The state with a number for the cause, in the more sensitive block, and that number."""
     (suspect,) = suspects_of(state, [cause])
     if suspect.block is None:
         state = with_number(state, cause, int(np.argmax(information)))
@@ -326,15 +322,14 @@ def _place(seen: Seen, one: Apart) -> int:
 
 
 def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
-    """Statistic, amount and error of each cause; columns and BPMs that contradict all others
-    count."""
+    """Statistic, amount and error of a cause, widened for contradicting BPMs and columns."""
     own, here = seen.beside(one.name), _place(seen, one)
     it = seen.blocks[one.block]
     posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
     wider = doubt(seen.state, one, it.there, posterior)
     amount, variance = float(own.amount[here]), float(own.sigma[here]) ** 2 * wider
-    # a distributed error multiplies with the fault: of a kick three times as strong it is three
-    # times
+    # a distributed error scales with the fault: it is three times as large for a kick three times
+    # as strong
     share = max(abs(find(one.cause[0]).joined(amount, 1.0) - amount), 1.0)
     variance += (share**2 - 1) * _scatter(it.there, it.sizes, one) ** 2
     return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))
@@ -388,10 +383,10 @@ def _stepped(state: State) -> State:
     return replace(state, groups=groups).moved(values)
 
 
-# --- what is told ---------------------------------------------------------------------------------
+# --- report ---------------------------------------------------------------------------------------
 def given_faults(fit: StepwiseFit, apart: Sequence[Apart]) -> StepwiseFit:
-    """The dense fit with the faults' numbers free of their families, as a step more; as it was,
-    where held-out correctors want none of it."""
+    """Return the hierarchical fit with the faults' numbers free of their families, as a further
+    step; unchanged where held-out residuals grow."""
     state = fit.state
     for one in apart:
         if one.variable in (kind.variable for kind in KINDS):

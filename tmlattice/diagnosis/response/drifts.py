@@ -1,6 +1,6 @@
 """Changes of BPMs and correctors on the second of two days.
 
-All of them drift a little; an outlier among them is a finding.
+All of them drift slightly; an outlier is a finding.
 """
 
 import numpy as np
@@ -20,12 +20,11 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.normal import solve
 
 DRIFT, OUTSTANDING = 0.03, 8.0
-"""Least change of a BPM or a corrector that is reported, and its least ratio to those of others."""
+"""Least change of a BPM or corrector that is a finding, and its least ratio to the typical one."""
 
 
 def drifts(state: State) -> list[tuple[StatedCause, Support]]:
-    """Changes of BPMs and correctors since the reference, with errors, and how much of each comes
-    from the data."""
+    """Return the changes of BPMs and correctors since the reference, with errors and support."""
     found: list[tuple[StatedCause, Support]] = []
     for block in (0, 1):
         own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
@@ -38,7 +37,7 @@ def drifts(state: State) -> list[tuple[StatedCause, Support]]:
 
 
 def outstanding(state: State, judgement: Judgement) -> list[Finding]:
-    """Findings: BPMs and correctors whose change is an outlier of the usual drift."""
+    """Return the findings: BPMs and correctors whose change is an outlier of the usual drift."""
     changes = [row for row, _ in drifts(state)]
     found = []
     for effect in dict.fromkeys(cause.effect for cause, _ in changes):
@@ -57,8 +56,7 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
 
 
 def is_drift(cause: Cause) -> bool:
-    """Whether it is no more than what monitors and correctors do from day to day: everybody may
-    have it, and the largest of them is no finding."""
+    """Return whether a change of a BPM or a corrector is within the usual drift from day to day."""
     of_each = {name for trial in CHANGES for family in trial.families if family.per != "ring"
                for name in family.effects}  # fmt: skip
     return cause.effect in of_each and abs(cause.amount) <= DRIFT

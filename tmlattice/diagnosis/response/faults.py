@@ -24,10 +24,10 @@ class Fault:
 
     Attributes:
         cause: with its amount.
-        sigma: standard error, with what its family scatters.
+        sigma: standard error, including the scatter of its family.
         statistic, p_value: of its detection.
-        rivals: alternatives, by falling evidence; the first is itself.
-        evidence: of each.
+        `rivals`: alternatives, by falling evidence; the first is the cause itself.
+        evidence: log evidence of each.
     """
 
     cause: Cause
@@ -51,9 +51,9 @@ CLEARLY = 5.0
 
 
 def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:
-    """The causes with a corrector that mainly kicks in the other plane reported as rolled: it has
-    one number for each plane, and its missing kick is no calibration. A corrector that is off kicks
-    in neither plane."""
+    """Return the fault, reported as a roll if the corrector kicks significantly in the other plane:
+    it has one number for each plane, and the kick that is missing in one is no calibration error. A
+    corrector without any kick is not rolled."""
     if fault.cause.effect != "corrector_calibration":
         return fault
     ring, name = data.ring, fault.cause.element

@@ -1,7 +1,7 @@
 """The start of a hierarchical fit, if the design is far from the ring.
 
-Gauss-Newton converges from phase errors of a fraction of a turn. From another working point it
-converges to a ring that matches one plane only. There, focusing and defocusing quadrupoles are
+Gauss-Newton converges if phase errors are a fraction of a turn. From another working point it may
+converge to a ring that matches one plane only. There, focusing and defocusing quadrupoles are
 scanned together, and the fit starts at the best match.
 """
 
@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 FAR = 0.25
-"""Share of the typical column's mean square, in the worse plane, from which on the design is far:
-half of its size. Usual rings leave a tenth of that."""
+"""Unexplained share of the typical column's mean square, in the worse plane, above which the design
+is far from the ring. Usual rings have a tenth of that."""
 BETTER = 0.5
 """Largest ratio of that share at another start to that of the design."""
 STEPS = np.arange(-3, 4) * 0.01
@@ -36,12 +36,12 @@ STEPS = np.arange(-3, 4) * 0.01
 
 
 def begun(design: State, trials: Sequence[Trial]) -> State:
-    """The design, or the ring that resembles the readings more, with each quadrupole's gradient a
-    number of its own from the first: one of no family would else go back to nothing.
+    """Return the design, or the ring of the first guess, with a number for each quadrupole: numbers
+    of no family would return to zero.
 
     Args:
-        design: with no families yet.
-        trials: that will be fitted; without quadrupoles' gradients it is the design.
+        design: without families.
+        trials: to be fitted; without quadrupole gradients the result is the design.
     """
     family = QuadrupoleGradient()
     if not any(own.name == family.name for trial in trials for own in trial.families):
@@ -66,26 +66,22 @@ class Guess(NamedTuple):
 
 
 def elsewhere(data: ResponseData) -> Guess | None:
-    """The first guess by all readings."""
-    nobody, everybody = (np.full(data.shape, own) for own in (False, True))
-    split = Split(held=nobody[:, 0], inner=nobody[:, 0], half=everybody, inner_rf=nobody[0])
+    """Return the first guess by all readings."""
+    none, all_of_them = (np.full(data.shape, own) for own in (False, True))
+    split = Split(held=none[:, 0], inner=none[:, 0], half=all_of_them, inner_rf=none[0])
     return first_guess(begin(data, split))
 
 
 def first_guess(design: State) -> Guess | None:
-    """Return the start of a fit; None where the design is near enough, or nothing is better.
-
-    Args:
-        design: with no families yet.
-    """
-    stands = strange(design)
+    """Return the start of a fit of the design; None if that is near, or nothing is better."""
+    unexplained = strange(design)
     family = QuadrupoleGradient()
-    if not stands > FAR or not family.size(design.data):
+    if not unexplained > FAR or not family.size(design.data):
         return None
     start = allow(design, [family])
     own = magnets(design.data.ring, ("quadrupole",), True)
     focusing = np.array([pieces[0].k1 > 0 for pieces in own])
-    best, found = BETTER * stands, None
+    best, found = BETTER * unexplained, None
     for f, d in product(STEPS, STEPS):
         values = {family.variable: np.where(focusing, f, d)}
         try:
@@ -94,18 +90,17 @@ def first_guess(design: State) -> Guess | None:
             continue
         if left < best:
             best, found = left, Guess(float(f), float(d), values, left)
-            log.info("focusing %+.2g, defocusing %+.2g: %.2g of the typical column's square left, "
-                     "%.2g by the design", f, d, left, stands)  # fmt: skip
+            log.info("focusing %+.2g, defocusing %+.2g: %.2g of the typical column's square is "
+                     "unexplained, %.2g by the design", f, d, left, unexplained)  # fmt: skip
     return found
 
 
 def strange(state: State, least: int = 1) -> float:
-    """Return the unexplained share of the typical column's mean square, each with its own kick, of
-    the worse plane.
+    """Return the unexplained share of the typical column's mean square, given its kick.
 
     Args:
-        state: what the model makes of the readings.
-        least: columns of a plane required for the typical one.
+        state: with the model's readings; of both planes the worse one counts.
+        least: fewest columns of a plane.
     """
     data = state.data
     read, orbits = data.pick(state.at.read)[:-1], data.pick(data.orbits)[:-1]

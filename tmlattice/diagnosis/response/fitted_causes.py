@@ -18,7 +18,7 @@ from tmlattice.inference.problem import Hypothesis
 Array = NDArray[np.float64]
 
 AGAINST, SHOWN = 0.4, 3
-"""Posterior correlation from which on numbers are degenerate, and how many are named."""
+"""Posterior correlation above which numbers are degenerate, and how many of them are named."""
 
 
 def fitted_causes(
@@ -71,8 +71,7 @@ def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: 
 def _correlated(
     state: State, families: Iterable[Family], there: Linear, covariance: Array
 ) -> tuple[Correlation, ...]:
-    """Strongly correlated amounts of the magnets' families; each number is named for its first
-    cause."""
+    """Strongly correlated amounts of the magnets' families, each named by its first cause."""
     amounts: list[Hypothesis] = []
     numbers: list[int] = []
     for family in families:
@@ -95,7 +94,7 @@ def with_support(
     Args:
         state, there: the state, and `linear` of the block.
         families: with a variable each.
-        known: what is stated of the numbers of the block.
+        known: stated errors of the block.
     """
     numbers = _numbers(state, families, there)
     for family in families:

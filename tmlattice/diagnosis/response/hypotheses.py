@@ -1,7 +1,6 @@
-"""Effects that may be missing from a fitted orbit response: each hypothesis as patterns of
-readings.
+"""Effects that may be missing from a fitted orbit response, as patterns of readings.
 
-To add one, write a function that returns its patterns at the fit, and put it into `HYPOTHESES`.
+To add one, write a function that returns its patterns at the fit, and add it to `HYPOTHESES`.
 """
 
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from tmlattice.observe.orbit_response import DELTA
 Array = NDArray[np.float64]
 
 BEND_GRADIENT = 1e-4
-"""Step of the differences, 1/m2."""
+"""Step of finite differences, 1/m2."""
 MILLIMETRE = 1e-3
 ORDERS = 3
 """Order of the polynomial of a drift over all columns."""
@@ -36,10 +35,10 @@ class Hypothesis:
     Attributes:
         effect: its name.
         unit: of the amounts.
-        expected: what physics would allow.
+        expected: physically plausible amounts.
         patterns: d reading / d amount in each column's own plane, m, [parameter, column, monitor].
-        own: each column has its own amount of each pattern.
-        most: the largest physically sensible amount.
+        own: whether each column has its own amount of each pattern.
+        most: largest plausible amount.
     """
 
     effect: str
@@ -108,7 +107,7 @@ def _corrector_energy(state: State) -> Hypothesis:
 def _position(
     state: State, which: str, names: Callable[[State], list[str]] | None = None
 ) -> Hypothesis:
-    """Each corrector's own, or one amount for all whose names begin alike."""
+    """The position of the field of each corrector; or one for all whose names begin alike."""
     jumps = _readings(state, state.at.jumps) * state.data.kicks[:, None]
     rows = jumps[None]
     if names is not None:
@@ -122,11 +121,11 @@ def _position_beside(state: State) -> Hypothesis | None:
     if state.allows("corrector_position"):
         return None  # the fit has it
 
-    def beside(own: State) -> list[str]:
+    def neighbours(own: State) -> list[str]:
         measured = own.data.measured
         return between(own.data.ring, measured.correctors, measured.planes)
 
-    return _position(state, "by the magnets next to it", beside)
+    return _position(state, "by the magnets next to it", neighbours)
 
 
 def _energy_drift(state: State) -> Hypothesis:
@@ -139,7 +138,7 @@ def _energy_drift(state: State) -> Hypothesis:
 
 
 def _orbit_drift(state: State) -> Hypothesis:
-    """The orbit drifts between the readings of a step, with other kicks in each column."""
+    """Closed orbits of random kicks between the readings of a step, different in each column."""
     orbits = _readings(state, state.at.orbits(state.at.model))
     waves = np.zeros((WAVES, *orbits.shape))
     for p in (0, 1):
@@ -166,7 +165,7 @@ def _tune_drift(state: State) -> Hypothesis:
 
 
 def _in_time(drift: Hypothesis, effect: str, constant: bool) -> Hypothesis:
-    """A smooth drift from column to column, in the order of time.
+    """A smooth drift over the columns in the order of time.
 
     Args:
         drift: its patterns of single columns.
@@ -225,7 +224,7 @@ def _chromatic(state: State) -> Hypothesis:
 
 
 def _dispersion(state: State) -> Hypothesis | None:
-    """Dispersion by kicks, see `dispersion`; one amount a pattern."""
+    """Dispersion by kicks, see `dispersion`; one amount per pattern."""
     if state.allows("horizontal kicks"):
         return None  # the fit has them
     kicks = HorizontalKicks()
@@ -237,7 +236,7 @@ def _dispersion(state: State) -> Hypothesis | None:
 
 
 def _nonlinear(state: State) -> Hypothesis:
-    """Cubic BPMs with two-sided steps: x^3 / 4 of the whole change remains."""
+    """Cubic BPMs with two-sided steps: x^3 / 4 of the whole change."""
     cubes = state.data.pick(state.at.read) ** 3 / 4 / MILLIMETRE**2
     rows = np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
     return Hypothesis("nonlinear monitors (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
@@ -279,7 +278,7 @@ def _monitor_position(state: State) -> Hypothesis:
 
 
 def _bend_gradient(state: State) -> Hypothesis:
-    """Bends by length: magnets of one length are one type."""
+    """Gradients of bends; magnets of one length are one type."""
     ring = state.at.model.ring
     bends = [i for i, e in enumerate(ring.elements) if e.kind == "bend"]
     kinds = sorted({round(ring.elements[i].length, 3) for i in bends})

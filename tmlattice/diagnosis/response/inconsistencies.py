@@ -1,13 +1,13 @@
-"""Inconsistency of the gradients from the RF's orbit and from the correctors' responses.
+"""Inconsistency of the gradients by the RF's orbit and by the correctors' responses.
 
 >>> found = inconsistencies(fit.state)
 >>> found.missed, found.known, [(own.name, own.correctors, own.with_rf) for own in found.pulls]
 
-Gradients are fitted to both. The estimate from the correctors alone predicts the RF's orbit, unless
-kicks of the closed orbit contribute. Where the prediction fails, the common fit biases the
-gradients. Hausman's test (Econometrica 46, 1978) finds which ones: the covariance of the difference
-of two estimates, one of which is efficient, is the difference of their covariances. All of it is
-linear about the fit, with its weights and without the kicks.
+Gradients are fitted to both. Those by the correctors alone predict the RF's orbit, unless kicks of
+the closed orbit contribute to it. Where the prediction fails, the common fit biases the gradients.
+Hausman's test (Econometrica 46, 1978) finds which ones: if one of two estimates is efficient, the
+covariance of their difference is the difference of their covariances. All is linearised at the fit,
+with its weights and without the kicks.
 """
 
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ from tmlattice.lattice.supplies import magnets, supplied_alike
 Array = NDArray[np.float64]
 
 CLEAR = 5.0
-"""Standard deviations from which on gradients are reported."""
+"""Standard deviations above which gradients are reported."""
 ROUNDING = 1e-6
-"""Share of a variance below which a difference of two counts as zero."""
+"""Share of a variance below which a difference of two is a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Pull:
     Attributes:
         name: of a family of quadrupoles, or of one of them.
         correctors, correctors_sigma: estimate by the correctors' responses, relative to the design.
-        with_rf, with_rf_sigma: estimate with the RF's orbit fitted, too.
-        pull: the difference, in standard deviations of it.
+        with_rf, with_rf_sigma: estimate by these and the RF's orbit.
+        pull: the difference, in its standard deviations.
     """
 
     name: str
@@ -58,11 +58,10 @@ class Inconsistency:
     """The inconsistency of the two estimates.
 
     Attributes:
-        missed: by how much gradients by the correctors alone miss the RF's orbit, rms, m.
-        known: by how much they would, rms, m: by their errors and the readings', as many of which
-            the fit takes for independent.
-        chi2, readings: of the RF's orbit, with the errors of that prediction.
-        pulls: inconsistent gradients, the strongest first: of families, of magnets.
+        missed: rms residual of the RF's orbit with gradients by the correctors alone, m.
+        known: its expected rms, m, by the errors of these gradients and the effective noise.
+        chi2, readings: of the RF's orbit, with the covariance of that prediction.
+        pulls: inconsistent gradients, of families, then of magnets, the strongest first.
     """
 
     missed: float
@@ -77,8 +76,7 @@ class Inconsistency:
 
 
 def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> Inconsistency | None:
-    """Return the inconsistency; None where the estimates agree, no gradients were fitted, or no
-    RF's orbit was read.
+    """Return the inconsistency; None if there is none, or without gradients or an RF's orbit.
 
     Args:
         state: of the fit.

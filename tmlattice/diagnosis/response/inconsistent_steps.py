@@ -1,12 +1,11 @@
-"""Inconsistent steps: a corrector's readings that belong to no orbit, because neighbours contradict
-one another.
+"""Inconsistent steps: readings of a corrector's step that are no single closed orbit.
 
-Of three neighbouring BPMs the reading of one follows from the other two, wherever else the beam is
+Given two of three neighbouring BPMs, the reading of the third follows, wherever else the beam is
 kicked: n1 x1 + n2 x2 + n3 x3 = 0, with n normal to their sensitivities to the two coordinates of a
-launch. A misplaced corrector, or a second kick, violates that at one triple. Where half of a
-column's triples violate it by many times the usual, the BPMs did not read one orbit; some had
-averaged over the time before the step, for example. Such a step determines no error and validates
-nothing. It is detected with the gains of a fit, rejected, and reported.
+launch. A misplaced corrector, or a second kick, violates that at one triple. If half of a column's
+triples violate it by many times the usual, the BPMs did not read one orbit: some may have averaged
+over the time before the step. Such a step has no information on any error. It is detected with the
+gains of a fit, rejected, and reported.
 """
 
 import numpy as np
@@ -31,11 +30,7 @@ _MAD = 1.4826  # of a Gaussian
 
 
 def inconsistent(state: State) -> Flags:
-    """Return the columns whose readings belong to no orbit, [column].
-
-    Args:
-        state: with gains and gradients.
-    """
+    """Return the columns whose readings are no single orbit, [column]; `state` has gains."""
     data = state.data
     out = np.zeros(len(data.plane), dtype=bool)
     for plane in (0, 1):
@@ -55,7 +50,7 @@ def inconsistent(state: State) -> Flags:
 
 
 def orbits_of(state: State, columns: NDArray[np.int64]) -> Array:
-    """rms of the measured columns in their own plane, m, at least the noise, [column]."""
+    """Return the rms of measured columns in their own plane, m, at least the noise, [column]."""
     read = state.data.pick(state.data.orbits)[columns][:, state.good]
     noise = float(np.median(state.data.noise))
     there = np.isfinite(read)
@@ -64,7 +59,7 @@ def orbits_of(state: State, columns: NDArray[np.int64]) -> Array:
 
 
 def _broken(state: State, column: int, plane: int) -> float:
-    """The violation of a column's typical triple, m, as one reading; NaN of too few."""
+    """The violation of a column's typical triple, per reading, m; NaN with too few readings."""
     data, at = state.data, state.at
     gain = at.errors.monitors[:, plane, plane]
     read, orbit = at.read[column, :, plane], data.orbits[column, :, plane]

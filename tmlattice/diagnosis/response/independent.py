@@ -1,13 +1,13 @@
-"""How many of a response's readings tell something of their own, by what a fit leaves of them.
+"""Effective sample size of the residuals of an orbit response.
 
-What a model lacks is no white noise: it is a few betatron waves, alike in many columns and at many
-monitors. Evidence, errors and the sizes of priors that took each reading for independent would be
-too sure by far, and fit what is lacking with whatever comes near it.
+Model discrepancy is not white: it is a few betatron oscillations, common to many columns and BPMs.
+If each residual counted as independent, evidence and errors would be overconfident, and the
+discrepancy would be fitted by unrelated parameters.
 
-White noise spreads over all singular vectors of [column, monitor], waves over few: the
-participation ratio of their squares counts them, and what white noise would have is known. (Of
-C x M Gaussian numbers the squared singular values s have E sum s = C M, and E sum s^2 =
-C M (C + M + 1).)
+White noise spreads over all singular vectors of the residual [column, monitor], betatron
+oscillations over few. The participation ratio of the squared singular values counts them, relative
+to its expectation for white noise. (For C x M Gaussian numbers the squared singular values s have E
+sum s = C M and E sum s^2 = C M (C + M + 1).)
 """
 
 import numpy as np
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 CLIPPED = 3.0
-"""Of a typical reading: one that went wrong is no pattern of all."""
+"""Limit of a residual, in units of the typical one: an outlier is no common pattern."""
 LEAST = 4
-"""Columns and monitors that it takes to say so."""
+"""Fewest columns and BPMs; with fewer, all readings count as independent."""
 
 
 def independent(left: Array, noise: Array) -> float:
-    """Share of the readings that are independent, 1 where noise alone is left.
+    """Return the effective sample size as a share of the readings; 1 if the residual is noise.
 
     Args:
-        left: what a fit leaves, m, NaN where nothing was read, [column, monitor].
-        noise: rms of each reading, m, [column, monitor].
+        left: residuals of a fit, m, NaN where nothing was read, [column, monitor].
+        noise: rms noise of each reading, m, [column, monitor].
     """
     seen = np.isfinite(left)
     left, noise = np.where(seen, left, 0.0), np.where(seen, noise, 0.0)
@@ -36,7 +36,7 @@ def independent(left: Array, noise: Array) -> float:
     if min(C, M) < LEAST or not left.any():
         return 1.0
     lacking = max(1 - float(np.sum(noise**2) / np.sum(left**2)), 0.0)
-    # one column, or monitor, that is worse than the others is no pattern either
+    # a column or BPM with large residuals is no common pattern either
     for axis in (1, 0, 1):
         typical = np.sum(left**2, axis=axis, keepdims=True) / seen.sum(axis=axis, keepdims=True)
         left = left / np.sqrt(np.maximum(typical, 1e-300))

@@ -1,14 +1,13 @@
-"""A jitter of the beam: closed orbits that every step has in it, each as much as chance has it.
+"""Beam jitter: closed orbits that are in each step, with a random amplitude.
 
-The orbits of a step are read seconds or minutes apart, and something kicks the beam meanwhile: a
-noisy supply, an injection element, the ground. All monitors read the same closed orbit then, in
-each step another amount of it. That is no noise of a monitor's own: hundreds of readings tell one
-amount. It is a covariance of each column's readings, whose amounts are integrated out
-(`inference.common`).
+The two orbits of a step are read seconds or minutes apart. If a noisy supply, a pulsed element or
+ground motion kicks the beam in between, all BPMs read the same additional closed orbit, in each
+step with another amplitude. So jitter is a covariance of each column's readings, whose amplitudes
+are integrated out (`inference.common`), and not noise of single BPMs.
 
-It is sought where the ring's own errors hardly show, in the plane that is not kicked, beside the
-roll of each corrector: place by place, the one first that explains most, as long as evidence wants
-more. Which places these are is known up to the phase of the betatron oscillation.
+Jitter is sought in the plane that is not kicked, where errors of the ring have little effect, given
+the roll of each corrector. Sources are added one by one by their evidence. Their positions are
+known up to the phase of the betatron oscillation.
 
 >>> found = sought(state)
 >>> state = settle(replace(state, jitter=found.orbits))
@@ -35,32 +34,31 @@ Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 MOST = 3
-"""Places that kick, in a plane: two make every phase, a third is for what is not quite a wave."""
+"""Most sources of a plane: two span all betatron phases, a third is for deviations from that."""
 LEAST = 5.0
-"""Log evidence of one, beyond that of as many places as there are."""
+"""Log evidence required for a source, beyond the logarithm of the number of candidates."""
 SHARE = 0.25
-"""Of what a typical column has left beside its own roll, in the mean square, that a jitter is at
-least: less is not worth a covariance."""
+"""Least share of the typical column's mean square residual, given its own roll, that jitter must
+explain: less is not worth a covariance."""
 SIZES = np.geomspace(0.01, 3.0, 30)
-"""That are tried, in units of what a typical column has left."""
+"""Prior rms of the amplitudes that are tried, in units of the typical column's rms residual."""
 PASSES = 3
-"""Through all places: how well each is told depends on what the others leave."""
+"""Repetitions of the search: the weights depend on the residual given the sources."""
 FREE = 30.0
-"""Size of a corrector's own roll, in units of what its column has left: all but free."""
+"""Prior rms of a corrector's own roll, in units of its column's residual: practically free."""
 ROUNDS = 30
-"""Of EM, for the sizes of all places together."""
+"""Iterations of EM for the prior rms of all sources together."""
 ENOUGH, COLUMNS = 12, 8
-"""Readings of a column, and columns, that it takes to say so."""
+"""Fewest readings of a column, and fewest columns, for a search."""
 
 
 @dataclass(frozen=True)
 class Jitter:
-    """What was found.
+    """Detected beam jitter.
 
     Attributes:
-        orbits: as large as they typically are, m, [plane that is read, pattern, monitor]; a plane
-            with fewer of them has zeros.
-        places: magnets behind which a kick makes them, of each plane.
+        orbits: of typical amplitude, m, [plane that is read, pattern, monitor], padded with zeros.
+        places: magnets behind which a kick makes these orbits, of each plane.
     """
 
     orbits: Array
@@ -68,31 +66,31 @@ class Jitter:
 
     @property
     def planes(self) -> tuple[int, ...]:
-        """In which it was found."""
+        """The planes in which jitter was detected."""
         return tuple(plane for plane, own in enumerate(self.places) if own)
 
     @property
     def sentence(self) -> str:
-        """In words."""
-        told = " and ".join(
+        """The message about it."""
+        sizes = " and ".join(
             f"{1e6 * np.sqrt(np.mean((own**2).sum(axis=0))):.2g} µm rms in {plane} "
-            f"(as from {', '.join(places)})"
+            f"(as by kicks behind {', '.join(places)})"
             for own, places, plane in zip(self.orbits, self.places, "xy", strict=True)
             if places
         )
         return (
-            "the beam moved between the readings of a step, all monitors together, by another "
-            f"amount in each: {told}; which amount is taken for unknown (where it comes from is "
-            "known up to the phase of the betatron oscillation)"
+            f"beam jitter between the readings of a step, common to all BPMs: {sizes}; its "
+            "amplitude in each step is integrated out (the source is known up to the phase of the "
+            "betatron oscillation)"
         )
 
 
 def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
-    """The jitter that stands out, if any does.
+    """Return the detected jitter; None if there is none.
 
     Args:
-        state: with gains, rolls and gradients; a jitter that it has is not looked at.
-        planes: that are looked at.
+        state: with gains, rolls and gradients; jitter in the state is ignored.
+        planes: to search.
     """
     still = replace(state, jitter=None)
     x, y = (_in_plane(still, plane) if plane in planes else _nothing(state) for plane in (0, 1))
@@ -105,7 +103,7 @@ def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
 
 
 class _OfPlane(NamedTuple):
-    """Orbits [pattern, monitor] of one plane, and where they come from."""
+    """Orbits [pattern, monitor] of one plane, and the magnets behind which a kick makes them."""
 
     orbits: Array
     places: tuple[str, ...]
@@ -116,7 +114,7 @@ def _nothing(state: State) -> _OfPlane:
 
 
 def _in_plane(state: State, plane: int) -> _OfPlane:
-    """What is found in one plane."""
+    """The jitter of one plane."""
     data, at, model = state.data, state.at, state.at.model
     nothing = _nothing(state)
     weights = weight(state, 1)
@@ -134,7 +132,7 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
     orbits *= at.errors.monitors[:, plane, plane]
     orbits *= np.median(_rms(without)) / np.maximum(_rms(orbits), 1e-300)
     least = (NOISE_LEFT * data.noise_of(1)[read]) ** 2
-    count = 1.0  # what makes few readings independent is what is sought
+    count = 1.0  # jitter itself would reduce the effective sample size
     for _ in range(PASSES):
         weights = count * _weights(weights > 0, rest, least)
         found, which = _places(weights, left, rolls, orbits)
@@ -144,21 +142,20 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
     before, after = np.median(_rms(without)), np.median(_rms(rest))
     if not before > 0:
         return nothing
-    log.info("plane %d: %s leave %.3g of %.3g m", plane, places, after, before)
+    log.info("plane %d: jitter from %s, residual %.3g of %.3g m", plane, places, after, before)
     share = 1 - float((after / before) ** 2)
     return nothing if share < SHARE else _OfPlane(found, places)
 
 
 def _weights(seen: Flags, rest: Array, least: Array) -> Array:
-    """1 / variance of what is left, of each column at least that of the typical one, [column,
-    monitor]."""
+    """Inverse variances by the mean square residual of each column, at least that of the typical
+    column, [column, monitor]."""
     squares = np.sum(rest**2, axis=1, keepdims=True) / seen.sum(axis=1, keepdims=True)
     return np.where(seen, 1 / (np.maximum(squares, np.median(squares)) + least), 0.0)
 
 
 def _places(weights: Array, left: Array, rolls: Array, orbits: Array) -> tuple[Array, list[int]]:
-    """Orbits that columns have in common beside their rolls, as large as they typically are; and
-    which these are."""
+    """Orbits of typical amplitude that the columns share, given their rolls; and their indices."""
     found, which = orbits[:0], list[int]()
     while len(which) < MOST:
         gained, sizes = _gains(weights, left, _patterns(rolls, found), orbits)
@@ -172,29 +169,28 @@ def _places(weights: Array, left: Array, rolls: Array, orbits: Array) -> tuple[A
 
 
 def _rest(weights: Array, left: Array, patterns: Array) -> Array:
-    """What is left beside the likeliest amounts of patterns, [column, monitor]."""
+    """The residual given the most probable amplitudes of the patterns, [column, monitor]."""
     likely = amounts(weights, patterns, left)[0]
     return np.where(weights > 0, left - np.einsum("ck,ckm->cm", likely, patterns), 0.0)
 
 
 def _rms(values: Array) -> Array:
-    """Of each row, [row, 1]."""
+    """The rms of each row, [row, 1]."""
     return np.asarray(np.sqrt(np.mean(values**2, axis=1, keepdims=True)))
 
 
 def _patterns(rolls: Array, orbits: Array) -> Array:
-    """Of each column its own roll, and the orbits that all have, [column, pattern, monitor]."""
+    """A column's own roll, and the shared orbits, [column, pattern, monitor]."""
     shared = np.broadcast_to(orbits, (len(rolls), *orbits.shape))
     return np.concatenate([rolls[:, None], shared], axis=1)
 
 
 def _gains(weights: Array, left: Array, patterns: Array, orbits: Array) -> tuple[Array, Array]:
-    """Log evidence of each orbit beside patterns that are there, at its likeliest size; and that
-    size, [orbit].
+    """Log evidence of each further orbit, given present patterns, at its most probable prior rms;
+    and that rms, [orbit].
 
-    A column knows the amount of an orbit with information d, and its likeliest one is n / d: with
-    a size s of all amounts the log evidence is the sum of s^2 n^2 / 2 (1 + s^2 d) - log(1 + s^2 d)
-    / 2.
+    A column with score n and information d of an orbit's amplitude contributes s^2 n^2 / 2 (1 + s^2
+    d) - log(1 + s^2 d) / 2 at the prior rms s.
     """
     taken = common(weights, patterns)[0]
     score = orbits @ times_precision(weights, taken, left).T
@@ -211,8 +207,7 @@ def _gains(weights: Array, left: Array, patterns: Array, orbits: Array) -> tuple
 
 
 def _sized(weights: Array, left: Array, rolls: Array, orbits: Array) -> Array:
-    """Orbits as large as all columns together make each likely, those whose amounts go together
-    combined, by EM."""
+    """The orbits combined and scaled to independent amplitudes of rms 1, by EM over all columns."""
     for _ in range(ROUNDS):
         likely, covariance = amounts(weights, _patterns(rolls, orbits), left)
         squares = np.mean(likely[:, :, None] * likely[:, None] + covariance, axis=0)[1:, 1:]

@@ -1,9 +1,8 @@
-"""Findings of a response that are no effect of the catalogue: swapped correctors or BPMs, and
-misplaced correctors.
+"""Findings that are no effect of the catalogue: swapped correctors or BPMs, misplaced correctors.
 
 >>> found = label_findings(ring, swapped, misplaced(fit.state))
 
-They are localised and described in words. The correction of swaps is reported elsewhere.
+They are localised and described. The correction of swaps is reported elsewhere.
 """
 
 from collections.abc import Sequence
@@ -30,8 +29,8 @@ def label_findings(
         ring: the design.
         swaps: pairs that were corrected.
         misplaced: misplaced correctors.
-        other: what each one of a pair does like the other: it "should", by the model, or it
-            "did" in the reference.
+        other: the verb of the text: each of a pair responds as the other one "should" by the model,
+            or "did" in the reference.
     """
     found = []
     for what, pairs in (("correctors", swaps.correctors), ("monitors", swaps.monitors)):
@@ -54,8 +53,8 @@ def label_findings(
 def _finding(
     ring: Ring, elements: tuple[str, ...], seen: Detection, words: str, to_check: str
 ) -> Finding:
-    """The finding of one element at its place in the lattice; of two, from one to the other where
-    they are near, else at the first."""
+    """The finding of one element at its place in the lattice; of two elements the range between
+    them if they are near one another."""
     found = located(ring, ring[elements[0]], seen)
     found = replace(found, words=words, to_check=to_check, elements=elements)
     if len(elements) == 1:

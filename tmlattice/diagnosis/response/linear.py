@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STILL = 0.05
-"""Mean move of the ring, as a share of the step bounds, from which on derivatives are computed
-again."""
+"""Mean move of the ring, as a share of the step bounds, above which derivatives are renewed."""
 
 
 def _ring(state: State) -> dict[str, Array]:
@@ -32,7 +31,7 @@ def _ring(state: State) -> dict[str, Array]:
 
 
 def _rows(state: State, family: Family) -> Kept:
-    """The derivatives of a variable of the ring: the present ones, or new ones."""
+    """The derivatives by a variable of the ring, renewed if the ring has moved."""
     ring, gain = _ring(state), state.at.gain(family.block)
     scale = 1 + state.at.errors.calibration
     kept = state.kept.get(family.variable)
@@ -44,7 +43,7 @@ def _rows(state: State, family: Family) -> Kept:
 
 
 def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) -> Array:
-    """Values of one variable padded with zeros to the length of the longer one."""
+    """Change of a variable; the shorter one of both values is padded with zeros."""
     old, new = (one.get(name, np.zeros(0)) for one in (before, now))
     change = np.zeros(max(len(old), len(new)))
     change[: len(new)] += new
@@ -53,7 +52,7 @@ def _change(before: Mapping[str, Array], now: Mapping[str, Array], name: str) ->
 
 
 def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
-    """Factors on the present derivatives: gains and calibrations have changed."""
+    """Factors on the present derivatives by changed gains and calibrations; None: unchanged."""
     if (gain == kept.gain).all() and (scale == kept.scale).all():
         return None
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -64,8 +63,8 @@ def _now(kept: Kept, gain: Array, scale: Array) -> Array | None:
 class Linear(NamedTuple):
     """The linearised readings of one block.
 
-    Parameters are those of the monitors, x and y of each; of the columns; and of the ring. One
-    at its lower bound that the readings would decrease stays there.
+    Parameters are those of the BPMs, x and y of each; of the columns; and of the ring. A parameter
+    at its lower bound stays there if the readings would decrease it.
     """
 
     normal: Normal
@@ -110,13 +109,13 @@ def linear(state: State, block: int) -> Linear:
     for family in {f.variable: f for f in families}.values():
         values = state.values[family.variable]
         if family.per == "ring":
-            stands = kept[family.variable] = _rows(state, family)
-            share = _now(stands, at.gain(block), 1 + at.errors.calibration)
+            current = kept[family.variable] = _rows(state, family)
+            share = _now(current, at.gain(block), 1 + at.errors.calibration)
             where[family.variable] = slice(end, end + len(values))
             end += len(values)
             start.append(values)
             trust.append(np.full(len(values), family.trust))
-            ring.append(Slopes(stands.rows, share))
+            ring.append(Slopes(current.rows, share))
         else:
             slopes = family.rows(at, values)
             low = 0 if family.per == "monitor" else 2 * monitors
@@ -154,7 +153,7 @@ def linear(state: State, block: int) -> Linear:
 
 
 def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array) -> Linear:
-    """The linearisation with more numbers of the ring, each of prior rms 1.
+    """Return the linearisation with more numbers of the ring, each of prior rms 1.
 
     Args:
         there: `linear` of a block of the state.
@@ -167,9 +166,9 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
     before, end = len(there.start), len(there.start) + len(rows)
     weighted = np.array([weighed(state, block, own) for own in rows]).reshape(rows.shape)
     plane, no_ring = state.data.plane_of(block), there._replace(ring=())
-    beside = [gathered(no_ring, plane, own) for own in weighted]
+    linear_ones = [gathered(no_ring, plane, own) for own in weighted]
     across = np.concatenate([
-        np.array(beside).reshape(len(rows), -1), *(own.times(weighted).T for own in there.ring)
+        np.array(linear_ones).reshape(len(rows), -1), *(own.times(weighted).T for own in there.ring)
     ], axis=1)  # fmt: skip
     more, read = Slopes(rows), Slopes(weighted)
     own = read.times(rows)
@@ -192,32 +191,30 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
 
 
 def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
-    """Return information and score of some variables, with all others and their priors integrated
-    out.
+    """Return information and score of some variables, with all others integrated out.
 
     Args:
         there: of the fit.
         names: of variables.
 
     Returns:
-        Information, and score with all these numbers at zero: their likelihood is
-        exp(score x - x information x / 2).
+        Information, and score at zero: the log likelihood of the numbers x is score x - x
+        information x / 2.
     """
     A = there.normal.matrix
-    said = there.normal.vector + A @ there.start
+    score = there.normal.vector + A @ there.start
     own = np.concatenate([np.arange(len(A))[there.where[name]] for name in names])
     spread = np.concatenate([group.basis * group.scale for group in there.groups], axis=1)
     spread = spread[:, ~spread[own].any(axis=0)]
     inside = spread.T @ A @ spread + np.eye(spread.shape[1])
     across = A[own] @ spread
-    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ said]))
+    taken = np.linalg.solve(inside, np.column_stack([across.T, spread.T @ score]))
     information = A[np.ix_(own, own)] - across @ taken[:, :-1]
-    return (information + information.T) / 2, said[own] - across @ taken[:, -1]
+    return (information + information.T) / 2, score[own] - across @ taken[:, -1]
 
 
 def gathered(there: Linear, plane: Indices, weighted: Array) -> Array:
-    """J^T of weighted readings [column, monitor] with the derivatives of the start, [parameter],
-    each column read in a plane."""
+    """Return J^T times weighted readings [column, monitor] in each column's plane, [parameter]."""
     by_monitor = there.by_monitor * weighted
     alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
     by_column = (there.by_column * weighted).sum(axis=1)

@@ -1,8 +1,8 @@
-"""Single correctors that respond as if they were elsewhere than in the lattice.
+"""Single correctors that respond as if they were at another place than in the lattice.
 
-From its place in the lattice, a kick at a distance d downstream looks like the same kick and a
-position jump of -d times the kick. All correctors have some of that, because their fields have a
-length. An outlier among them that agrees at another place has a wrong place, or name.
+Seen from its place in the lattice, a kick at a distance d downstream is the same kick and a
+position jump of -d times the kick. All correctors have a small jump, because their fields have a
+length. An outlier whose residual vanishes at another place has a wrong place, or a wrong name.
 
 >>> found = misplaced(state)
 >>> [(own.name, own.by) for own in found]
@@ -19,20 +19,19 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FAR = 5.0
-"""Least ratio of residual and displacement to those usual of the plane's correctors."""
+"""Least ratio of the residual, and of the displacement, to the usual ones of the plane."""
 AGREES = 0.3
-"""Largest ratio of the residual at the new place to the one before."""
+"""Largest ratio of the residuals at the new place and at the lattice's."""
 SPARED = 0.1
-"""Largest share of the readings between the two places, which do not count."""
+"""Largest share of readings that are omitted because they are between the two places."""
 MARGIN = 1.5
-"""Margin beyond the estimated place, as a share of the distance, within which a BPM counts as
-between."""
+"""Margin beyond the estimated place, as a share of the distance, that counts as between."""
 SAME = 1e-6
 """Distance, m, below which elements have one place."""
 LEAST = 0.05
-"""Displacement, m, that any field's shape explains."""
+"""Displacement, m, that the shape of any field explains."""
 FEWEST = 8
-"""Least numbers of readings, and of correctors of a plane."""
+"""Fewest readings, and correctors of a plane."""
 _MAD = 1.4826  # of a Gaussian
 
 
@@ -41,9 +40,9 @@ class Misplaced(NamedTuple):
 
     Attributes:
         name, column: of the corrector, and of the response.
-        left, moved: residual at its place in the lattice, and at the other place, rms, m.
-        by: how far downstream, m.
-        gain: by which chi-square falls there.
+        left, moved: rms residual at its place in the lattice, and at the other place, m.
+        by: distance of the other place downstream, m.
+        gain: fall of chi-square.
     """
 
     name: str
@@ -55,11 +54,7 @@ class Misplaced(NamedTuple):
 
 
 def misplaced(state: State) -> list[Misplaced]:
-    """Return the misplaced correctors.
-
-    Args:
-        state: a fit's; held-out correctors are included.
-    """
+    """Return the misplaced correctors by the state of a fit, held-out ones included."""
     data, at = state.data, state.at
     beam, jumps = (data.pick(at.seen(own)) for own in (at.beam, at.jumps))
     orbits = data.pick(data.orbits)
@@ -95,16 +90,16 @@ def misplaced(state: State) -> list[Misplaced]:
 def clear(
     state: State, column: int, patterns: Array, orbit: Array, seen: Flags, kick: float = 0.0
 ) -> Flags:
-    """Readings except those of BPMs between the corrector's place and its estimated place, which
-    have the kick on their other side. Outside, a kick at any place is a kick here and a jump.
+    """Return the readings except those of BPMs between the corrector's place and its estimated
+    place, on the other side of the kick. Elsewhere a kick at any place is a kick here and a jump.
 
     Args:
         state: of the fit.
         column: of the corrector.
         patterns: of kick and jump, [monitor, 2].
-        orbit: what is to be explained, [monitor].
-        seen: readings that there are.
-        kick: of which the pattern of the kick is on top, in its units.
+        orbit: to be explained, [monitor].
+        seen: valid readings, [monitor].
+        kick: that `orbit` no longer includes, in units of its pattern.
     """
     data = state.data
     missed = np.abs(amplitudes(patterns, orbit, seen, seen)[1])
@@ -123,7 +118,7 @@ def clear(
 
 
 def moved_text(own: Misplaced) -> str:
-    """The displacement, and the residuals with and without it, in words."""
+    """Return the displacement, and the residuals with and without it, as a text."""
     return (
         f"{abs(own.by):.2g} m {'down' if own.by > 0 else 'up'}stream ({1e6 * own.left:.2g} µm rms "
         f"residual in the lattice's place, {1e6 * own.moved:.2g} there)"

@@ -4,9 +4,9 @@
 >>> for row in weigh(fit.state): print(row.effect, row.amount, row.amount_sigma, row.judgement)
 
 A hypothesis is a set of patterns, the derivatives of the readings by its parameters. They are
-fitted together with the parameters of the fit, linearised, to the same correctors; held-out ones
-are the validation set. The parameters of single correctors (place, drift during the step) are
-estimated from half of a held-out corrector's BPMs, like its kick.
+fitted together with the parameters of the fit, linearised, to the same correctors, and validated on
+held-out ones. Parameters of single correctors (place, drift during the step) are estimated from
+half of a held-out corrector's BPMs, like its kick.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -30,7 +30,7 @@ Patterns: TypeAlias = Array | csr_array
 FREE = 30.0
 """Prior rms of a single parameter, in units of the largest plausible amount: nearly flat."""
 FEW = 6
-"""Most amounts of a hypothesis with such a prior."""
+"""Largest number of amounts with such a prior."""
 CONTROL = 17
 """Seed of the random parameters of the control."""
 SPARSE = 0.1
@@ -43,14 +43,14 @@ class Weighed:
 
     Attributes:
         effect, unit, expected: see `Hypothesis`.
-        parameters: how many.
+        parameters: their number.
         amount: the parameter, or the rms of several.
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
         on_top_in_plane, on_top_position: with it and all accepted ones, m.
-        evidence: by which the log evidence of the fitted readings grows with it alone: the misfit
-            that it explains, less what its parameters cost.
-        control_in_plane: with as many random parameters in its stead, m; None where columns have no
+        evidence: gain of log evidence of the fitted readings with it alone: the misfit that it
+            explains, less the cost of its parameters.
+        control_in_plane: with as many random parameters instead, m; None unless columns have
             amounts of their own. See `control`.
         judgement: "helps" (on top of all better ones); "helps, not on top"; "as random ones do" (no
             more than its control); "unphysical" (improves with an implausible amount); "excluded"
@@ -72,12 +72,12 @@ class Weighed:
     judgement: str
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return dict(vars(self))
 
 
 HELPS = 0.98
-"""Largest ratio of the held-out rms where a hypothesis improves."""
+"""Ratio of held-out rms, with and without a hypothesis, below which it improves the prediction."""
 
 
 def weigh(
@@ -85,13 +85,13 @@ def weigh(
     wanted: Iterable[str] | None = None,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> list[Weighed]:
-    """Score every hypothesis alone and on top of the others; the first row is the fit without any.
+    """Return the scores of every hypothesis alone and given the others; the first row is the fit.
 
-    Those that physics allows are accepted one by one, the best first, as long as each lowers the
-    held-out rms given those before; then every other is scored once more given them.
+    Plausible ones are accepted one by one, the best first, as long as each lowers the held-out rms
+    given those before; then every other one is scored again given them.
 
     Args:
-        state: after the fit.
+        state: of the fit.
         wanted: names of `HYPOTHESES`; None: all.
         progress: called with each name.
     """
@@ -114,11 +114,11 @@ def weigh(
         nonlocal together
         left = list(candidates)
         while left:
-            beside = [found[k] for k in chosen]
-            answers = {i: fitted.weigh([*beside, found[i]]) for i in left}
+            given = [found[k] for k in chosen]
+            answers = {i: fitted.weigh([*given, found[i]]) for i in left}
             left = [i for i in left if _helps(found[i], answers[i], together)]
             if left:
-                best = min(left, key=lambda i, said=answers: said[i].in_plane)  # type: ignore[misc]
+                best = min(left, key=lambda i, scores=answers: scores[i].in_plane)  # type: ignore[misc]
                 together = answers[best]
                 chosen.append(best)
                 left.remove(best)
@@ -140,7 +140,7 @@ def weigh(
     four = base.in_plane, base.position, together.in_plane, together.position
     out = [Weighed("none", "", "", 0, 0.0, 0.0, *four, 0.0, None, "")]
     for i, hypothesis in enumerate(found):
-        beside = together if i in chosen else on_top[i]
+        given = together if i in chosen else on_top[i]
         if i in chosen:
             judgement = "helps"
         elif i in helpers:
@@ -148,23 +148,23 @@ def weigh(
         elif i not in helpful and _helps(hypothesis, alone[i], base):
             judgement = "as random ones do"
         else:
-            judgement = _refusal(hypothesis, alone[i], beside, base, before)
+            judgement = _refusal(hypothesis, alone[i], given, base, before)
         amounts, sigma, in_plane, position, evidence = alone[i]
         out.append(
             Weighed(
                 hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts),
-                _size(amounts), float(np.median(sigma)), in_plane, position, beside.in_plane,
-                beside.position, evidence, random[i], judgement,
+                _size(amounts), float(np.median(sigma)), in_plane, position, given.in_plane,
+                given.position, evidence, random[i], judgement,
             )
         )  # fmt: skip
     return out
 
 
 def _refusal(
-    hypothesis: Hypothesis, alone: "Answer", beside: "Answer", base: "Answer", before: "Answer"
+    hypothesis: Hypothesis, alone: "Answer", given: "Answer", base: "Answer", before: "Answer"
 ) -> str:
-    best = min(alone.in_plane / base.in_plane, beside.in_plane / before.in_plane)
-    unphysical = best < HELPS and not _sensible(hypothesis, beside)
+    best = min(alone.in_plane / base.in_plane, given.in_plane / before.in_plane)
+    unphysical = best < HELPS and not _sensible(hypothesis, given)
     return "unphysical" if unphysical else "excluded"
 
 
@@ -174,10 +174,10 @@ def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:
 
 
 def control(hypothesis: Hypothesis) -> Hypothesis:
-    """Random parameters as many, as large and as smooth along the ring, unrelated to their columns.
+    """Return random parameters of the same number, size and smoothness, unrelated to their columns.
 
-    Parameters of single columns are estimated from half of a held-out one's BPMs, so that any
-    smooth orbits improve the other half.
+    Parameters of single columns are estimated from half of a held-out corrector's BPMs, so any
+    smooth orbit improves the other half.
     """
     rng = np.random.default_rng(CONTROL)
     patterns = hypothesis.patterns.copy()
@@ -353,7 +353,7 @@ class _Part:
 
 
 def _scaled(flat: Patterns, by: Array) -> Patterns:
-    """A parameter for every reading."""
+    """Patterns with a factor on each reading."""
     return csr_array(flat.multiply(by)) if isinstance(flat, csr_array) else flat * by
 
 

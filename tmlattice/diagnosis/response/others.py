@@ -1,5 +1,4 @@
-"""Causes in the ring without a family (a misaligned sextupole, a device), as numbers of a
-hierarchical fit; and priors of single faults.
+"""Causes in the ring without a family (a misaligned sextupole, a device), as numbers of a fit.
 
 >>> state = with_number(state, ("sextupole_offset_x", "sf::3"), block=0)
 """
@@ -43,7 +42,7 @@ class _Others(Family):
         return len(self.causes)
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """No priors."""
+        """None: each number has the prior of its single fault."""
         return []
 
     def rows(self, at: Predicted, values: Array) -> Array:
@@ -68,7 +67,7 @@ class _Others(Family):
         return [(Cause(*h, a), s) for h, a, s in rows]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Zero: each has its own prior."""
+        """The effect of each number, in its unit."""
         return [{h: u} for h, u in zip(self.causes, self.units.tolist(), strict=True)]
 
 

@@ -1,8 +1,8 @@
-"""Single readings that stick out of what a response's fit leaves: they count less, and are named.
+"""Outlier readings of an orbit response: rejected, or with reduced weights, and reported.
 
-One monitor may read one corrector's step wrongly, by fifty times its noise, and be sound else: such
-readings are few, and their squares most of the misfit. In the last fit they weigh as if their noise
-were as large as makes them five times it, and no more.
+A sound BPM may read the step of one corrector wrongly, by fifty times its noise. Such readings are
+few, but make up most of chi-square. In the last fit their noise is increased until each residual is
+five times its noise; gross outliers are rejected.
 """
 
 import warnings
@@ -21,29 +21,29 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 GROSS = 20.0
-"""So many times what the design, or a fit, leaves of the typical reading, both of its corrector and
-of its monitor, no error of a ring makes of one reading alone: it went wrong."""
+"""Ratio of a residual to the typical ones of its corrector and of its BPM above which a reading is
+rejected: no error of a ring has this effect on a single reading."""
 OUT = 5.0
-"""A reading sticks out from so many times what is left of its column's typical one."""
+"""Ratio of a residual to the typical one of its column above which a reading is an outlier."""
 LEAST = 6
-"""Readings of the RF's orbit that say what is usual of them."""
+"""Fewest readings of the RF's orbit for a typical residual."""
 NAMED = 3
-"""Monitors and correctors that are named."""
+"""Most BPMs, and correctors, named in a message."""
 MANY = 8
-"""Readings of the RF's orbit that are named."""
+"""Most outliers of the RF's orbit named in a message."""
 OFTEN = 2
-"""Readings of one monitor, or corrector, from which it is named."""
+"""Outliers of one BPM or corrector from which on it is named."""
 _MAD = 1.4826  # of a Gaussian
 
 
 def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitResponse, list[str]]:
-    """The measurement without single readings that went wrong, and a sentence of them.
+    """Return the measurement without gross outliers relative to the design, and messages.
 
-    Held-out correctors have such readings too, and a few of them make up all that the judges see.
+    They are rejected in held-out correctors too, where a few would dominate the validation scores.
 
     Args:
         measured: the response.
-        data: the same, as the ring has it.
+        data: the same response on the ring.
     """
     wrong = gross(data, data.orbits - Predicted(data, Errors.none(data)).read)
     if not wrong.any():
@@ -54,12 +54,11 @@ def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitRes
 
 
 def gross(data: ResponseData, left: Array) -> Flags:
-    """Readings of the correctors that went wrong, by what something leaves of them, [column,
-    monitor, 2].
+    """Return the gross outliers among the correctors' readings, [column, monitor, 2].
 
     Args:
         data: the response.
-        left: m, NaN where nothing was read, [column, monitor, 2].
+        left: residuals, m, NaN where nothing was read, [column, monitor, 2].
     """
     gap, plane = np.abs(left[:-1]), data.plane[:-1]
     wrong = np.zeros(left.shape, dtype=bool)
@@ -67,7 +66,7 @@ def gross(data: ResponseData, left: Array) -> Flags:
         rows = np.flatnonzero(plane == kicked)
         own = gap[rows, :, read]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # what was not read at all
+            warnings.simplefilter("ignore", RuntimeWarning)  # no readings
             column, monitor = (np.nanmedian(own, axis=k, keepdims=True) for k in (1, 0))
         usual = np.fmax(np.fmax(column, monitor), data.noise[:, read])
         wrong[rows, :, read] = np.nan_to_num(own) > GROSS * _MAD * usual
@@ -75,12 +74,12 @@ def gross(data: ResponseData, left: Array) -> Flags:
 
 
 def told_gross(data: ResponseData, wrong: Flags, what: str) -> list[str]:
-    """A sentence of readings that went wrong, where there are any.
+    """Return a message about gross outliers; none without any.
 
     Args:
         data: the response.
-        wrong: which, [column, monitor, 2].
-        what: they differ from.
+        wrong: the outliers, [column, monitor, 2].
+        what: reference of the residuals: the design or the fit.
     """
     if not wrong.any():
         return []
@@ -89,13 +88,13 @@ def told_gross(data: ResponseData, wrong: Flags, what: str) -> list[str]:
     most = _most(Counter(names.monitors[i] for i in monitors.tolist()),
                  Counter(names.correctors[i] for i in columns.tolist()))  # fmt: skip
     return [
-        f"single readings that differ from {what} by {GROSS:g} times what is usual of their "
-        f"corrector and of their monitor, left out: {len(columns)}{most}"
+        f"outlier readings, which differ from {what} by more than {GROSS:g} times the typical "
+        f"residual of their corrector and of their BPM, rejected: {len(columns)}{most}"
     ]
 
 
 def _most(*tables: Counter[str]) -> str:
-    """Who has most of them."""
+    """The BPMs and correctors with most outliers."""
     most = [
         f"{name} ({own})"
         for table in tables
@@ -106,18 +105,20 @@ def _most(*tables: Counter[str]) -> str:
 
 
 def robust(state: State) -> State:
-    """Every reading has a weight of its own from here on."""
+    """Return the state with a weight of its own for each reading."""
     return replace(state, share=np.ones((2, *state.data.shape)))
 
 
 def rf_shares(state: State, block: int, left: Array) -> Array:
-    """By which each reading of the RF's orbit counts, [block, monitor]: it is one orbit, and a few
-    of its readings that went wrong (0 where nothing was read, say) make kicks and energies of it.
+    """Return factors on the weights of the RF's orbit, [block, monitor].
+
+    This orbit is read once: a few outliers (zeros where nothing was read, for example) would be
+    fitted by kicks and an energy offset.
 
     Args:
-        state: that is fitted.
+        state: of the fit.
         block: 0 in-plane, 1 coupling.
-        left: what the fit leaves of it, m, NaN where nothing is fitted, [monitor].
+        left: residuals, m, NaN where nothing is fitted, [monitor].
     """
     own = np.ones((2, len(left))) if state.rf_share is None else state.rf_share.copy()
     if np.isfinite(left).sum() >= LEAST:
@@ -128,12 +129,12 @@ def rf_shares(state: State, block: int, left: Array) -> Array:
 
 
 def shares(state: State, block: int, left: Array) -> Array:
-    """By which each reading of the correctors counts; the RF's have shares of their own.
+    """Return factors on the weights of the correctors' readings, [block, column, monitor].
 
     Args:
-        state: that is fitted.
+        state: of the fit.
         block: 0 in-plane, 1 coupling.
-        left: what the fit leaves, m, NaN where nothing is fitted, [column but the RF, monitor].
+        left: residuals, m, NaN where nothing is fitted, [column except the RF, monitor].
     """
     assert state.share is not None
     out = state.share.copy()
@@ -143,7 +144,7 @@ def shares(state: State, block: int, left: Array) -> Array:
 
 
 def _pulls(state: State, block: int, left: Array) -> Array:
-    """In units of what is left of the column's typical reading, or of the noise if that is more."""
+    """Residuals in units of the column's typical one, or of the noise if that is larger."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns that are not fitted
         typical = _MAD * np.nanmedian(np.abs(left), axis=1)
@@ -151,7 +152,7 @@ def _pulls(state: State, block: int, left: Array) -> Array:
 
 
 def outlier_readings(state: State) -> list[str]:
-    """Sentences of those that stick out of a result, where there are any."""
+    """Return messages about the outliers of a fit; none without any."""
     if state.share is None:
         return []
     messages = _odd_rf(state)
@@ -168,13 +169,13 @@ def outlier_readings(state: State) -> list[str]:
         return messages
     return [
         *messages,
-        f"{count} of {total} readings stick out by more than {OUT:g} times what is left of their "
-        f"corrector's typical one, and count little{_most(monitors, correctors)}.",
+        f"{count} of {total} readings are outliers, by more than {OUT:g} times the typical "
+        f"residual of their corrector, and have reduced weights{_most(monitors, correctors)}.",
     ]
 
 
 def _odd_rf(state: State) -> list[str]:
-    """A sentence of the RF's readings that count little."""
+    """A message about outliers of the RF's orbit."""
     if state.rf_share is None:
         return []
     odd = np.flatnonzero((state.rf_share < 1).any(axis=0) & state.good)
@@ -183,6 +184,6 @@ def _odd_rf(state: State) -> list[str]:
     names = ", ".join(state.data.measured.monitors[i] for i in odd[:MANY])
     more = f" and {len(odd) - MANY} more" if len(odd) > MANY else ""
     return [
-        f"readings of the RF's orbit that stick out of it by more than {OUT:g} times what is usual "
-        f"of it, and count next to nothing: {names}{more}."
+        f"outlier readings of the RF's orbit, by more than {OUT:g} times its typical residual, "
+        f"with almost no weight: {names}{more}."
     ]

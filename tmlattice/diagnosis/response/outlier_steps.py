@@ -1,9 +1,7 @@
-"""Steps of correctors, and single readings, that went wrong, by what a fit leaves of them: they are
-not fitted, and judge nobody.
+"""Outlier steps and outlier readings of a fit: they are neither fitted nor used for validation.
 
 >>> readings, steps = outlier_steps(state)
->>> odd = readings.and_more(steps)
->>> state = beside(state, odd.unread)
+>>> readings.and_more(steps).messages
 """
 
 from dataclasses import dataclass, replace
@@ -22,25 +20,25 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 MANY = 0.1
-"""Share of a step's readings, and more than one, from which they are not single ones."""
+"""Share of a step's readings above which, if more than one, its outliers are no single readings."""
 GAINS = "monitor_gain"
-"""The family of monitors' gains."""
+"""The family of BPM gains."""
 
 
 @dataclass(frozen=True)
 class OutlierSteps:
-    """What went wrong.
+    """Rejected readings.
 
     Attributes:
-        unread: which readings are not used, [column, monitor, plane that is read].
-        said: sentences of them.
+        unread: which readings are rejected, [column, monitor, plane that is read].
+        messages: about them.
     """
 
     unread: Flags
     messages: tuple[str, ...] = ()
 
     def and_more(self, *others: "OutlierSteps") -> "OutlierSteps":
-        """With others."""
+        """Return these together with others."""
         unread, messages = self.unread, self.messages
         for own in others:
             unread, messages = unread | own.unread, (*messages, *own.messages)
@@ -48,30 +46,31 @@ class OutlierSteps:
 
 
 def outlier_steps(state: State) -> tuple[OutlierSteps, OutlierSteps]:
-    """Single readings that went wrong; and steps whose readings belong to no orbit, and those with
-    another kick in them: none where too few are left to fit and to judge.
+    """Return outlier readings; and inconsistent steps together with those of spurious kicks.
+
+    No step is rejected if too few columns would remain for the fit and its validation.
 
     Args:
-        state: with all families; without monitors' gains nothing is told, for these break triples
-            and leave kicks, too.
+        state: with all families. Without BPM gains nothing is rejected, because unknown gains look
+            like inconsistencies and like kicks.
     """
     data, split = state.data, state.split
     nothing = np.zeros(data.orbits.shape, dtype=bool)
     if not state.allows(GAINS):
         return OutlierSteps(nothing), OutlierSteps(nothing)
-    # beside a far lattice a column may have begun with a calibration that it has not, and with the
-    # third order of that
+    # if the lattice is far from the ring, a column may have started with a wrong calibration, and
+    # with the third order of its kick
     state = bend(jump(state, beyond=1.0))
     alone = gross(data, _beside_own_kick(state))
     read = np.isfinite(data.orbits).sum(axis=(1, 2))
     many = np.maximum(MANY * read, 1)
-    alone[alone.sum(axis=(1, 2)) > many] = False  # the step went wrong, not single readings
+    alone[alone.sum(axis=(1, 2)) > many] = False  # the step is the outlier
     state = beside(state, alone)
     broken = inconsistent(state)
-    alone[broken] = False  # among all the others
+    alone[broken] = False  # rejected with their step
     single = OutlierSteps(alone, tuple(told_gross(data, alone, "the fit")))
     names = data.measured.correctors
-    swapped = {name for pair in swaps(state) for name in pair}  # to be put right, not left out
+    swapped = {name for pair in swaps(state) for name in pair}  # corrected, not rejected
     others = [
         own
         for own in spurious_kicks(state)
@@ -80,7 +79,7 @@ def outlier_steps(state: State) -> tuple[OutlierSteps, OutlierSteps]:
     unread = np.zeros((len(data.plane), 2), dtype=bool) | broken[:, None]
     for own in others:
         unread[own.column, own.plane] = True
-        if own.plane == data.plane[own.column]:  # its own kick is not known either
+        if own.plane == data.plane[own.column]:  # its own kick is unknown
             unread[own.column] = True
     unread[left_in_plane(state, [own.column for own in others])] = True
     gone = unread.all(axis=1)
@@ -91,9 +90,8 @@ def outlier_steps(state: State) -> tuple[OutlierSteps, OutlierSteps]:
 
 
 def _beside_own_kick(state: State) -> Array:
-    """What is left with the kick that each column's readings have, for held-out ones have not been
-    fitted, m, [column, monitor, 2]: the one of least absolute deviations, of which a few wrong
-    readings move nothing."""
+    """Residuals given each column's own kick, because held-out columns are not fitted, m, [column,
+    monitor, 2]. The kick minimises the absolute deviations, which is robust against outliers."""
     data, read = state.data, state.at.read
     model, orbits = data.pick(read), data.pick(data.orbits)
     kick = np.ones(len(model))
@@ -111,9 +109,9 @@ def _torn(data: ResponseData, columns: Flags) -> list[str]:
     if not names:
         return []
     return [
-        "correctors at whose steps monitors next to one another contradict each other, as if some "
-        f"had been read before the beam had settled, left out: {', '.join(names)}; measure these "
-        "again, and wait longer"
+        "inconsistent steps, at which neighbouring BPMs contradict one another as if some had been "
+        f"read before the orbit settled, rejected: {', '.join(names)}; measure these correctors "
+        "again, and wait longer after each step"
     ]
 
 
@@ -121,21 +119,21 @@ def _kicked(state: State, others: list[SpuriousKick]) -> list[str]:
     if not others:
         return []
     names, layers = state.data.measured.correctors, state.at.model.maps.layers
-    told = ", ".join(
-        f"{names[own.column]} ({1e6 * own.amount:+.2g} µrad in {'xy'[own.plane]}, as from "
+    kicks = ", ".join(
+        f"{names[own.column]} ({1e6 * own.amount:+.2g} µrad in {'xy'[own.plane]}, as behind "
         f"{layers[own.layer]})"
         for own in others
     )
     return [
-        "something else kicked the beam while these correctors were stepped (where is known up to "
-        f"half betatron oscillations): {told}; these readings are left out; look for a supply that "
-        "jumps, and measure them again"
+        "spurious kicks during the steps of correctors (their positions are known up to half "
+        f"betatron oscillations): {kicks}; these readings are rejected; look for a power supply "
+        "that jumps, and measure these correctors again"
     ]
 
 
 def beside(state: State, flags: Flags) -> State:
-    """A state as if nobody had taken these readings, [column, monitor, 2]: columns that have none
-    are fitted nowhere, judge nothing, and have no numbers of their own."""
+    """Return the state without some readings, [column, monitor, 2]. Columns without readings are
+    neither fitted nor used for validation, and their own numbers are zero."""
     if not flags.any():
         return state
     data = state.data

@@ -1,16 +1,16 @@
-"""Which errors close how much of a measured orbit response's gap, step by step, on held-out data.
+"""Diagnosis of an orbit response by families of errors, validated on held-out readings.
 
-A fifth of the correctors is never fitted. Of each of them only the kick is taken, from a random
-half of the monitors, and the other half judges; the RF's orbit is fitted on half of the monitors
-and judged on the other half. Which families of errors are kept is decided on other correctors, held
-out from the rest, so that the figures of the steps judge and choose nothing.
+One fifth of the correctors is never fitted. For each of them the kick is estimated from a random
+half of the BPMs, and the prediction is scored on the other half. The RF's orbit is fitted at half
+of the BPMs and scored at the other half. Families are selected on other held-out correctors, so
+that the reported scores select nothing.
 
 >>> result = diagnose_response(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
 
-Gain and calibration are degenerate in scale without the dispersion, and neighbouring quadrupoles
-are correlated. Priors resolve both: a family of correctors or quadrupoles (one kind of magnet, or
-one supply) shares an error, its members scatter about it, and the scatter is learnt.
+BPM gains and corrector calibrations are degenerate in scale without the dispersion, and
+neighbouring quadrupoles are correlated. Priors resolve both: correctors of one kind, or quadrupoles
+of one kind or supply, share an error and scatter about it, and the scatter is learnt.
 """
 
 import time
@@ -76,13 +76,12 @@ Array = NDArray[np.float64]
 PATTERNS = 8
 """Number of the strongest patterns of the residual."""
 LARGE = 60_000
-"""Most readings for the search for single faults among distributed errors, which refits
-everything."""
+"""Most readings for the search for single faults among distributed errors, which refits all."""
 TOO_LARGE = (
     "single faults among the distributed errors were not sought: there are too many readings"
 )
 TYPICAL = 6
-"""Columns of a plane required for the typical one."""
+"""Fewest columns of a plane for the typical one."""
 
 
 def diagnose_response(
@@ -102,21 +101,19 @@ def diagnose_response(
 
     Args:
         ring: the design.
-        measured: with an RF step, if possible, and the noise of its readings; else that is
-            learnt.
+        measured: with an RF step, if possible, and with its noise, else that is estimated.
         holdout: share of the correctors that is never fitted.
-        effects: only families of these are tried; else all.
-        max_effects: steps that are kept at most.
-        false_alarm: chance that the readings of a faultless ring are said to have an error.
-        missing: weigh too which effect the result still lacks.
-        assume: what was written down wrongly everywhere, see `measurement.assume`; it is undone
-            first.
+        effects: names of effects whose families are tried; None: all.
+        max_effects: most accepted steps.
+        false_alarm: probability of a finding in readings of a faultless ring.
+        missing: score effects that may be missing from the result, too.
+        assume: what is recorded wrongly everywhere, see `measurement.assume`.
         seed: of the split.
         progress: called with the name of each stage.
 
     Raises:
         MeasurementError: too few correctors, or effects that have no family.
-        UnknownNameError: an effect or a monitor that does not exist.
+        UnknownNameError: an effect or a BPM that does not exist.
         UnstableRingError: no closed orbit.
     """
     begun = time.perf_counter()
@@ -131,9 +128,10 @@ def diagnose_response(
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
-    if sparse is None or overstated(ring, data.measured):  # to such a noise a few explain anything
+    if sparse is None or not sparse.noise or overstated(ring, data.measured):
         whole = _families(ring, measured, trials, holdout, max_effects, seed, progress)
-        sparse = None if sparse is None or outperforms(whole[0], sparse.fit) else sparse
+        worse = sparse is None or outperforms(whole[0], sparse, judgement)
+        sparse = None if worse else sparse
     rejected: tuple[tuple[str, str | None], ...] = ()
     if sparse is None:
         fit, measured, unlike, swaps = whole
@@ -183,8 +181,7 @@ def _families(
     seed: int,
     progress: Callable[[str], Any],
 ) -> tuple[StepwiseFit, OrbitResponse, list[str], Swaps]:
-    """The dense fit of what resembles the model; what was fitted, and what was done to it; and
-    what is exchanged."""
+    """The hierarchical fit without rejected channels, its measurement, messages, and swaps."""
     messages: list[str] = []
     known = Swaps([], {}, {}, [])
     fit: StepwiseFit | None = None
@@ -217,16 +214,15 @@ def _families(
 
 
 def _far(state: State, unlike: RejectedChannels) -> bool:
-    """Whether the ring is fitted before swaps are sought: in a design far from the ring, swapped
-    columns match by chance."""
+    """Whether the design is far from the ring: swapped columns then match by chance, and the ring
+    is fitted before swaps are sought."""
     gone = {name for name, _ in unlike.monitors}
     good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
     return strange(replace(state, good=good), TYPICAL) > FAR
 
 
 def _anothers(state: State) -> set[str]:
-    """Correctors that may answer as other ones should: they seem to stand elsewhere, or a fit
-    leaves far more of them than of the others."""
+    """Correctors that may be swapped: misplaced ones, and those with large residuals."""
     return {*(own.name for own in misplaced(state)), *unlike_model(state, ODD).correctors}
 
 
@@ -238,7 +234,7 @@ def _faults(
     judgement: Judgement,
     progress: Callable[[str], Any],
 ) -> tuple[StepwiseFit, tuple[Finding, ...]]:
-    """What is wrong alone among small errors, and the fit beside it."""
+    """The fit given detected single faults, and the findings."""
     state = fit.state
     ring = state.data.ring
     found = [swap_of(state, name, judgement) for name in swaps.planes
@@ -257,7 +253,7 @@ def _faults(
 
 
 def _without(state: State, far: Sequence[Misplaced]) -> State:
-    """The state without steps of explained columns, which are evidence for no single fault."""
+    """The state without the steps of misplaced correctors, no evidence of single faults."""
     gone = np.zeros(state.data.orbits.shape, dtype=bool)
     gone[[own.column for own in far]] = True
     return beside(state, gone)
@@ -344,7 +340,11 @@ def provenance(ring: Ring, used: dict[str, Any], seed: int, begun: float) -> dic
 
 
 def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> list[Trial]:
-    """Steps of families that may be tried."""
+    """Return the trials of `steps` with families of these effects; None: all.
+
+    Raises:
+        MeasurementError: an orbit response is sensitive to none of the effects.
+    """
     if effects is None:
         return list(steps)
     wanted = set(names(effects))
@@ -356,28 +356,28 @@ def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> 
     known |= {name for name in names() if find(name).responds}
     if not known & wanted:
         raise MeasurementError(
-            f"an orbit response does not see {', '.join(sorted(wanted)) or 'no effect'}; it sees "
-            f"{', '.join(sorted(known))}"
+            f"an orbit response is not sensitive to {', '.join(sorted(wanted)) or 'no effect'}; "
+            f"name some of {', '.join(sorted(known))}"
         )
     return [trial for trial in kept if trial.families]
 
 
 def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
-    """`nothing` where the design leaves noise alone, in the fit and held out, in both planes and in
-    the RF's response; else `distributed`: many small errors."""
+    """`none` if the design's residual is noise, of fitted and held-out readings, in-plane, coupling
+    and RF; else `distributed`."""
     messages = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
     chances = [chi2.sf(own.total, own.readings) for own in messages if own.readings]
     return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
 def _warnings(fit: StepwiseFit) -> tuple[str, ...]:
-    """What a reader should know."""
+    """Warnings about additional dispersion and outliers."""
     messages = dispersion_by_kicks(fit.state.values, fit.state.data)
     return (*messages, *outlier_readings(fit.state))
 
 
 def _misfit(fit: StepwiseFit, read: Array) -> Misfit:
-    """Of the fitted correctors' readings in their own plane."""
+    """The misfit of the fitted correctors' readings in their own plane."""
     data, good = fit.state.data, fit.state.good
     rows = np.flatnonzero(~fit.state.split.held[:-1])
     miss = data.pick(data.orbits - read)[rows][:, good]
@@ -389,15 +389,15 @@ def _gap(fit: StepwiseFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
     # in units of each reading's noise: the planes differ in it
     before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
-    seen = fit.heldout[0].chi2[0]  # below five sigma of the noise there is no gap to close
+    seen = fit.heldout[0].chi2[0]  # a gap below five sigma of the noise is not significant
     there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
     explained = 1 - after / before if there and len(misfits) > 1 else None
     return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, seen.readings)
 
 
 def _patterns(fit: StepwiseFit) -> dict[str, Any]:
-    """What stays of the fitted correctors' readings: chi-square per reading, and the share of the
-    strongest patterns in each plane."""
+    """The residual of the fitted correctors: chi-square per reading, and the share of the strongest
+    patterns in each plane."""
     state, data = fit.state, fit.state.data
     shares = []
     total, count = 0.0, 0

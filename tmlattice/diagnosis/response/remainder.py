@@ -1,10 +1,9 @@
 """The residual of a fit of an orbit response, compared with its expected covariance.
 
-Fitted readings are compared with their noise, and the numbers that were fitted count as lost
-degrees of freedom. Held-out readings are compared with the posterior predictive covariance (Gelman
-et al., Bayesian Data Analysis, ch. 6): the noise, and what the fit leaves undetermined of the ring,
-of the monitors and of the held-out corrector's own calibration and roll. The kick of a held-out
-corrector is free.
+Fitted readings are compared with their noise; fitted numbers reduce the degrees of freedom.
+Held-out readings are compared with the posterior predictive covariance (Gelman et al., Bayesian
+Data Analysis, ch. 6): the noise, and what the fit leaves undetermined of the ring, of the BPMs and
+of the held-out corrector's calibration and roll. The kick of a held-out corrector is free.
 
 >>> [(block.name, block.ratio) for block in remainder(state)]
 """
@@ -28,12 +27,8 @@ BLOCKS = ("in-plane", "coupling", "RF")
 
 
 def remainder(state: State) -> tuple[Block, ...]:
-    """Return fitted and held-out readings of a converged state: in-plane, coupling, and the RF's
-    orbit; without those that have no reading.
-
-    Args:
-        state: with its priors as learnt.
-    """
+    """Return chi-square of fitted and held-out readings of a converged state, with its learnt
+    priors: in-plane, coupling, and the RF's orbit; without those that have no reading."""
     return tuple(block for block in _blocks(state) if block.freedom >= 1)
 
 
@@ -69,16 +64,15 @@ def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, 
 
 
 def _numbers(found: Posterior | None) -> float:
-    """Effective number of parameters: 1 for each that the data determine, 0 for each that its prior
-    determines."""
+    """Effective number of parameters: 1 for each by the data, 0 for each by its prior."""
     if found is None:
         return 0.0
     return float(len(found.prior) - np.trace(found.covariance))
 
 
 class _Sum:
-    """Return chi-square of readings column by column, in the covariance of their noise and, of
-    held-out ones, of the fit's posterior (by Woodbury's identity).
+    """Chi-square of readings, column by column, in the covariance of their noise and, of held-out
+    ones, of the fit's posterior (by Woodbury's identity).
 
     Args:
         state, block: of the readings.

@@ -1,10 +1,10 @@
-"""The RF's orbit at each monitor that is fitted, as all other readings predict it.
+"""Leave-one-out residuals of the RF's orbit.
 
-A few monitors that were kept apart tell little of an orbit that is read once. What all the others
-predict of a reading follows from the fit to all of them: readings y with precision matrix Q miss
-what the others say by (Q y) / Q_ii, and for a linear fit with priors Q y is the weighed residual, Q
-the weights less what the fit takes of them. Families that follow every monitor by itself, and none
-between, are seen by that.
+The RF's orbit is read once, and a few held-out BPMs validate little of it. The prediction of one
+reading by all others follows from the fit to all of them: for readings y with precision matrix Q
+the residual is (Q y) / Q_ii. For a linear fit with priors, Q y is the weighted residual, and Q the
+weights less the information that the fit takes. These residuals reveal families that fit each BPM
+by itself and predict none.
 
 >>> there = linear(state, 0); found = solve(there.normal, there.groups, there.start, rounds=0)
 >>> rf_by_others(state, there, found)
@@ -22,16 +22,16 @@ from tmlattice.inference.normal import Posterior
 Array = NDArray[np.float64]
 
 LEAST = 1e-9
-"""Share of a reading's weight that a fit leaves, at least: above rounding."""
+"""Least share of a reading's weight after the fit, above rounding errors."""
 
 
 def rf_by_others(state: State, there: Linear | None, found: Posterior | None) -> Array:
-    """What is left of each reading by a fit to all the others, m, [monitor]; NaN where none is.
+    """Return the residual of each reading by a fit to all others, m, NaN if not fitted, [monitor].
 
     Args:
-        state: where the fit stands.
-        there: `linear` of it, in-plane; None where nothing is fitted.
-        found: solved from that; None: without all that is fitted there.
+        state: of the fit.
+        there: `linear` of it, in-plane; None: nothing is fitted.
+        found: its solution; None: all numbers at zero.
     """
     column = len(state.data.plane) - 1
     read, weights, left = rf_fitted(state)
@@ -49,8 +49,8 @@ def rf_by_others(state: State, there: Linear | None, found: Posterior | None) ->
 
 
 def rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
-    """The monitors at which the RF's orbit is fitted, the inverse covariance of these readings,
-    1/m2, and what is left of them, m."""
+    """Return the BPMs at which the RF's orbit is fitted, the inverse covariance of these readings,
+    1/m2, and their residuals, m."""
     column = len(state.data.plane) - 1
     own = weight(state, 0)[column]
     read = np.flatnonzero(own > 0)

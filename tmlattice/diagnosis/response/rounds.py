@@ -1,4 +1,4 @@
-"""Rounds of Gauss and Newton of a dense fit, and the evidence of what they leave.
+"""Damped Gauss-Newton rounds of a hierarchical fit, and the log evidence of its result.
 
 >>> state = settle(bend(jump(allow(state, families))))
 """
@@ -25,26 +25,25 @@ Indices = NDArray[np.int64]
 log = logging.getLogger(__name__)
 
 ROUNDS = 12
-"""Rounds of a fit at most: it has settled, or is as good as the weights that it changes allow."""
+"""Most rounds of a fit: it has converged, as far as the changing weights allow."""
 GAIN = 3e-3
-"""Share of the cost that a round has to gain for another one."""
+"""Relative fall of the cost required for another round."""
 EACH = 4
-"""Rounds of EM for the priors in a round of the fit."""
+"""Iterations of EM for the prior scales in a round."""
 LEARN = 10
-"""Rounds of EM where evidence counts: the priors of what is not there fall slowly."""
+"""Iterations of EM for the evidence: prior scales of absent errors fall slowly."""
 RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
-"""How often a round that went astray is repeated; by what trust falls then and grows else, and to
-how much at most."""
+"""Repetitions of a diverged round; divisor of the step bounds then; their growth, and its limit."""
 CORRECTED, CORRECTS = 6, 1e-3
-"""How often a round corrects its step by what the readings say where it led, with the slopes of its
-start; and what share of the cost that has to gain to be repeated. Numbers that pull against one
-another go far in a valley that is narrow and bent: a step along its tangent leads up its wall."""
+"""Corrections of a step by the residuals at its end, with the derivatives at its start; and the
+relative fall of the cost required for another one. Correlated numbers follow a curved valley of the
+cost, which its tangent leaves."""
 HELD = 4
-"""How often numbers that would be lower than they can be are held, and the rest solved again."""
+"""Iterations that fix numbers at their lower bounds and solve for the rest."""
 
 
 class Moved(NamedTuple):
-    """A state after a round, and the cost that the round was to lessen, before and after."""
+    """A state after a round, and the cost before and after it."""
 
     state: State
     before: float
@@ -55,10 +54,10 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
     """Solve the readings of one block, and move.
 
     Args:
-        state: where it stands.
+        state: the start.
         block: 0 in-plane, 1 coupling.
-        there: `linear` of that block where it stands.
-        bold: factor of every trusted change: small where the last rounds went astray.
+        there: `linear` of that block at the start.
+        bold: factor on the step bounds; small after diverged rounds.
     """
     found = _within(there, bold)
     groups = {group.name: group for group in found.groups}
@@ -79,14 +78,14 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         then = learnt.moved({**state.values, **values})
         try:
             after = cost(then)
-        except UnstableRingError:  # astray: nothing is stored there
+        except UnstableRingError:  # diverged: no closed orbit
             break
         last = best.after
         if after <= last:
             best = best._replace(state=then, after=after)
         if after > (1 - CORRECTS) * last:
             break
-        # what the readings say there, as if the ring were linear with the slopes of the start
+        # the score there, with the derivatives of the start
         moved = np.zeros_like(there.start)
         for name, at in there.where.items():
             moved[at] = values[name] - there.start[at]
@@ -96,12 +95,12 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         aim, before = _aim(there, found, bold * there.trust, messages), aim
         further = aim - before
         if further @ there.normal.matrix @ further < CORRECTS * after:
-            break  # as straight as the step took it for
+            break  # linear enough
     return best
 
 
 def _within(there: Linear, bold: float) -> Posterior:
-    """The step, those that it would make lower than they can be left where they are lowest."""
+    """The bounded step, with numbers fixed at their lower bounds where it would cross them."""
     groups, trust = there.groups, bold * there.trust
     for _ in range(HELD):
         found = solve(there.normal, groups, there.start, trust, rounds=EACH)
@@ -114,13 +113,13 @@ def _within(there: Linear, bold: float) -> Posterior:
 
 
 def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:
-    """Values that another vector leads to, from the same start with the same priors and trust."""
+    """The values by another score, with the same start, priors and step bounds."""
     whole = vector + there.normal.matrix @ there.start + there.start / trust**2
     return found.solved(whole)
 
 
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
-    """The prior's gradient for the values of one variable; its priors add up."""
+    """Twice the negative log prior density of a variable, up to a constant; its priors add up."""
     if not groups:  # the ring has no such numbers
         return 0.0
     each, shared = np.zeros(len(values)), []
@@ -131,11 +130,11 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
             each += np.abs(spread).sum(axis=1)
         else:
             shared.append(spread)
-    free = each > 0  # held numbers are skipped
+    free = each > 0  # fixed numbers are skipped
     if not free.any():
         spread = np.concatenate(shared, axis=1)
         return float(np.sum(np.linalg.lstsq(spread, values, rcond=1e-9)[0] ** 2))
-    # after shared ones, each number's own prior has the rest
+    # each number's own prior penalises the rest beyond the shared ones
     rest, scale = values[free] / each[free], each[free, None]
     few = np.concatenate([np.zeros((len(rest), 0)), *(own[free] / scale for own in shared)], axis=1)
     asked = np.concatenate([rest, np.zeros(few.shape[1])])
@@ -157,18 +156,18 @@ def settle(
     possible: Callable[[State], bool] = lambda state: True,
     look_at_monitors: bool = True,
 ) -> State:
-    """Rounds until none gains any more, none of which may make things worse.
+    """Return the state after damped rounds, which end when none reduces the cost any further.
 
-    As Levenberg and Marquardt have it, but that what is trusted is a change of each number by
-    itself: a round that went astray is taken back and repeated with less trust.
+    This is the method of Levenberg and Marquardt with a step bound for each number. A round that
+    increases the cost is repeated with smaller bounds.
 
     Args:
-        state: where it stands.
-        blocks: that move, in this order.
-        most: rounds of each block.
-        gain: share of the cost that a round has to gain for another one.
-        possible: whether a state is one that is sought; rounds end at one that is not.
-        look_at_monitors: whether those that are bad are set aside after each round.
+        state: the start.
+        blocks: that are fitted, in this order.
+        most: most rounds of each block.
+        gain: relative fall of the cost required for another round.
+        possible: whether a state is plausible; rounds end at one that is not.
+        look_at_monitors: whether bad BPMs are rejected after each round.
     """
     good = state.good
     bold = dict.fromkeys(blocks, 1.0)
@@ -194,7 +193,10 @@ def settle(
                     state = look(state, seen)
                     state = state if look_at_monitors else replace(state, good=good)
         log.info(
-            "round %d gained %.3g, lacking %s m", turn, gained, np.median(state.lacking, axis=1)
+            "round %d: cost %.3g less, model discrepancy %s m",
+            turn,
+            gained,
+            np.median(state.lacking, axis=1),
         )
         if gained < gain or not possible(state):
             break
@@ -204,13 +206,13 @@ def settle(
 def linear_evidence(
     there: Linear, gone: Collection[str] = (), rounds: int = LEARN
 ) -> tuple[float, dict[str, Array], Posterior | None]:
-    """Log evidence that priors and readings have of one block where the fit stands, linear about
-    it, up to a constant; the values that are the likeliest; and the fit, if there is one.
+    """Return the log evidence of one block, linearised at the fit, up to a constant; the most
+    probable values; and the solution, if anything is fitted.
 
     Args:
-        there: where the fit stands.
-        gone: priors of families that are not there, by name.
-        rounds: of EM for the priors.
+        there: `linear` of the fit.
+        gone: names of priors that are omitted.
+        rounds: iterations of EM for the prior scales.
     """
     left = [group for group in there.groups if group.name not in gone]
     found = solve(there.normal, left, there.start, rounds=rounds) if left else None
@@ -228,13 +230,13 @@ def linear_evidence(
 
 
 class Evidence(NamedTuple):
-    """What the readings say for a state.
+    """The evidence of a state.
 
     Attributes:
-        log: its logarithm, of both blocks.
-        state: with the weights that it was taken with.
-        in_plane: linear where it stands; None where nothing is fitted there.
-        found: the fit of that.
+        log: log evidence of both blocks.
+        state: with the weights of the evidence.
+        in_plane: `linear` of it; None: nothing is fitted in-plane.
+        found: its solution.
     """
 
     log: float
@@ -244,13 +246,13 @@ class Evidence(NamedTuple):
 
 
 def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evidence:
-    """Evidence of what is fitted, of the readings of some monitors, both blocks, what the model
-    lacks and the priors at their likeliest; up to a constant of the data.
+    """Return the evidence of a state by the readings of some BPMs, at the most probable model
+    discrepancy and prior scales; up to a constant of the data.
 
     Args:
-        state: that is weighed.
-        good: the monitors.
-        shares: of the readings that are independent: the same for states that are compared.
+        state: to evaluate.
+        good: the BPMs.
+        shares: effective sample sizes, see `State.independent`; equal for states that are compared.
     """
     total, in_plane, found = 0.0, None, None
     for block in (block for block in (1, 0) if state.reads(block)):
@@ -268,5 +270,5 @@ def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evide
 
 
 def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
-    """That of `evidence_of`."""
+    """Return the log evidence of `evidence_of`."""
     return evidence_of(state, good, shares).log

@@ -1,10 +1,8 @@
-"""Monitors that were set aside, and may be sound: neighbours, where the ring itself is wrong.
+"""Rejected BPMs that may be sound, because a magnet next to them is wrong.
 
-A monitor that reads what no other one makes likely is bad. But so seem all that stand beside a
-magnet that is far off, before it is found; and once they are set aside nothing is left that could
-find it. A broken monitor stands alone. So neighbours that were set aside together are taken back,
-the fit settles with them, and they stay if they fit then. (Pohang: two monitors beside a quadrupole
-that is 18 % off; whether they were set aside hung on who was held out.)
+A BPM whose readings contradict all others is bad. But sound BPMs next to a magnet with a large
+error look bad too, and without them the error cannot be found. A broken BPM has no rejected
+neighbours. So rejected neighbours are fitted again, and kept if they agree with that fit.
 """
 
 import logging
@@ -19,18 +17,14 @@ from tmlattice.diagnosis.response.weights import good_monitors, sound_monitors
 log = logging.getLogger(__name__)
 
 HOPELESS = 20.0
-"""Of the median rms residual: no magnet's error does that to a sound monitor, once all families are
-there."""
+"""Ratio to the median rms residual above which a BPM stays rejected: with all families fitted, no
+magnet's error has that effect on a sound BPM."""
 WORTH = 0.5
-"""Log evidence that the others may lose for each of their readings: what one standard error is."""
+"""Log evidence that the other readings may lose for each reading regained: one standard error."""
 
 
 def taken_back(state: State) -> State:
-    """With neighbours that fit once they are fitted; else as it stands.
-
-    Args:
-        state: that has settled.
-    """
+    """Return the converged state with the rejected neighbours that agree with the fit."""
     aside = ~state.good & good_monitors(state, HOPELESS)
     together = aside & (np.roll(aside, 1) | np.roll(aside, -1))
     if not together.any():
@@ -44,7 +38,7 @@ def taken_back(state: State) -> State:
     )
     orbits = state.data.pick(state.data.orbits)[state.fitted]
     readings = int(np.isfinite(orbits[:, back]).sum())
-    log.info("neighbours set aside: %s, sound in the end: %s; the others lose %.1f",
+    log.info("rejected neighbours: %s, sound: %s; evidence of the others falls by %.1f",
              np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
     if not back.any() or (state.good & ~sound).any() or lost > WORTH * readings:
         return state

@@ -12,7 +12,7 @@ from tmlattice.lattice.supplies import supplied_alike
 Array = NDArray[np.float64]
 
 GAP = 2.5
-"""Ratio to the usual distance of two bends that makes a straight."""
+"""Ratio to the typical distance of two bends above which a straight is between them."""
 
 
 class Candidates(NamedTuple):
@@ -20,8 +20,8 @@ class Candidates(NamedTuple):
 
     Attributes:
         kinds, names: see `common_factors.MAKES`.
-        members: what each moves, [magnet, candidate].
-        families: which are families of several magnets, whatever kind they are reported as.
+        members: 1 for each magnet that shares it, [magnet, candidate].
+        families: whether it is a family of several magnets, whatever its kind.
     """
 
     kinds: tuple[str, ...]

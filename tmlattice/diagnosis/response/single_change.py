@@ -33,7 +33,7 @@ STEP = 0.01
 LINEARISED = 3
 """Iterations of the change at its most probable amount."""
 SAME = 0.02
-"""Relative accuracy of the amount at which they end."""
+"""Relative change of the amount below which the iterations end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,7 @@ class _Line:
 
     @cached_property
     def _parts(self) -> tuple[Array, Array, Array, Array]:
-        """Variances along the directions of B, the residual and slope there; and their products
-        beyond them."""
+        """Variances along the directions of B, residual and slope there; their products beyond."""
         values, along = directions_of(self.spread)
         both = np.stack([self.left, self.slope])
         inside = both @ along.T
@@ -97,10 +96,10 @@ class SingleChange:
         self.left = self.plain.at((), self.plain.first).residual
 
     def likeliest(self, hypothesis: Hypothesis, start: float | None = None) -> Alternative | None:
-        """The change with its most probable amount; None where the readings reject it.
+        """Return the change with its most probable amount; None if the readings reject it.
 
         Args:
-            hypothesis: what changes.
+            hypothesis: effect and place.
             start: an amount near it; None: any.
         """
         effect = find(hypothesis[0])
@@ -136,8 +135,8 @@ class SingleChange:
     def _amount(
         self, line: _Line, hypothesis: Hypothesis, near: float | None
     ) -> tuple[float, float, float] | None:
-        """The most probable amount, its error, and the log density there with the amount's
-        prior."""
+        """The most probable amount, its error, and the log density there with the amount's prior;
+        None if no change is better."""
         effect = find(hypothesis[0])
         if effect.discrete:
             return 1.0, 0.0, float(line.log_density(np.ones(1))[0])
@@ -196,7 +195,7 @@ class SingleChange:
         return self.blur.among(self.blur.of((one.cause,)))
 
     def all_of(self, starts: Mapping[Hypothesis, float | None]) -> tuple[Alternative, ...]:
-        """Some hypotheses, with amounts near theirs, by falling evidence."""
+        """Return some hypotheses, with amounts near the given ones, by falling evidence."""
         tried = (self.likeliest(hypothesis, start) for hypothesis, start in starts.items())
         found = [rival for rival in tried if rival is not None]
         return tuple(sorted(found, key=lambda rival: -rival.fit.log_evidence))

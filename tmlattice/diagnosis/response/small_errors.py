@@ -49,8 +49,7 @@ USUAL: tuple[Family, ...] = (
 )  # fmt: skip
 """Families of every ring."""
 ANEW = 20_000
-"""Most readings for a second fit from the design: a fit that diverged may have converged to a wrong
-ring."""
+"""Most readings for a second fit, from the design, because the given one may be of a wrong ring."""
 EXPLAINED = 1.5
 """Chi-square per reading of each plane below which one start is sufficient."""
 SIZES = 12
@@ -60,36 +59,36 @@ SHARED = {
     "quadrupole_gradient of families": "quadrupole_gradient",
     "corrector_calibration of families": "corrector_calibration",
 }
-"""Groups of few numbers, whose usual scale counts as `COUNTS` of them."""
+"""Groups of few numbers, in which the usual scale counts as `COUNTS` further numbers."""
 COUNTS = 4
 
 
 def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
-    """Fit the distributed errors to all readings outside the validation set.
+    """Return the fit of the distributed errors to all readings outside the validation set.
 
     Args:
         data, split: the data, and the validation split.
         fitted: a hierarchical fit of the data.
     """
     data = _near(data, split)
-    nobody = np.zeros_like(split.held)
-    everybody = Split(nobody, nobody, _halves(split), np.zeros_like(split.inner_rf))
-    design = replace(begin(data, everybody), good=fitted.good, exploring=False)
+    none = np.zeros_like(split.held)
+    split_of_all = Split(none, none, _halves(split), np.zeros_like(split.inner_rf))
+    design = replace(begin(data, split_of_all), good=fitted.good, exploring=False)
     families = _families(design, fitted.families)
-    beside = _from(design, families, fitted)
+    continued = _from(design, families, fitted)
     few = data.orbits.size <= ANEW
     found: list[tuple[float, State]] = []
-    for start in (allow(design, families), beside) if few else (beside,):
+    for start in (allow(design, families), continued) if few else (continued,):
         try:
             state = settle(jump(bend(start), beyond=1.0), gain=ROUGH)
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # diverged
             continue
         found.append((log_evidence(state, state.good), state))
-        log.info("small errors: evidence %.1f", found[-1][0])
+        log.info("distributed errors: evidence %.1f", found[-1][0])
         if all(own.per_reading < EXPLAINED for own in fit_chi2(state)[:2]):
             break
-    return max(found, key=lambda one: one[0])[1] if found else beside
+    return max(found, key=lambda one: one[0])[1] if found else continued
 
 
 def _near(data: ResponseData, split: Split) -> ResponseData:
@@ -101,8 +100,8 @@ def _near(data: ResponseData, split: Split) -> ResponseData:
 
 
 def _halves(split: Split) -> Flags:
-    """BPMs that determine a corrector's kick, the others validate it; of held-out correctors half
-    of the remaining ones."""
+    """BPMs that determine a corrector's kick; the others validate it. Of held-out correctors these
+    are half of the remaining ones."""
     half = split.half.copy()
     for column in np.flatnonzero(split.held):
         half[column, np.flatnonzero(half[column])[::2]] = False
@@ -128,11 +127,7 @@ def _from(design: State, families: Sequence[Family], fitted: State) -> State:
 
 # --- prior scales ---------------------------------------------------------------------------
 def sizes_in(there: Linear) -> tuple[Group, ...]:
-    """The priors with scales from all numbers but each family's largest.
-
-    Args:
-        there: of the fit.
-    """
+    """Return the priors of a fit with scales from all numbers but each family's largest."""
     groups = [replace(group, each=None, freedom=np.inf) for group in there.groups]
     pull = there.normal.vector + there.normal.matrix @ there.start
     for _ in range(SIZES):

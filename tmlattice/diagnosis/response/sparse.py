@@ -1,8 +1,7 @@
 """A sparse solution of an orbit response's gap: the search of trajectories, on the response's rows.
 
 A single faulty magnet, corrector or BPM is identified before families of distributed errors are
-fitted. Where a sparse set of causes leaves more than noise, this returns None, and the hierarchical
-fit follows.
+fitted. If a sparse set of causes leaves more than noise, the hierarchical fit follows.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.assessment import combined_p_value
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
+from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import Step, StepwiseFit
@@ -37,7 +38,7 @@ from tmlattice.observe.split import Split
 Flags = NDArray[np.bool_]
 
 MOST = 3
-"""Causes of a sparse solution at most: each costs a search of its own."""
+"""Most causes of a sparse solution: each costs a search of its own."""
 
 RARER = 100.0
 """Log prior odds of each further cause: the residual of an inexact cause looks like one more."""
@@ -55,17 +56,15 @@ ROUNDS, SETTLED = 30, 0.99
 """Rounds of filling in missing readings, and the least gain of chi-square in a round."""
 
 LESS = 0.98
-"""Ratio of both planes' rms, multiplied, to those of the sparse solution below which distributed
-errors are preferred."""
+"""Ratio of rms, both planes multiplied, below which the hierarchical fit is preferred."""
 
 LARGER = 2.0
-"""Ratio to the largest fault above which a kick is implausible, because it stands for its tune
-shift by sextupoles."""
+"""Ratio to the largest fault above which a kick is implausible: it fits tunes by sextupoles."""
 
 
 BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12
-"""Most products of readings and undetermined errors; searches; and hypotheses, before and after one
-of them explains the readings."""
+"""Most products of readings and undetermined errors; most searches; and hypotheses, before and
+after one of them explains the readings."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +75,11 @@ class SparseFit:
         fit: the design, the same with the causes, and each of them as a step.
         findings: by falling statistic.
         verdict: the least certain of theirs.
-        told: the causes with their errors.
-        said: messages.
-        noise: whether the residual is noise of the stated size, neither more nor less.
+        fitted_causes: the causes with their errors.
+        messages: about the findings.
+        p_value: of the residual, over its blocks.
+        noise: whether the residual is noise of the stated size, neither more nor less, in each of
+            its blocks.
     """
 
     fit: StepwiseFit
@@ -86,6 +87,7 @@ class SparseFit:
     verdict: str
     fitted_causes: list[StatedCause]
     messages: tuple[str, ...]
+    p_value: float
     noise: bool
 
 
@@ -113,11 +115,10 @@ def sparse_fit(
     """Return the sparse solution of a response, or None where it has none.
 
     Args:
-        data: what was measured.
-        split: held-out correctors give half of their monitors to the fit: it determines their own
-            calibration.
-        effects: names of those that may be the cause; None: all usual ones.
-        most: findings at most.
+        data: the measurement on the ring.
+        split: half of the BPMs of held-out correctors is fitted, and determines their calibration.
+        effects: names of candidates; None: all usual ones.
+        most: most findings.
         judgement: thresholds.
         seed: of the threshold's simulation.
         progress: called with the name of each stage.
@@ -156,11 +157,15 @@ def sparse_fit(
     return _result(data, split, problem.base, found, count, most, judgement)
 
 
-def outperforms(fit: StepwiseFit, sparse: StepwiseFit) -> bool:
-    """Whether correctors that were not fitted say that a fit of everything knows more than a few
-    causes do, of the monitors that it takes for good and the planes that were read."""
+def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bool:
+    """Return whether the hierarchical fit explains more than the sparse solution: it alone leaves
+    noise, or it predicts held-out readings better, at the BPMs that it does not reject, in the
+    planes that were read."""
+    if sparse.p_value < judgement.noise[0] <= combined_p_value(remainder(fit.state)):
+        return True
+    state = sparse.fit.state
     of_all = fit.heldout[1]
-    of_few = score(replace(sparse.state, good=fit.state.good), sparse.state.split.held)
+    of_few = score(replace(state, good=fit.state.good), state.split.held)
     gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
     return bool(np.nansum(gained) < np.log(LESS))
 
@@ -191,8 +196,7 @@ def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
 def _among_open(
     search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
 ) -> Explanation | None:
-    """The solution given the ring's undetermined errors, where it is more probable; else the
-    previous one."""
+    """The solution given undetermined errors of the ring, if more probable; else `found`."""
     seen = found.first if found else scan(
         plain.metric(before.point), search.hypotheses, before.residual, seed=search.seed
     )  # fmt: skip
@@ -238,8 +242,7 @@ def _among_open(
 
 
 def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
-    """The search repeated given the undetermined errors; and its log evidence, if it still explains
-    the readings."""
+    """The search repeated given undetermined errors; its log evidence, -inf if it fails."""
     evidence = -np.inf
     for _ in range(AGAIN):
         problem = blur.among(blur.of(found.fit.causes))
@@ -258,8 +261,7 @@ def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanatio
 def _hopeless(
     problem: Response, hypotheses: Sequence[Hypothesis], left: Fit, number: int, enough: float
 ) -> bool:
-    """Whether a few further causes cannot reduce the residual below the limit: a quick test before
-    the search."""
+    """Whether a few further causes cannot reduce the residual below the limit: a quick test."""
     if _beyond(problem, left, PATTERNS * number + SPARE, enough) <= enough:
         return False
     # a kick, and an energy offset, are no product of columns and readings
@@ -321,6 +323,9 @@ def _result(
     errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
     stepwise = StepwiseFit(design, state, tuple(steps), (), heldout)
     fitted_causes = list(zip(causes, errors, strict=True))
-    less = p_value > 1 - judgement.noise[1]
-    noise = p_value >= judgement.noise[1] and not less
-    return SparseFit(stepwise, findings[:most], verdict, fitted_causes, messages, noise)
+    expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
+    left = combined_p_value(remainder(state))
+    return SparseFit(
+        stepwise, findings[:most], verdict, fitted_causes, messages, left,
+        noise=expected and left >= judgement.noise[0],
+    )  # fmt: skip

@@ -1,11 +1,9 @@
-"""Steps of a corrector during which something else kicked the beam.
+"""Steps of a corrector that include a spurious kick at another place.
 
-The two orbits of a step are read seconds apart. A supply that jumps in between, a feedback, or an
-injection element that pulses adds an orbit of its own: a kick at another place, which has nothing
-to do with the corrector. Such a step leaves many times what is usual, and half of the monitors tell
-where one kick has to be for the other half to agree. (PETRA III: 0.1 mrad of pkhw_wr_5, and beside
-it 3 urad in y, a kilometre away.) It teaches nothing of the ring, and would judge by what no model
-can know.
+The two orbits of a step are read seconds apart. A supply that jumps in between, a feedback or a
+pulsed element adds a closed orbit unrelated to the corrector. The residual of such a step is many
+times the usual one. A single kick is located by half of the BPMs, and must explain the residual at
+the other half. Such a step has no information on the ring, and would distort validation scores.
 """
 
 from collections.abc import Sequence
@@ -24,26 +22,26 @@ Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 TIMES = 5.0
-"""What a step leaves, its own kick apart, over what the typical one leaves in the same plane."""
+"""Least ratio of a step's residual, given its own kick, to the typical one of the same planes."""
 ALSO = 2.0
-"""The same of a step that had a kick in the other plane: one of both."""
+"""The same ratio for the corrector's own plane, given a spurious kick in the other one."""
 SHARE = 0.15
-"""Of the mean square of the far monitors, left at most beside one kick elsewhere."""
+"""Largest ratio of mean square residuals at the other BPMs, with and without the kick."""
 HERE = 0.5
-"""Of the same beside a jump at the corrector's own place, at most: else it stands elsewhere."""
+"""Largest ratio of that residual to the one with a jump at the corrector's place instead: above it,
+the corrector is misplaced."""
 ENOUGH, COLUMNS = 12, 5
-"""Readings of a column, and columns of a plane, that it takes to say so."""
+"""Fewest readings of a column, and columns of a plane, for a detection."""
 
 
 @dataclass(frozen=True)
 class SpuriousKick:
-    """Something that kicked the beam while a corrector was stepped.
+    """A spurious kick during the step of a corrector.
 
     Attributes:
         column: of the corrector.
         plane: 0 for x, 1 for y.
-        layer: the magnet behind which one such kick explains most; others in the same phase of the
-            betatron oscillation explain as much.
+        layer: the magnet behind which a kick explains most; any at its betatron phase is as likely.
         amount: rad.
     """
 
@@ -54,11 +52,7 @@ class SpuriousKick:
 
 
 def spurious_kicks(state: State) -> list[SpuriousKick]:
-    """Those that stand out.
-
-    Args:
-        state: with gains, rolls and gradients.
-    """
+    """Return the detected kicks, by a state with gains, rolls and gradients."""
     found = []
     for kicked in (0, 1):
         for plane in (0, 1):
@@ -67,12 +61,11 @@ def spurious_kicks(state: State) -> list[SpuriousKick]:
 
 
 def left_in_plane(state: State, suspects: Sequence[int]) -> list[int]:
-    """Of columns that something else kicked in the plane across, those that leave more than is
-    usual in their own, too.
+    """Return those suspects whose residual in their own plane is also unusually large.
 
     Args:
         state: as in `spurious_kicks`.
-        suspects: the columns.
+        suspects: columns with a spurious kick in the other plane.
     """
     found: list[int] = []
     for plane in (0, 1) if suspects else ():
@@ -85,8 +78,7 @@ def left_in_plane(state: State, suspects: Sequence[int]) -> list[int]:
 
 @dataclass(frozen=True)
 class _Column:
-    """What a column reads, and leaves, in one plane, m, and the pattern of its own amplitude,
-    [reading]."""
+    """Readings and residuals of a column in one plane, m, and its own pattern, [reading]."""
 
     column: int
     seen: Indices
@@ -96,14 +88,13 @@ class _Column:
 
     @property
     def rms(self) -> float:
-        """Beside its own amplitude."""
+        """The rms residual given its own amplitude, m."""
         every = np.ones(len(self.left), dtype=bool)
         return rms_of([amplitudes(self.own[:, None], self.left, every, every)[1]])
 
     @property
     def explained(self) -> float:
-        """rms of the orbit that its own kick makes: of a corrector that is turned nearly all of it
-        is in the plane across, m."""
+        """The rms orbit by its own kick, m; for a rolled corrector mostly in the other plane."""
         return float(np.sqrt(np.maximum(np.mean(self.orbit**2) - self.rms**2, 0.0)))
 
 
@@ -111,12 +102,12 @@ def _columns(state: State, kicked: int, plane: int) -> list[_Column]:
     data, at = state.data, state.at
     rows = np.flatnonzero(data.plane[:-1] == kicked)
     if kicked != plane and not state.allows("corrector_roll"):
-        return []  # what its own roll makes of it is not known yet
+        return []  # the corrector's own roll is unknown
     pattern = at.seen(at.beam if kicked == plane else at.across)[..., plane]
     read, orbits = at.read[..., kicked], data.orbits[..., kicked]
     found = []
     for c in rows:
-        near = np.isfinite(orbits[c]) & state.good  # what tells its kick
+        near = np.isfinite(orbits[c]) & state.good  # determine its kick
         size = float(read[c, near] @ read[c, near])
         kick = float(read[c, near] @ orbits[c, near]) / size if size else 1.0
         left = data.orbits[c, :, plane] - kick * at.read[c, :, plane]
@@ -137,7 +128,7 @@ def _of_planes(state: State, kicked: int, plane: int) -> list[SpuriousKick]:
     orbits = orbits_of(state, np.array([one.column for one in columns]))
     explained = np.array([one.explained for one in columns])
     shares = sizes / np.maximum(orbits, explained)
-    usual = float(np.median(shares))  # a larger step leaves more
+    usual = float(np.median(shares))  # a larger step has a larger residual
     odd = [
         one
         for one, size, share in zip(columns, sizes, shares, strict=True)
@@ -158,10 +149,10 @@ def _of_planes(state: State, kicked: int, plane: int) -> list[SpuriousKick]:
 
 
 def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> SpuriousKick | None:
-    """The kick that explains a column, if one does; see the module.
+    """The kick that explains the residual of a column; None if there is none.
 
     Args:
-        state: that it is left by.
+        state: of the fit.
         one: the column.
         plane: that is read.
         kicks: readings by a kick behind each layer, m/rad, [layer, monitor].
@@ -185,14 +176,14 @@ def _elsewhere(state: State, one: _Column, plane: int, kicks: Array) -> Spurious
     jump = state.at.jumps[one.column, one.seen, plane]
     kicked = state.data.plane[one.column] == plane
     without, here = missed(), missed(jump, among=_beside(state, one, jump) if kicked else every)
-    beside_it = missed(patterns[layer])
-    if beside_it > SHARE * without or beside_it > HERE * here:
+    with_kick = missed(patterns[layer])
+    if with_kick > SHARE * without or with_kick > HERE * here:
         return None
     return SpuriousKick(one.column, plane, layer, amount)
 
 
 def _beside(state: State, one: _Column, jump: Array) -> Flags:
-    """Readings that a corrector may be asked for if it stands elsewhere, [reading]."""
+    """Readings that remain for a misplaced corrector, see `misplaced.clear`, [reading]."""
     monitors = state.data.shape[1]
     seen = np.zeros(monitors, dtype=bool)
     seen[one.seen] = True

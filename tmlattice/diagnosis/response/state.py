@@ -1,7 +1,6 @@
-"""The state of a dense fit of an orbit response, and what may happen to it.
+"""The state of a hierarchical fit of an orbit response, and the functions that change it.
 
-Everything that is fitted is one frozen `State`; what happens to it is a function that gives another
-one: `bend`, `allow`, `jump`, `settle`, `look`.
+Everything that is fitted is one frozen `State`; each function returns another one.
 """
 
 import logging
@@ -32,12 +31,12 @@ FEW = 3
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """Numbers of one variable with a common single fault: a prior of their own, apart from their
-    family's, whose scale it does not change.
+    """A single fault as numbers of one variable, with a prior of its own: it does not change the
+    scale of their family.
 
     Attributes:
         cause: effect and place.
-        variable: whose numbers.
+        variable: of the numbers.
         block: 0 in-plane, 1 coupling.
         members: the numbers for a unit of the cause's amount, [number].
         wide: prior rms of the amount.
@@ -56,7 +55,7 @@ class Apart:
 
 
 class Kept(NamedTuple):
-    """Derivatives of the readings by the ring's numbers of one variable, and their point."""
+    """Derivatives of the readings by a variable of the ring, and where they were computed."""
 
     rows: Array  # [number, column, monitor]
     gain: Array  # [column, monitor]
@@ -69,27 +68,26 @@ class State:
     """The state of the fit.
 
     Attributes:
-        data, split: what was measured, and who judges.
-        at: what the model reads with the values.
-        lacking: what the model lacks in-plane and across in each column, m: it lessens weights as
-            noise does, so that one corrector whose field is not where the model has it spoils no
-            magnet; [block, column].
-        good: monitors that are not bad, [monitor].
-        families: that are allowed.
-        values: by variable.
-        groups: the families' priors with what they have learnt, by name.
-        exploring: the inner correctors choose, and are not fitted.
-        kept: rows of the ring's variables, that stand until the ring has moved.
-        share: by which each reading's weight counts, [block, column, monitor]; None: all alike.
-        rf_share: by which the RF's readings count, [block, monitor]; None: all alike.
-        apart: numbers that are wrong alone.
-        independent: share of the readings that tell something of their own, see `independent`,
-            [block, plane that is read]; None: all are taken to.
-        jitter: closed orbits that each step has an unknown amount of, as large as they typically
-            are, m, [plane that is read, pattern, monitor]; None: the beam stood still.
-        guessed: rms of the logarithm of a family's size about its first guess.
-        unneeded: families that were tried: their numbers are taken for zero, and stated errors know
-            that they may not be (those of the ring, where they are few).
+        data, split: the data, and the validation split.
+        at: the model's readings with the values.
+        lacking: model discrepancy in-plane and coupling, rms of each column, m, [block, column]. It
+            reduces weights like noise, so that one misplaced corrector does not bias the gradients.
+        good: BPMs that are not bad, [monitor].
+        families: that are fitted.
+        values: of the numbers, by variable.
+        groups: the families' priors with learnt scales, by name.
+        exploring: the inner validation correctors are not fitted, and select families.
+        kept: derivatives by the ring's variables, used until the ring has moved.
+        share: factors on the weights, [block, column, monitor]; None: all 1.
+        rf_share: factors on the weights of the RF's readings, [block, monitor]; None: all 1.
+        apart: single faults.
+        independent: effective sample size as a share of the readings, see `independent`, [block,
+            plane that is read]; None: all 1.
+        jitter: orbits of beam jitter, of typical amplitude, m, [plane that is read, pattern,
+            monitor]; None: no jitter.
+        guessed: rms of the logarithm of a prior scale about its first guess.
+        unneeded: rejected families. Their numbers are zero, but their uncertainty is in the stated
+            errors (for the ring's families of few numbers).
     """
 
     data: ResponseData
@@ -115,7 +113,7 @@ class State:
         return tuple(family for family in self.families if family.block == block)
 
     def reads(self, block: int) -> bool:
-        """Whether fitted correctors have readings of a block."""
+        """Whether fitted correctors have readings in a block."""
         orbits = self.data.pick(self.data.orbits, block)
         return bool(np.isfinite(orbits[self.fitted][:, self.good]).any())
 
@@ -125,7 +123,7 @@ class State:
 
     @property
     def fitted(self) -> Flags:
-        """Fitted correctors, [column]; the RF's BPMs are split instead."""
+        """Fitted correctors, [column]; of the RF's column the BPMs are split instead."""
         out = self.split.held | (self.split.inner & self.exploring)
         return np.asarray(~out & (np.arange(len(out)) < len(out) - 1))
 
@@ -148,8 +146,7 @@ def begin(data: ResponseData, split: Split) -> State:
 
 
 def bend(state: State) -> State:
-    """The state with the third order of the steps; unchanged where the ring stores no beam with
-    such a step."""
+    """The state with the third order of the steps, if the ring stores a beam with such a step."""
     try:
         return replace(state, at=state.at.bend())
     except UnstableRingError:
@@ -182,12 +179,12 @@ def forbid(state: State, families: Sequence[Family]) -> State:
 
 
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
-    """Return each column's own estimate of its number, from its near BPMs: with the third order of
+    """Return each column's own estimate of its number from its near BPMs, with the third order of
     its step, or without it where that agrees better.
 
     Returns:
-        The change of the number, and the far readings' mean squares in units of the noise, without
-        it and with it, [column]; NaN for columns that are never fitted.
+        The change of the number, and the mean square residuals of far readings, in units of the
+            noise, without and with it, [column]; NaN for held-out columns.
     """
     rows = family.rows(state.at, np.zeros(0))
     left = state.data.pick(state.at.left, family.block)
@@ -257,7 +254,7 @@ def jump(state: State, beyond: float | None = None) -> State:
 
 
 def rms_of(parts: Iterable[Array]) -> float:
-    """The mean over all entries; NaN without any."""
+    """Return the rms of all entries; NaN without any."""
     values = np.concatenate(list(parts))
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
@@ -265,12 +262,12 @@ def rms_of(parts: Iterable[Array]) -> float:
 def amplitudes(
     patterns: Array, data: Array, near: Flags, far: Flags, held: Array | None = None
 ) -> tuple[Array, Array]:
-    """Amplitudes of patterns [monitor, pattern] from near readings, and what far ones miss.
+    """Return the amplitudes of patterns by near readings, [pattern], and the residuals of far ones.
 
     Args:
         patterns, data: m, [monitor, pattern] and [monitor].
         near, far: [monitor].
-        held: by priors about zero, noise of a reading over the amplitude's rms, [pattern]; 0: free.
+        held: ratio of a reading's noise to the prior rms of each amplitude, [pattern]; 0: no prior.
     """
     size = np.abs(patterns[near]).max(axis=0)
     size[size == 0] = 1

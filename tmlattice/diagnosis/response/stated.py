@@ -26,8 +26,7 @@ class Stated(NamedTuple):
     Attributes:
         sigma: standard errors, [parameter].
         prior: rms of each number before the data, [parameter].
-        covariance: of the posterior, any member of a family being the faulty one,
-            [parameter, parameter].
+        covariance: of the posterior with possible single faults, [parameter, parameter].
     """
 
     sigma: Array
@@ -63,15 +62,15 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
 
 
 def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
-    """Posterior errors, widened for columns or BPMs that contradict all others; see `stated`."""
+    """Return posterior errors, widened for columns or BPMs that contradict all others."""
     covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     found = LinearFit.of(there.normal.matrix, covariance)
     return _widened(state, block, there, posterior, found)
 
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
-    """What sizes of families add to the covariance that are unknown, of those too that were tried
-    and not needed: F, of F F^T, [parameter, direction]; see `stated`."""
+    """Return a root F of the covariance F F^T by unknown prior scales, those of rejected families
+    included, [parameter, direction]; see `stated`."""
     tried = [
         family
         for family in state.unneeded
@@ -80,15 +79,16 @@ def of_sizes(state: State, block: int, there: Linear) -> Array:
     whole = linear(allow(state, tried), block) if tried else there
     gone = [group.name for family in tried for group in family.groups(state.data)]
     more = errors.scale_covariance(whole.normal, whole.groups, whole.start, gone)
-    return more[: len(there.start)]  # what was tried comes after
+    return more[: len(there.start)]  # without the rejected families
 
 
 def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> float:
-    """The factor by which the variance of a single fault's amount grows by this.
+    """Return the factor by which the variance of a single fault's amount grows by columns or BPMs
+    that contradict all others.
 
     Args:
-        state, there, posterior: as in `stated`; its block is that of the cause.
-        one: has its own prior in them.
+        state, there, posterior: as in `stated`, for the block of the cause.
+        one: the fault, with its own prior in them.
     """
     ends = np.cumsum([group.basis.shape[1] for group in posterior.groups])
     at = int(ends[[group.name for group in posterior.groups].index(one.name)]) - 1

@@ -1,9 +1,10 @@
-"""The dense fit of an orbit response: families of errors, step by step, judged on held-out data.
+"""The hierarchical fit of an orbit response: families of errors, validated on held-out readings.
 
 >>> fit = fit_steps(data, split)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in fit.steps]
 
-Gradients and skew gradients are fitted together, because skew ones move the tunes.
+Families are added one by one. Gradients and skew gradients are fitted together, because skew
+gradients move the tunes.
 """
 
 import logging
@@ -52,33 +53,34 @@ Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 LEAST = 5.0
-"""Log evidence that a step has to have."""
+"""Log evidence required for a step."""
 SPOILT, ENOUGH = 0.05, 3
-"""By how much the judges' figures may rise with all families together, and judges that it takes to
-say so: one of them alone may be near the design by chance."""
+"""Largest rise of the validation score with all families together, and fewest correctors for this
+test: a single one may be near the design by chance."""
 ASTRAY, NEAR = 1.2, 1e-3
-"""So many times what the design leaves of the typical column's square no result may leave; or this
-share of it, if that is more."""
+"""Largest unexplained share of the typical column's mean square: as a ratio to the design's, or
+itself if that is more. Above it the fit has diverged."""
 SURE = 100.0
-"""Log evidence, linear about the fit, of which nobody doubts that it is above the least."""
+"""Log evidence, linearised at the fit, above which a family is needed without a second fit."""
 FIRST, ROUGH = 4, 0.03
-"""Rounds of each block after a family came in, or went, and what one has to gain for another."""
+"""Rounds of each block after a family is added or removed, and the relative fall of the cost
+required for another one."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """The gap with what has been allowed so far.
+    """The scores with the families accepted so far.
 
     Attributes:
-        effect: what was tried; the first is "design".
-        parameters: how many it has.
-        heldout_rms_in_plane, heldout_rms_coupling: m, over held-out correctors.
+        effect: the families of the step; the first is "design".
+        parameters: their number.
+        heldout_rms_in_plane, heldout_rms_coupling: of held-out correctors, m.
         heldout_rms_position: in-plane, with a position jump of each held-out corrector, m.
-        heldout_rms_roll: coupling, with the roll of each held-out corrector from the monitors that
-            gave its kick, m; NaN before rolls are fitted.
+        heldout_rms_roll: coupling, with a roll of each held-out corrector, by the BPMs that
+            determine its kick, m; NaN before rolls are fitted.
         heldout_chi2_per_dof: in-plane, by the readings' noise.
-        dispersion_rms: of the RF's orbit in x on the half of the monitors not fitted, m.
-        kept: whether it helped those who choose; the figures of one that was not are its own.
+        dispersion_rms: residual of the RF's orbit in x at BPMs that are not fitted, m.
+        kept: whether it was accepted; the scores of a rejected step are its own.
     """
 
     effect: str
@@ -93,19 +95,19 @@ class Step:
 
     @classmethod
     def scored(cls, effect: str, parameters: int, s: Score) -> "Step":
-        """With what the judges say."""
+        """Return a step with its validation scores."""
         return cls(
             effect, parameters, s.in_plane, s.coupling, s.chi2_per_dof, s.dispersion, s.position,
             s.roll,
         )  # fmt: skip
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in the diagnosis."""
+        """The entry in the file of the diagnosis."""
         return {name: value for name, value in vars(self).items() if name != "kept"}
 
 
 def fit_chi2(state: State) -> tuple[Chi2, Chi2, Chi2]:
-    """Of the fitted readings, by their noise alone: in-plane, across, of the RF."""
+    """Return chi-square of the fitted readings by their noise alone: in-plane, coupling, RF."""
     data = state.data
     out = []
     use = ~state.split.held
@@ -122,14 +124,14 @@ def fit_chi2(state: State) -> tuple[Chi2, Chi2, Chi2]:
 # --- the steps ------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class StepwiseFit:
-    """Ordered steps, and where they end.
+    """The steps and the fitted state.
 
     Attributes:
         design, state: before and after.
-        steps: those kept; the first is the design's, the last the result's.
-        refused: those that did not help, or spoilt the RF's response.
-        heldout: what held-out correctors say of the design and of the result.
-        said: sentences of steps that went wrong, and are left out.
+        steps: accepted; the first is the design's, the last the result's.
+        rejected_steps: did not improve the fit.
+        heldout: validation scores of the design and of the result.
+        messages: about rejected readings, implausible families and beam jitter.
     """
 
     design: State
@@ -147,31 +149,29 @@ def fit_steps(
     most: int = len(STEPS),
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> StepwiseFit:
-    """All families together, those taken out again that nobody needs, the rest fitted to all
-    correctors but the held-out ones.
+    """Return the fit of all families that are needed, to all correctors except the held-out ones.
 
-    Families need one another: monitors' gains, say, help nobody before the gradients are there. So
-    each is judged by what is lost without it, everything else settled anew: the same work with it
-    and without it.
+    Families need one another: BPM gains improve nothing before the gradients, for example. So all
+    are fitted together, and each is tested by the loss without it, with the others fitted again.
 
     Args:
-        data, split: what was measured, and who judges.
-        trials: families, in the order in which they come in.
-        most: steps that are kept at most.
+        data, split: the data, and the validation split.
+        trials: families, in the order in which they are added.
+        most: most accepted steps.
         progress: called with each step's name.
     """
     design = begin(data, split)
     stages, state = _in_turn(design, trials, progress)
     readings, steps_gone = outlier_steps(state)
-    if readings.messages:  # the families went after them, and what that made of steps is not known
+    if readings.messages:  # outliers have biased the families, and the residuals of steps
         stages, state = _in_turn(beside(design, readings.unread), trials, progress)
         more, steps_gone = outlier_steps(state)
         readings = readings.and_more(more)
     odd = readings.and_more(steps_gone)
     progress("all together")
     state, doubts = _together(beside(state, odd.unread), stages)
-    log.info("independent readings: %s", state.independent)
-    odd = odd.and_more(*outlier_steps(state))  # what is usual is less now
+    log.info("effective sample size per reading: %s", state.independent)
+    odd = odd.and_more(*outlier_steps(state))  # typical residuals are smaller now
     state, design = beside(state, odd.unread), beside(design, odd.unread)
     state, moving = _beside_jitter(state, progress)
     split = state.split
@@ -189,34 +189,34 @@ def fit_steps(
         [replace(steps.pop(own), kept=False) for own in gone],
         [*doubts, *others],
     )
-    judged = inner(state)
-    enough = int(np.sum(judged.columns[:, 0, 1] > 0)) >= ENOUGH
-    spoilt = -lost(inner(replace(design, jitter=state.jitter)), judged)[0]
+    validated = inner(state)
+    enough = int(np.sum(validated.columns[:, 0, 1] > 0)) >= ENOUGH
+    worse = -lost(inner(replace(design, jitter=state.jitter)), validated)[0]
     nothing = StepwiseFit(
         design, design, (Step.scored("design", 0, before),),
         (*rejected_steps, *(replace(step, kept=False) for step in steps.values())),
         (before, before), (*odd.messages, *doubts),
     )  # fmt: skip
-    if enough and spoilt > SPOILT:  # all together spoil what they should mend
+    if enough and worse > SPOILT:  # together they worsen the validation
         return nothing
     progress("result")
-    # those that chose start at what they say: a column far off would weigh nothing, and stay there
+    # inner validation columns start at their own estimates: far from them they have no weight
     state = bend(jump(replace(state, exploring=False), beyond=1.0))
     if moving is not None:
         moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(robust(state)))
-    for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since it was asked
+    for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since
         doubts += _doubts(state, trial)
         state = _without(state, trial)
         rejected_steps.append(replace(steps.pop(trial), kept=False))
     then = replace(design, good=state.good, exploring=False)
     if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
-        astray = (
-            "the fit left more of the readings that it was fitted to than the design leaves: the "
-            "lattice may be too far from the ring, and no effect is told"
+        diverged = (
+            "the fit diverged: the residual of its own readings is larger than the design's; the "
+            "lattice may be too far from the ring, and no effect is reported"
         )
-        return replace(nothing, messages=(*nothing.messages, astray))
+        return replace(nothing, messages=(*nothing.messages, diverged))
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
@@ -227,8 +227,8 @@ def fit_steps(
 def _needed(
     state: State, trials: Collection[Trial], most: int, progress: Callable[[str], Any]
 ) -> tuple[State, list[Trial], list[str]]:
-    """The state with families that are needed alone, `most` trials at most; those that are not; and
-    why some cannot be what they stand for."""
+    """The state with the needed families alone, `most` trials at most; the rejected trials; and
+    messages about implausible ones."""
     there = {family.name for family in state.families}
     needed = [own for own in trials if there & {family.name for family in own.families}]
     gone = [own for own in trials if own not in needed]
@@ -251,7 +251,7 @@ def _needed(
 def _in_turn(
     design: State, trials: Sequence[Trial], progress: Callable[[str], Any]
 ) -> tuple[dict[Trial, State], State]:
-    """The state with each trial's families, of those that there are, and the last of them."""
+    """The state after each trial that has places and readings, and the last of them."""
     stages: dict[Trial, State] = {}
     state = design
     for trial, state in one_by_one(begun(design, trials), trials, progress):
@@ -260,9 +260,8 @@ def _in_turn(
 
 
 def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
-    """All families settled, but those whose numbers cannot be what they stand for, which would draw
-    the others along; and why. One after another, the last that came in first: one may have drawn
-    another along."""
+    """The state with all families fitted, except implausible ones, which would bias others, and
+    messages about these. They are removed one by one, the last first: one may bias another."""
     state = replace(state, independent=np.ones((2, 2)))
     doubts: list[str] = []
     while True:
@@ -275,33 +274,33 @@ def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
-    """With a jitter of the beam, where one stands out and those who choose do not object. It is
-    looked for again beside the first, of which the ring's errors had taken some."""
+    """The state with beam jitter, where it is detected and validation does not reject it. It is
+    sought again given the first result, because errors of the ring had taken a part of it."""
     moving = sought(state)
     if moving is None:
         return state, None
-    progress("jitter of the beam")
+    progress("beam jitter")
     with_it = settle(replace(state, jitter=moving.orbits))
     again = sought(with_it)
     if again is not None:
         moving, with_it = again, settle(replace(with_it, jitter=again.orbits))
-    beside_it = replace(state, jitter=moving.orbits)
-    messages = lost(inner(beside_it), inner(with_it))
-    log.info("%s: judges %+.3f +- %.3f", moving.sentence, *messages)
+    not_refitted = replace(state, jitter=moving.orbits)
+    messages = lost(inner(not_refitted), inner(with_it))
+    log.info("%s: validation %+.3f +- %.3f", moving.sentence, *messages)
     return (state, None) if against(messages, WORTH) else (with_it, moving)
 
 
 def one_by_one(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
 ) -> Iterator[tuple[Trial, State]]:
-    """The state with one trial's families after another, each fitted beside those before it;
-    without those that the ring has no places of, or the measurement no readings."""
+    """Yield each trial, and the state with its families fitted together with those before. Families
+    without places in the ring, or without readings, are omitted."""
     for given in trials:
-        told = tuple(
+        present = tuple(
             family for family in given.families
             if state.reads(family.block) and family.size(state.data)
         )  # fmt: skip
-        trial = replace(given, families=told)
+        trial = replace(given, families=present)
         if not any(family.count(state.data) for family in trial.families):
             continue
         progress(_title(trial))
@@ -321,16 +320,15 @@ def _blocks(trial: Trial) -> list[int]:
 def _worth(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
 ) -> tuple[dict[Trial, float], dict[Trial, State]]:
-    """Log evidence of each trial's families beside all the others (0 or less: not needed), and the
-    states without them.
+    """Log evidence beyond `LEAST` of each trial (0 or less: not needed), and the states without it.
 
-    Correctors that were not fitted have the veto: evidence takes readings for independent, which
-    what the model lacks is not. Where they want what the evidence linear about the fit wants too,
-    that stands, for two fits that settled each by itself compare to a share of their cost alone.
+    Validation has a veto, because the evidence assumes independent readings, and model discrepancy
+    is not. Where validation and the linearised evidence both favour a family, the latter decides,
+    because the costs of two separate fits agree only to a share of their size.
     """
-    worth, judged = _quickly(state, trials, progress)
+    worth, rejected = _quickly(state, trials, progress)
     doubtful = [
-        trial for trial, unwanted in judged.items()
+        trial for trial, unwanted in rejected.items()
         if worth[trial] > -np.inf and (unwanted or not worth[trial] > SURE)
     ]  # fmt: skip
     states: dict[Trial, State] = {}
@@ -355,7 +353,10 @@ def _worth(
             inner(replace(state, good=good), _of_rf(with_it)),
         )
         log.info(
-            "without %s: evidence %+.1f, judges %+.3f +- %.3f", _title(trial), -gained, *messages
+            "without %s: evidence %+.1f, validation %+.3f +- %.3f",
+            _title(trial),
+            -gained,
+            *messages,
         )
         if not _asked(trial):
             worth[trial] = gained
@@ -367,14 +368,14 @@ def _worth(
 
 
 def _doubts(state: State, trial: Trial) -> list[str]:
-    """Why what was found of a trial's families cannot be what they stand for."""
+    """Messages about implausible values of a trial's families."""
     own = [family for family in trial.families if state.allows(family.name)]
     doubts = (family.doubt(state.values[family.variable], state.data) for family in own)
     return [doubt for doubt in doubts if doubt is not None]
 
 
 def _of_rf(own: Evidence) -> Array:
-    """What the RF's fitted monitors leave, each predicted by all others."""
+    """Leave-one-out residuals of the RF's orbit."""
     return rf_by_others(own.state, own.in_plane, own.found)
 
 
@@ -383,16 +384,15 @@ def _priors(trial: Trial, state: State) -> set[str]:
 
 
 def _asked(trial: Trial) -> bool:
-    """Whether correctors that were not fitted know of it: not of what fitted ones have of their
-    own."""
+    """Whether held-out correctors can validate a trial: not numbers of fitted correctors."""
     return any(family.per != "column" for family in trial.families)
 
 
 def _quickly(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
 ) -> tuple[dict[Trial, float], dict[Trial, bool]]:
-    """Log evidence of each trial, linear about where the fit stands, which is enough for what
-    nobody doubts; and whether the judges would rather be without it."""
+    """Log evidence of each trial beyond `LEAST`, linearised at the fit, which is sufficient in
+    clear cases; and whether validation rejects it."""
     worth: dict[Trial, float] = {}
     unwanted: dict[Trial, bool] = {}
     blocks: dict[int, tuple[Linear, tuple[float, dict[str, Array], Posterior | None]]] = {}
@@ -402,7 +402,7 @@ def _quickly(
             blocks[block] = there, linear_evidence(there)
     in_plane = blocks.get(0)
     of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
-    judged = inner(state, of_rf)
+    validated = inner(state, of_rf)
     for trial in trials:
         progress(f"is {_title(trial)} needed")
         if not any(state.values[family.variable].any() for family in trial.families):
@@ -417,12 +417,12 @@ def _quickly(
         worth[trial] = evidence - other - LEAST
         without_it = of_rf if block else rf_by_others(state, there, found)
         try:
-            messages = lost(inner(state.moved({**state.values, **values}), without_it), judged)
+            messages = lost(inner(state.moved({**state.values, **values}), without_it), validated)
         except TmlatticeError:  # no closed orbit without it
             messages = np.inf, 0.0
         unwanted[trial] = _asked(trial) and against(messages)
         log.info(
-            "%s: linear evidence %+.1f, judges %+.3f +- %.3f",
+            "%s: linear evidence %+.1f, validation %+.3f +- %.3f",
             _title(trial),
             worth[trial],
             *messages,
@@ -431,5 +431,6 @@ def _quickly(
 
 
 def _without(state: State, trial: Trial) -> State:
-    """All the others settled anew; the other block does not feel it, to first order."""
+    """The state without a trial's families and the others fitted again; the other block is
+    unchanged to first order."""
     return settle(forbid(state, trial.families), _blocks(trial), FIRST, ROUGH)

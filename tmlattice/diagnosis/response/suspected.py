@@ -1,7 +1,6 @@
 """The effect of each single cause on an orbit response, given all usual distributed errors.
 
->>> seen = look_at(state, suspects_of(state, single_causes(state.data)))
->>> seen.statistic, seen.amount
+>>> seen = Seen(state, suspects_of(state, single_causes(state.data)))
 
 A cause that is one number of a family (a quadrupole's gradient, a gain, a roll), or a sum of some
 (a supply), is in the normal equations already. Others are compared by their signatures.
@@ -27,10 +26,9 @@ from tmlattice.observe.orbit_response import Hypothesis
 Array = NDArray[np.float64]
 
 AFFORDABLE = 4e9
-"""Most products of signatures with derivatives by distributed errors; above it only numbers of
-families are compared."""
+"""Most products of signatures and derivatives; above it only numbers of families are compared."""
 BLIND = 1e-6
-"""Share of a signature that must remain given the distributed errors."""
+"""Least share of a signature's information that remains given the distributed errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +38,8 @@ class Suspect:
     Attributes:
         cause: effect and place.
         block: 0 in-plane, 1 coupling; None: both, by its signature.
-        variable: whose numbers it moves.
-        members: which, for a unit of its amount, [number].
+        variable: of its numbers.
+        members: the numbers for a unit of its amount, [number].
     """
 
     cause: Hypothesis
@@ -51,7 +49,7 @@ class Suspect:
 
 
 def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Suspect]:
-    """Suspects of the causes; without those that the readings cannot determine."""
+    """Return the suspects of causes that the readings may determine."""
     numbers = _numbers(state)
     found, signed = [], []
     for cause in causes:
@@ -151,7 +149,7 @@ class Weighed:
 
     Attributes:
         statistic: fall of chi-square, [suspect].
-        amount, sigma: best one, and its error, [suspect].
+        amount, sigma: best amount, and its error, [suspect].
         information: by block, [2, suspect].
     """
 
@@ -162,7 +160,7 @@ class Weighed:
 
 
 class Seen:
-    """Return the products of all suspects at a fit.
+    """The products of all suspects at a fit.
 
     Args:
         state: with distributed errors, and with the single faults so far.
@@ -204,11 +202,10 @@ class Seen:
                 it.across[:, h] = gathered(it.there, state.data.plane_of(block), heavy)
 
     def beside(self, without: str | None = None) -> Weighed:
-        """The statistics of each suspect, given distributed errors and accepted faults.
+        """Return the statistics of each suspect, given distributed errors and accepted faults.
 
         Args:
-            without: the prior's name of one of these that is taken back: its alternatives take its
-                place.
+            without: name of the prior of an accepted fault that is replaced by its alternatives.
         """
         shape = (2, len(self.suspects))
         information, inner = np.zeros(shape), np.zeros(shape)

@@ -1,9 +1,7 @@
-"""Swapped correctors: each responds as the other one should. Swapped BPMs, and BPMs with swapped
-planes.
+"""Swapped correctors: each responds as the other one should. Swapped BPMs, or planes of a BPM.
 
-A table of names, or two cables, may be wrong in one place. The orbit of a swapped corrector still
-resembles the model's, so it is not rejected but looks misplaced by the distance to its
-neighbour.
+Two cables, or two rows of a table of names, may be swapped. The orbit of a swapped corrector still
+resembles the model's, so it is not rejected, but looks misplaced by the distance to the other one.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -21,7 +19,7 @@ from tmlattice.measurement import OrbitResponse
 Array = NDArray[np.float64]
 
 SHARE = 0.25
-"""Largest ratio of the mean square of each of the two columns after and before the swap."""
+"""Largest ratio of the mean square residuals, of each of two columns, after and before the swap."""
 
 Pair = tuple[str, str]
 
@@ -43,14 +41,14 @@ def labels_corrected(
     odd: RejectedChannels,
     among: Collection[str],
 ) -> tuple[OrbitResponse, str] | None:
-    """The measurement with new swaps corrected, and messages about them; None where there are none.
+    """Return the measurement with new swaps corrected, and a message about them; None without any.
 
     Args:
         state: with the model's readings.
         measured: the measurement.
         known: pairs that were corrected before; new ones are added.
         odd: rejected channels.
-        among: correctors that may answer as others should.
+        among: correctors that may be swapped with any other.
     """
     pairs = _new(swaps(state, {*odd.correctors, *among}), known.correctors)
     if pairs:
@@ -67,8 +65,8 @@ def _new(found: dict[Pair, float], known: dict[Pair, float]) -> list[Pair]:
 
 
 def swaps(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
-    """Swapped pairs with their fall of chi-square: neighbours of a plane, in beam order, then any
-    two of given ones, and any two of different planes. Each corrector is in one pair at most.
+    """Return swapped pairs with their fall of chi-square: neighbours of a plane, in beam order,
+    then any two of `among`, and any two of different planes. Each corrector is in one pair at most.
 
     Args:
         state: with the model's readings.
@@ -100,7 +98,7 @@ def swaps(state: State, among: Collection[str] = ()) -> dict[Pair, float]:
 def _suspects(
     state: State, among: Collection[str]
 ) -> Iterator[tuple[list[int], Iterable[tuple[int, int]]]]:
-    """Columns that may be swapped, two by two, and the planes that show it."""
+    """Pairs of columns that may be swapped, and the planes to compare."""
     data, names = state.data, state.data.measured.correctors
     for p in (0, 1):
         mine = np.flatnonzero(data.plane[:-1] == p)
@@ -135,13 +133,12 @@ def correctors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitResp
 
 
 def swapped_monitors(state: State, among: Collection[str]) -> dict[Pair, float]:
-    """Swapped pairs of some BPMs, anywhere in the ring, in both planes, whatever their gains, with
-    the fall of chi-square; each BPM is in one pair at most.
+    """Return swapped pairs of some BPMs, anywhere in the ring, in both planes, whatever their
+    gains, with the fall of chi-square; each BPM is in one pair at most.
 
     Args:
-        state: what the model makes of the readings.
-        among: rejected channels; with a design of another phase advance many others look
-            shifted by one cell.
+        state: with the model's readings.
+        among: rejected channels; if the phase advance is wrong, others look shifted by one cell.
     """
     data, read = state.data, state.at.seen(state.at.beam)
     model, orbits = data.pick(read)[:-1], data.pick(data.orbits)[:-1]
@@ -178,7 +175,7 @@ def monitors_back(measured: OrbitResponse, pairs: Iterable[Pair]) -> OrbitRespon
 
 
 def swapped_planes(state: State) -> list[str]:
-    """BPMs whose readings in each plane match the model's other plane, whatever their gain."""
+    """Return the BPMs whose readings, whatever their gain, match the other plane of the model."""
     data, read = state.data, state.at.seen(state.at.beam)
     found = []
     for m, name in enumerate(data.measured.monitors):

@@ -1,7 +1,7 @@
 """Swapped correctors or BPMs on one of two days.
 
 >>> measured, data, before = all_right(partial(response_data, ring), measured, 0.2)
->>> since(before, after, said)
+>>> since(before, after, messages)
 
 The first day is compared with the design, the second one with the first.
 """
@@ -21,11 +21,11 @@ from tmlattice.observe.split import split_columns
 def all_right(
     made: Callable[[OrbitResponse], ResponseData], measured: OrbitResponse, holdout: float
 ) -> tuple[OrbitResponse, ResponseData, Swaps]:
-    """A measurement with swapped pairs of correctors and BPMs corrected, its data, and these pairs.
+    """Return a measurement with swapped pairs corrected, its data, and these pairs.
 
     Args:
-        made: readings in a model, of a measurement.
-        measured: as it was read.
+        made: returns the data of a measurement, with the model to compare with.
+        measured: the measurement.
         holdout: share of the correctors that are held out.
     """
     known = Swaps([], {}, {}, [])
@@ -39,8 +39,7 @@ def all_right(
 
 
 def since(first: Swaps, second: Swaps, messages: list[str]) -> Swaps:
-    """Pairs that were swapped on one of two days; a message about those of both is added to
-    `said`."""
+    """Return the pairs swapped on one of two days; `messages` are extended about those of both."""
     found = []
     for what, a, b in (
         ("correctors", first.correctors, second.correctors),

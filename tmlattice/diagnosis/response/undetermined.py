@@ -1,9 +1,9 @@
 """Undetermined errors of a machine after a hierarchical fit, and their effect on a change.
 
-A change between two measurements is fitted in the machine of the first one, whose errors are known
-with uncertainty. That uncertainty cancels in the difference, but scales with the effect of the
-change on the readings. Amounts, alternatives and statistics include it, for one change
-(`inference.among.Blurred`) and for many (`linear.with_numbers`).
+A change between two measurements is fitted in the machine of the first one, whose errors have
+uncertainties. Their effect on the readings cancels in the difference, but their effect on the
+change does not: it scales with the change. Amounts, alternatives and statistics include it, for one
+change (`inference.among.Blurred`) and for many (`linear.with_numbers`).
 """
 
 from collections.abc import Sequence
@@ -31,15 +31,15 @@ class Undetermined:
     """Gaussian errors of a machine that are undetermined.
 
     Attributes:
-        hypotheses: what they are errors of.
-        root: their amounts by independent ones of size 1, [hypothesis, error].
+        hypotheses: effects and places of the errors.
+        root: their amounts by independent errors of size 1, [hypothesis, error].
     """
 
     hypotheses: tuple[Hypothesis, ...]
     root: Array
 
     def size(self, problem: Response) -> int:
-        """Largest dimension of the covariance."""
+        """The largest dimension of the covariance."""
         return len(self.hypotheses) * problem.used.size
 
 
@@ -47,12 +47,11 @@ ORBITS = (
     "quadrupole_offset_x", "quadrupole_offset_y", "dipole_field", "dipole_roll",
     "sextupole_offset_x", "sextupole_offset_y",
 )  # fmt: skip
-"""Effects that make orbits: a response is hardly sensitive to them, but a change of sextupoles
-is."""
+"""Effects that make orbits: a response hardly shows them, but a change of sextupoles does."""
 
 
 def undetermined(state: State) -> Undetermined:
-    """The undetermined errors of a converged fit, with its priors."""
+    """Return the undetermined errors of a converged fit, with its priors."""
     blocks: list[dict[Hypothesis, Array]] = []
     for block in (block for block in (0, 1) if state.of_block(block)):
         there = linear(state, block)
@@ -80,7 +79,7 @@ def undetermined(state: State) -> Undetermined:
 
 
 def and_orbits(ring: Ring, open_: Undetermined) -> Undetermined:
-    """The errors with orbits of the usual size."""
+    """Return the errors together with those that make orbits of the usual size."""
     usual = background_rms(dict.fromkeys(ORBITS))
     unseen = [(name, place) for name in ORBITS for place in find(name).places(ring)]
     alone = np.diag([usual[name] for name, _ in unseen])
@@ -88,8 +87,7 @@ def and_orbits(ring: Ring, open_: Undetermined) -> Undetermined:
 
 
 STRONGEST, HARDLY = 200, 0.1
-"""Errors that are kept where there are too many, and the least effect of one on the readings, in
-units of their noise."""
+"""Most errors that are kept, and the least effect of one, in units of the readings' noise."""
 
 
 def strongest(problem: Response, open_: Undetermined, causes: Sequence[Cause]) -> Undetermined:
@@ -113,7 +111,7 @@ def strongest(problem: Response, open_: Undetermined, causes: Sequence[Cause]) -
 
 
 class Blur:
-    """Return the problem with undetermined errors of the machine.
+    """A problem with undetermined errors of the machine.
 
     Args:
         problem: of the response in that machine.

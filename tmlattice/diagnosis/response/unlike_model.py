@@ -1,8 +1,7 @@
 """Rejected channels: BPMs, in one plane or both, and correctors that the model cannot describe.
 
 A BPM plane with another one's signal, or noise, biases the validation; its other plane may be good.
-The model explains almost nothing of such a channel, whatever its gain, and most of all the
-others.
+The model explains almost nothing of such a channel, whatever its gain, but most of all others.
 """
 
 from dataclasses import dataclass, replace
@@ -17,14 +16,13 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 STRANGE, TIMES = 0.5, 9.0
-"""Unexplained share of the mean square of a rejected channel; and its least ratio to the typical
-share."""
+"""Least unexplained share of a rejected channel's mean square; its least ratio to the typical."""
 ODD = 0.05
 """Least unexplained share of a channel that may be swapped."""
 ENOUGH = 4
-"""Readings required for a decision."""
+"""Fewest readings for a test."""
 SILENT = 0.3
-"""Share of the model's response below which a channel is weak."""
+"""Share of the model's response below which a channel is weak, not rejected."""
 MOST = 0.25
 """Largest share of rejected BPMs or correctors of a plane: more of them mean another lattice."""
 
@@ -78,7 +76,7 @@ def reversed_ones(state: State) -> list[str]:
     gains = np.diagonal(errors.monitors, axis1=1, axis2=2)
     messages = []
     for what, names in (
-        ("monitors that read", [
+        ("BPMs that read", [
             f"{measured.monitors[m]} in {'xy'[p]}"
             for m, p in np.argwhere((gains < 0) & state.good[:, None])
         ]),

@@ -1,8 +1,8 @@
-"""The validation of a hierarchical fit of an orbit response, on correctors that were not fitted.
+"""The validation of a hierarchical fit of an orbit response, on held-out correctors.
 
-For each of them the kick is estimated from half of the BPMs, and the prediction is scored on the
-other half. The outer validation set (`score`) selects nothing. The inner one (`inner`) selects
-families, with standard errors, because it may have only four correctors.
+For each held-out corrector the kick is estimated from half of the BPMs, and the prediction is
+scored on the other half. The outer validation set (`score`) selects nothing. The inner one
+(`inner`) selects families, with standard errors, because it may have only four correctors.
 """
 
 from dataclasses import dataclass, replace
@@ -17,15 +17,13 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
-"""How the logarithms of rms count that held-out correctors leave (in-plane, coupling, RF: one
-reading a monitor), and by how much their sum may fall without a step that stays all the same:
-evidence takes what the model lacks for noise, and gladly fits it."""
+"""Weights of log rms in the validation score: in-plane, coupling, RF (one reading per BPM); and the
+fall of the score that rejects a family against the evidence, which may fit model discrepancy."""
 FLOOR = np.array([0.1, 0.1, 1.0])
-"""Of the noise, beside what is left in-plane, across and of the RF: what is left of nothing (a
-model's own orbit) is no better for being less."""
+"""Share of the noise that is added to each rms in quadrature, in-plane, coupling and RF: for
+readings without noise (simulated ones) a smaller residual is no improvement."""
 SURELY, WORTH = 1.0, 0.05
-"""Standard errors of a fall from which on it counts; and how much one is at least that refuses what
-most of the readings ask for."""
+"""Least significant fall of the score, in standard errors; the least one that rejects jitter."""
 
 
 class Chi2(NamedTuple):
@@ -42,7 +40,7 @@ class Chi2(NamedTuple):
 
 @dataclass(frozen=True)
 class Score:
-    """Validation scores: rms in m; see `Step`. Chi-squares are in-plane, across, of the RF."""
+    """Validation scores: rms in m, see `Step`; chi-square in-plane, coupling, RF."""
 
     in_plane: float
     coupling: float
@@ -54,18 +52,17 @@ class Score:
 
 
 class _Missed(NamedTuple):
-    """Residuals of the far readings of held-out correctors, m, column by column.
+    """Residuals of held-out correctors at the BPMs that validate them, m, column by column.
 
     Attributes:
-        inside: in-plane.
-        outside: across.
-        jumped: in-plane, with a position jump of the corrector's own.
-        rolled: across, with a roll of the corrector's own, of those that have one.
-        squares, cross: in-plane and across, in units of the noise, squared.
-        spread: of `squares`: what the kick's own error adds, times.
+        inside, outside: in-plane, coupling.
+        jumped: in-plane, with a position jump of the corrector.
+        rolled: coupling, with a roll of the corrector, if it has one.
+        squares, cross: squares in-plane and coupling, in units of the noise.
+        spread: factor on the variance of `squares` by the error of the kick.
         rf: of the RF's orbit.
-        rf_squares: in units of the noise, squared.
-        rf_monitors: which monitors those are, [monitor].
+        rf_squares: squares of these, in units of the noise.
+        rf_monitors: the BPMs of these, [monitor].
     """
 
     inside: list[Array]
@@ -83,11 +80,11 @@ class _Missed(NamedTuple):
 def _missed(
     state: State, validation: Flags, rf: Flags | None = None, jitter: Array | None = None
 ) -> _Missed:
-    """What correctors that were not fitted say; see `score`.
+    """Residuals of held-out correctors; see `score`.
 
     Args:
-        state, judges, rf: as there.
-        jitter: orbits that a step may have some of, see `State`, which near monitors tell too.
+        state, validation, rf: as there.
+        jitter: orbits of beam jitter, see `State`, whose amplitudes the near BPMs determine, too.
     """
     data, at, half = state.data, state.at, state.split.half
     read = at.seen(at.beam)
@@ -103,7 +100,7 @@ def _missed(
     typical = np.median(data.noise, axis=0)
 
     def still(left: Array, near: Flags, plane: int) -> Array:
-        """Without the jitter that near monitors tell."""
+        """The residual without the jitter at near BPMs."""
         orbits = moving[plane].T
         held = np.full(orbits.shape[1], typical[plane])
         amounts, _ = amplitudes(orbits, left, near, near, held)
@@ -114,13 +111,13 @@ def _missed(
         near, far = seen & half[c], seen & ~half[c]
         if not (near.any() and far.any()):
             continue
-        # all alike: what the model lacks is not the readings' noise
+        # equal weights: model discrepancy does not scale with the noise
         moved = moving[data.plane[c]].T
         held = np.append(0.0, np.full(moved.shape[1], typical[data.plane[c]]))
         kick, miss = amplitudes(np.column_stack([straight[c], moved]), orbits[c], near, far, held)
         inside.append(miss)
         squares.append(miss**2 / variance[c, far])
-        # the kick's error adds to the reading's
+        # the error of the kick adds to that of the reading
         spread.append(1 + straight[c, far] ** 2 / np.sum(straight[c, near] ** 2))
         jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
         left = orbits_across[c] - kick[0] * across[c]
@@ -131,21 +128,21 @@ def _missed(
         cross.append(outside[-1] ** 2 / variance_across[c, far & there])
         if rolls[c].any() and (near & there).any():
             rolled.append(amplitudes(rolls[c][:, None], left, near & there, far & there)[1])
-    judge = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
+    scored = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
     left = orbits[-1] - straight[-1]
-    near = state.good & np.isfinite(left) & half[-1] & ~judge
-    of_rf = (still(left, near, 0) if moving.size and near.any() else left)[judge]
+    near = state.good & np.isfinite(left) & half[-1] & ~scored
+    of_rf = (still(left, near, 0) if moving.size and near.any() else left)[scored]
     return _Missed(inside, outside, jumped, rolled, squares, cross, spread, of_rf,
-                   of_rf**2 / variance[-1, judge], judge)  # fmt: skip
+                   of_rf**2 / variance[-1, scored], scored)  # fmt: skip
 
 
 def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
     """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
     Args:
-        state: that is validated.
-        judges: the correctors of the validation set, [column].
-        rf: monitors that validate the RF's response; None: those that did not fit it.
+        state: to validate.
+        validation: the held-out correctors, [column].
+        rf: BPMs that validate the RF's response, [monitor]; None: those that are not fitted.
     """
     missed = _missed(state, validation, rf)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
@@ -165,11 +162,11 @@ def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
 
 
 class Validated(NamedTuple):
-    """Residuals of the inner validation set: sums of squares, m^2, and counts of readings.
+    """Residuals of the inner validation set: sums of squares, m^2, and numbers of readings.
 
     Attributes:
-        columns: of each corrector, in-plane and across, [column, 2, (sum, count)].
-        rf: of each monitor, of the RF's orbit, [monitor, (sum, count)].
+        columns: of each corrector, in-plane and coupling, [column, 2, (sum, count)].
+        rf: of each BPM, of the RF's orbit, [monitor, (sum, count)].
     """
 
     columns: Array
@@ -177,7 +174,7 @@ class Validated(NamedTuple):
 
     @property
     def logs(self) -> Array:
-        """Log rms, in-plane, across and of the RF; NaN without readings."""
+        """Log rms in-plane, coupling and RF; NaN without readings."""
         return _logs(np.concatenate([self.columns.sum(axis=0), self.rf.sum(axis=0)[None]]))
 
 
@@ -187,28 +184,30 @@ def _logs(sums: Array) -> Array:
 
 
 def inner(state: State, by_others: Array | None = None) -> Validated:
-    """In-plane, coupling and dispersion readings of correctors held out for it; each half of their
-    monitors gives the kick once, and a jitter of the beam that the state has: else one that the
-    judges have themselves would hide what is better.
+    """Return the residuals of the inner validation set: in-plane, coupling and dispersion.
+
+    Each half of the BPMs determines the kicks once, and the amplitudes of the state's beam jitter.
+    Otherwise the jitter of the held-out steps would hide improvements.
 
     Args:
-        state: that is judged.
-        by_others: what fitted monitors leave of the RF's orbit, `rf_by_others`: they judge too.
+        state: to validate.
+        by_others: leave-one-out residuals of the RF's fitted BPMs, see `rf_by_others`, m,
+            [monitor]; they count in the validation, too.
     """
     other = replace(state, split=replace(state.split, half=~state.split.half))
-    said = [
+    missed = [
         _missed(one, state.split.inner, state.split.inner_rf, state.jitter)
         for one in (state, other)
     ]
     sums = [
         np.array([[[np.sum(own**2), len(own)] for own in pair]
                   for pair in zip(one.inside, one.outside, strict=True)])
-        for one in said
+        for one in missed
     ]  # fmt: skip
     rf = np.zeros((len(state.good), 2))
     if by_others is not None:
         rf = np.stack([np.nan_to_num(by_others) ** 2, np.isfinite(by_others)], axis=1)
-    rf[said[0].rf_monitors] = np.stack([said[0].rf ** 2, np.ones(len(said[0].rf))], axis=1)
+    rf[missed[0].rf_monitors] = np.stack([missed[0].rf ** 2, np.ones(len(missed[0].rf))], axis=1)
     floor = (FLOOR * float(np.median(state.data.noise))) ** 2
     columns = sums[0] + sums[1]
     columns[..., 0] += floor[:2] * columns[..., 1]
@@ -217,27 +216,27 @@ def inner(state: State, by_others: Array | None = None) -> Validated:
 
 
 def lost(without: Validated, within: Validated) -> tuple[float, float]:
-    """By how much the judges' figures rise, and its standard error: by the jackknife, each
-    corrector, and each of the RF's monitors, left out once. Those that nobody read say nothing."""
+    """Return the rise of the validation score (weighted log rms; lower is better) without a family,
+    and its standard error by the jackknife over correctors and over BPMs of the RF's orbit."""
     whole = float(np.nansum(JUDGES * (without.logs - within.logs)))
     variance = 0.0
     for now, then, weights in (
         (within.columns, without.columns, JUDGES[:2]),
         (within.rf[:, None], without.rf[:, None], JUDGES[2:]),
     ):
-        judged = now[:, 0, 1] > 0
-        if judged.sum() > 1:
-            one_less = [_logs(own.sum(axis=0) - own[judged]) for own in (then, now)]
-            said = np.nansum(weights * (one_less[0] - one_less[1]), axis=1)
-            variance += (len(said) - 1) * float(np.var(said))
+        counted = now[:, 0, 1] > 0
+        if counted.sum() > 1:
+            one_less = [_logs(own.sum(axis=0) - own[counted]) for own in (then, now)]
+            changes = np.nansum(weights * (one_less[0] - one_less[1]), axis=1)
+            variance += (len(changes) - 1) * float(np.var(changes))
     return whole, float(np.sqrt(variance))
 
 
-def against(said: tuple[float, float], least: float = VETO) -> bool:
-    """Whether the judges would rather be without, by what `lost` says, and by so much at least."""
-    return said[0] < -max(least, SURELY * said[1])
+def against(change: tuple[float, float], least: float = VETO) -> bool:
+    """Return whether validation is significantly better without, by `lost`, and by `least`."""
+    return change[0] < -max(least, SURELY * change[1])
 
 
-def in_favour(said: tuple[float, float]) -> bool:
-    """Whether they would rather be with, likewise."""
-    return against((-said[0], said[1]))
+def in_favour(change: tuple[float, float]) -> bool:
+    """Return whether validation is better with, likewise."""
+    return against((-change[0], change[1]))

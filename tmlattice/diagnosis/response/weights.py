@@ -1,4 +1,4 @@
-"""For how much each reading of a dense fit counts: what the model lacks, and monitors that are bad.
+"""Weights of the readings of a hierarchical fit: noise, discrepancy, outliers and bad BPMs.
 
 >>> state = look(state, 0)
 >>> weight(state, 0)                               # 1 / variance, [column, monitor]
@@ -18,26 +18,27 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 BAD = 5.0
-"""A monitor whose rms residual, its gain fitted, is so many times the median one's is bad."""
+"""Ratio of a BPM's rms residual, given its own gain, to the median one above which it is bad."""
 SPARED = 0.1
-"""Of its readings: a monitor is not bad by the few worst of them alone; these are themselves."""
+"""Share of a BPM's readings, the largest residuals, without which it must be bad too: few outliers
+are rejected as readings."""
 FEW = 4
-"""Correctors that a plane needs for a monitor to be judged by what its gain leaves."""
+"""Fewest correctors of a plane for the test of BPMs."""
 TYPICAL = 10.0
-"""The median misfit of all columns counts as so many readings of each one's own."""
+"""Number of readings by which the typical misfit counts in the model discrepancy of each column."""
 LEAST = 0.2
-"""Of the noise: what the model lacks at least, and what noise is left beside a jitter."""
+"""Least model discrepancy, and least noise given jitter, as a share of the noise."""
 ROUNDED = 1e-6
-"""Of the readings: two equal responses differ by less."""
+"""Relative size of rounding errors: two equal responses differ by less."""
 DISPERSION = "quadrupole_gradient"
-"""The family that makes the RF's orbit what it is. Before it is there, that orbit is off by many
-times what all others are, and would make the monitors' gains what fits it."""
+"""The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
+many times all others, and would bias the BPM gains."""
 COUPLING = "skew_gradient"
-"""The family that makes the other plane's readings what they are."""
+"""The family that determines the readings in the other plane."""
 
 
 def weight(state: State, block: int) -> Array:
-    """1 / variance of the readings that are fitted, [column, monitor]."""
+    """Return 1 / variance of the fitted readings, 1/m2, and 0 of others, [column, monitor]."""
     data, split = state.data, state.split
     use = np.isfinite(data.pick(data.orbits, block)) & state.good
     use[:-1] &= state.fitted[:-1, None]
@@ -54,13 +55,13 @@ def weight(state: State, block: int) -> Array:
 
 
 def taken(state: State, block: int) -> Array | None:
-    """What the beam's jitter takes from the weights, see `inference.common`, [column, monitor,
-    pattern]; None where the beam stood still."""
+    """Return the factor of the information that beam jitter takes from the weights, see
+    `inference.common`, [column, monitor, pattern]; None without jitter."""
     return None if state.jitter is None else _common(state, block)[0]
 
 
 def _common(state: State, block: int) -> tuple[Array, Array]:
-    """What jitter takes from the weights, and its share of the log evidence."""
+    """The factor of the information that jitter takes, and its term of the log evidence."""
     assert state.jitter is not None
     count = counts(state, block)
     alone = weight(state, block) / count
@@ -69,15 +70,14 @@ def _common(state: State, block: int) -> tuple[Array, Array]:
 
 
 def weighed(state: State, block: int, left: Array) -> Array:
-    """Inverse covariance of the readings that are fitted times what is left, 1/m, [column,
-    monitor]."""
+    """Return the inverse covariance of fitted readings times `left`, 1/m, [column, monitor]."""
     weights, own = weight(state, block), taken(state, block)
     left = np.where(weights > 0, left, 0.0)
     return weights * left if own is None else times_precision(weights, own, left)
 
 
 def log_scale(state: State, block: int) -> float:
-    """Logarithm of the determinant of that inverse covariance."""
+    """Return the log determinant of that inverse covariance."""
     weights = weight(state, block)
     use = weights > 0
     count = np.broadcast_to(counts(state, block), use.shape)[use]
@@ -86,8 +86,8 @@ def log_scale(state: State, block: int) -> float:
 
 
 def _without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array]:
-    """What is left beside the likeliest jitter of each column, and the readings' noise, which
-    stated or learnt has the jitter in it, beside it; m, [column, monitor]."""
+    """The residual given the most probable jitter of each column; and the readings' noise without
+    jitter, which is included in stated and estimated noise; m, [column, monitor]."""
     noise = state.data.noise_of(block)
     if state.jitter is None:
         return left, noise
@@ -98,14 +98,14 @@ def _without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array
 
 
 def counts(state: State, block: int) -> Array:
-    """As how many readings each one counts, [column, 1]."""
+    """Return the effective sample size of one reading, [column, 1]."""
     plane = state.data.plane_of(block)
     own = np.ones(len(plane)) if state.independent is None else state.independent[block, plane]
     return np.asarray(own[:, None])
 
 
 def look(state: State, block: int) -> State:
-    """What the model lacks now; and the monitors that are bad, their own gains apart."""
+    """Return the state with its present model discrepancy, weights of outliers, and good BPMs."""
     data = state.data
     use = weight(state, block) > 0
     left = np.where(use, data.pick(state.at.left, block), np.nan)
@@ -118,7 +118,7 @@ def look(state: State, block: int) -> State:
     shared = TYPICAL * typical**2 + np.nansum(share * left**2, axis=1)
     squares = shared / (TYPICAL + use.sum(axis=1))
     if state.allows(DISPERSION):
-        squares[-1] = typical**2  # it is one column among many, and counts like any
+        squares[-1] = typical**2  # the RF counts like a typical column
         state = replace(state, rf_share=rf_shares(state, block, left[-1]))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
@@ -127,8 +127,8 @@ def look(state: State, block: int) -> State:
 
 
 def _independent(state: State, block: int, left: Array, noise: Array) -> State:
-    """With the share of independent readings, where that is looked at: not before there are
-    gradients, for all that they make is waves."""
+    """The state with its effective sample size, once gradients are fitted: residuals by gradients
+    are betatron oscillations, too."""
     if state.independent is None or not state.allows(DISPERSION):
         return state
     own, shares = state.independent.copy(), state.share
@@ -140,11 +140,11 @@ def _independent(state: State, block: int, left: Array, noise: Array) -> State:
 
 
 def good_monitors(state: State, bad: float = BAD) -> Flags:
-    """Those that read, in the plane that is kicked, what the others make likely, [monitor].
+    """Return the BPMs that agree with the others in the kicked plane, [monitor].
 
     Args:
-        state: that is fitted.
-        bad: so many times the median rms residual, gains fitted, is a bad monitor's.
+        state: of the fit.
+        bad: ratio to the median rms residual, given gains, above which a BPM is bad.
     """
     data = state.data
     read, orbits = data.pick(state.at.read), data.pick(data.orbits)
@@ -157,10 +157,10 @@ def good_monitors(state: State, bad: float = BAD) -> Flags:
         rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
         for spared in (0.0, SPARED):
             rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
-            rms[gain < 0.2] = np.inf  # reversed, until gains come in
-            read_at_all = count > 0  # what was never read says nothing of the other plane
+            rms[gain < 0.2] = np.inf  # reversed, until gains are fitted
+            read_at_all = count > 0  # a plane may have no readings
             typical = max(np.median(rms[read_at_all]), rounded) if read_at_all.any() else np.inf
-            # else the fit is astray, not half of the monitors
+            # otherwise the fit has diverged, and BPMs are not bad
             share = rms / typical if np.isfinite(typical) else np.zeros_like(rms)
             own = np.minimum(own, np.where(read_at_all, share, 0.0))
         ratio = np.maximum(ratio, own)
@@ -168,13 +168,12 @@ def good_monitors(state: State, bad: float = BAD) -> Flags:
 
 
 def sound_monitors(state: State) -> Flags:
-    """Those that read what is likely in both planes, [monitor]."""
+    """Return the BPMs that agree with the others in both planes, [monitor]."""
     return good_monitors(state) & _good_across(state)
 
 
 def _good_across(state: State) -> Flags:
-    """Those that read in the other plane what is usual, their own gains apart, once skew gradients
-    and rolls say what that is."""
+    """The good BPMs in the plane that is not kicked, given gains and fitted skew gradients."""
     data = state.data
     good = np.ones(data.shape[1], dtype=bool)
     if not state.allows(COUPLING):
@@ -194,12 +193,12 @@ def _good_across(state: State) -> Flags:
 
 
 def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
-    """What each monitor leaves with a gain of its own, rms, m; the gain, over those that it has;
-    and of how many readings, [monitor].
+    """The rms residual of each BPM given its own gain, m; that gain, relative to the fitted one;
+    and the number of readings, [monitor].
 
     Args:
-        read, orbits: by the model and measured, m, [column, monitor].
-        spared: share of a monitor's readings, its worst ones, that do not count.
+        read, orbits: of the model and measured, m, [column, monitor].
+        spared: share of a BPM's readings, the largest residuals, that is omitted.
     """
     seen = np.isfinite(orbits)
     if spared:
