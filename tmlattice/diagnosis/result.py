@@ -202,7 +202,7 @@ class Diagnosis(Speaks):
         noise_estimated: whether it comes from the data.
         provenance: package, lattice, options as used, seed, seconds.
         ring: the design.
-        repaired: the estimated ring: the design with the identified causes
+        corrected: the estimated ring: the design with the identified causes
             in it; monitors and correctors are in `calibration`. See `as_found` and `repair`.
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
@@ -219,8 +219,8 @@ class Diagnosis(Speaks):
         hypotheses: effects that may be missing, with scores; None: not tested.
         suspects: first places to inspect for an undetected fault.
         dispersion: additional to that of the estimated ring, for `write_calibration`.
-        rejected: channels that the model cannot describe: (monitor, "x" or "y"), or (corrector,
-            None).
+        rejected_channels: those that the model cannot describe: (monitor, "x" or "y"), or
+            (corrector, None).
         compared: blocks of readings with their prediction by the result.
         correlations: pairs of amounts that the data hardly separate.
         covariance: of the amounts of the causes, [cause, cause]; None where none is stated, as of
@@ -509,7 +509,7 @@ class Diagnosis(Speaks):
         }
 
     def as_json(self) -> dict[str, Any]:
-        """The result in the format `tmlattice-diagnosis`, version 1 (see `schemas/`)."""
+        """The result in the format `tmlattice-diagnosis`, version 2 (see `schemas/`)."""
         from tmlattice import __version__
 
         return {

@@ -1,8 +1,8 @@
 """Families of errors of a hierarchical fit of an orbit response: each is one object.
 
 To add one, write a class with its places, prior and derivatives, and with how its values enter the
-errors and are reported as causes (`family.Family`; those of fields in the ring are in `fields`, of
-the beam's energy in `energy`). Add it to `STEPS`, which is the order of the trials.
+errors and are reported as causes (`family.Family`; those of fields in the ring are in `fields`).
+Add it to `STEPS`, which is the order of the trials.
 
 Families with the same numbers (single gradients, and gradients of whole families) share a
 `variable`: their priors add up.
