@@ -1,6 +1,5 @@
 """`tmlattice dev challenge`: the diagnosis checked on data whose cause is withheld."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +10,11 @@ from tmlattice.cli.options import (
     Careful,
     background_option,
     console,
+    is_quiet,
     jobs_option,
     json_option,
-    quiet_option,
+    outputs,
+    seed_option,
     table,
 )
 
@@ -38,17 +39,11 @@ def challenge() -> None:
     """Check the diagnosis on data whose cause is withheld: make cases, run, score."""
 
 
-def _cluster_options(function: Any) -> Any:
-    for decorate in (
-        jobs_option,
-        click.option(
-            "--lattice",
-            metavar="FILE.py",
-            help="The challenge's lattice where it is Python code: named here, it is run.",
-        ),
-    ):
-        function = decorate(function)
-    return function
+code_option = click.option(
+    "--lattice",
+    metavar="FILE.py",
+    help="The challenge's lattice where it is Python code: named here, it is run.",
+)
 
 
 @challenge.command("make")
@@ -57,12 +52,10 @@ def _cluster_options(function: Any) -> Any:
     metavar="A|B|C|D|E|R|T|P|M",
     type=click.Choice(list("ABCDERTPM"), case_sensitive=False),
 )
-@click.option("--cases", type=click.IntRange(1), default=300, show_default=True, help="How many.")
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all that is drawn."
-)
+@click.option("--cases", type=click.IntRange(1), default=300, help="How many.")
+@seed_option("Of all that is drawn.")
 @click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
-@click.option("--lattice", default="petra3", show_default=True, help="Built-in name or path.")
+@click.option("--lattice", default="petra3", help="Built-in name or path.")
 @click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
 @click.option(
     "--learnt",
@@ -82,17 +75,14 @@ def _cluster_options(function: Any) -> Any:
     "--shots",
     type=click.IntRange(1),
     default=4,
-    show_default=True,
     help="Of the fit; two more are held out.",
 )
 @click.option("--effect", "effects", multiple=True, help="Draw from these alone (repeat).")
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
 @background_option("Tiers B, E, R, T, P and M: distributed errors")
-@quiet_option
 def make(
     tier: str,
     folder: Path,
-    quiet: bool,
     effects: tuple[str, ...],
     background: tuple[tuple[str, float | None], ...],
     **options: Any,
@@ -107,27 +97,25 @@ def make(
 
     lost = make_cases(
         tier.upper(), folder=folder, effects=effects or None, background=dict(background),
-        progress=not quiet, **options,
+        progress=not is_quiet(), **options,
     )  # fmt: skip
-    if not quiet:
-        screen = console()
-        screen.print(f"{options['cases']} cases of tier {tier.upper()} in {folder}")
-        if lost:
-            rows = ", ".join(f"{name} {count}" for name, count in sorted(lost.items()))
-            screen.print(f"drawn anew, for no amount has the signal to noise asked for: {rows}")
+    screen = console()
+    screen.print(f"{options['cases']} cases of tier {tier.upper()} in {folder}")
+    if lost:
+        rows = ", ".join(f"{name} {count}" for name, count in sorted(lost.items()))
+        screen.print(f"drawn anew, for no amount has the signal to noise asked for: {rows}")
 
 
 @challenge.command("run")
 @click.argument("folder", type=FILE)
-@_cluster_options
-@quiet_option
+@code_option
+@jobs_option
 @click.pass_context
 def run(
     context: click.Context,
     folder: Path,
     workers: dict[str, Any],
     lattice: str | None,
-    quiet: bool,
 ) -> None:
     """Diagnose every case in FOLDER that has no result yet; the truth is not read.
 
@@ -135,13 +123,12 @@ def run(
     """
     from tmlattice.challenge import run as run_cases
 
-    results = run_cases(folder, progress=not quiet, lattice=lattice, **workers)
+    results = run_cases(folder, progress=not is_quiet(), lattice=lattice, **workers)
     failed = {name: result["error"] for name, result in results.items() if "error" in result}
-    if not quiet:
-        screen = console()
-        screen.print(f"{len(results) - len(failed)} of {len(results)} cases diagnosed")
-        for name, error in failed.items():
-            screen.print(f"case {name}: {error}")
+    screen = console()
+    screen.print(f"{len(results) - len(failed)} of {len(results)} cases diagnosed")
+    for name, error in failed.items():
+        screen.print(f"case {name}: {error}")
     if failed:
         context.exit(FAILED)
 
@@ -152,12 +139,11 @@ def run(
 @click.option(
     "--oracle/--no-oracle",
     default=True,
-    show_default=True,
     help="With the oracle and plain baselines, some seconds a case the first time.",
 )
-@_cluster_options
+@code_option
+@jobs_option
 @json_option
-@quiet_option
 def score(
     folder: Path,
     out: Path | None,
@@ -165,25 +151,20 @@ def score(
     workers: dict[str, Any],
     lattice: str | None,
     json_file: Path | None,
-    quiet: bool,
 ) -> None:
     """Score the results in FOLDER against the truth, together with oracle and baselines."""
     from tmlattice.challenge import score as score_cases
-    from tmlattice.files import output_file, output_folder, write_json
 
-    with (
-        output_file(json_file) if json_file else nullcontext() as path,
-        output_folder(out) if out else nullcontext() as figures,
-    ):
-        result = score_cases(folder, oracle=oracle, progress=not quiet, lattice=lattice, **workers)
-        if path:
-            write_json(path, result)
+    with outputs(out, json_file) as (figures, write):
+        result = score_cases(
+            folder, oracle=oracle, progress=not is_quiet(), lattice=lattice, **workers
+        )
+        write(result)
         if figures:
             from tmlattice.plots.challenge import save_challenge
 
             save_challenge(result, figures)
-    if not quiet:
-        print_score(console(), result)
+    print_score(console(), result)
 
 
 def _share(rate: dict[str, Any] | None) -> str:
@@ -224,8 +205,10 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
             above = result["exact_above_10"].get(name)
             shown.add_row(METHODS[name], _share(result["exact"][name]), _share(above))
         screen.print(shown)
-    for title, methods in _method_tables(result):
-        _print_methods(screen, title, methods)
+    if "methods" in result:
+        _print_methods(screen, "signal to noise >= 10", result["methods"])
+        for name, methods in result["bands"].items():
+            _print_methods(screen, f"signal to noise {name}", methods)
     if "together" in result:
         for key, title in (("of_found_alone", "one kind"), ("of_none_alone", "none")):
             rate = result["together"][key]
@@ -268,13 +251,6 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
 
 def _plain(rate: dict[str, Any]) -> str:
     return "-" if rate["share"] is None else f"{rate['share']:.0%} of {rate['cases']}"
-
-
-def _method_tables(result: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    if "methods" not in result:
-        return []
-    bands = [(f"signal to noise {name}", entry) for name, entry in result["bands"].items()]
-    return [("signal to noise >= 10", result["methods"]), *bands]
 
 
 def _print_methods(screen: "Console", title: str, methods: dict[str, Any]) -> None:

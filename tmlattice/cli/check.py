@@ -12,9 +12,10 @@ from tmlattice.cli.options import (
     console,
     json_option,
     lattice_argument,
-    no_numbers,
+    named_data,
     open_ring,
-    quiet_option,
+    outputs,
+    radiation_option,
     read_data,
 )
 
@@ -28,9 +29,8 @@ WRONG = 1
 @lattice_argument
 @click.argument("measurement", type=FILE, required=False)
 @assume_option
-@click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
+@radiation_option
 @json_option
-@quiet_option
 @click.pass_context
 def check(
     context: click.Context,
@@ -39,7 +39,6 @@ def check(
     assumed: tuple[str, ...],
     radiation: bool,
     json_file: Path | None,
-    quiet: bool,
 ) -> None:
     """Check a measurement as a whole for errors of the data, in a second.
 
@@ -47,28 +46,17 @@ def check(
     stated ones; silent, frozen and copied monitors; and outliers. MEASUREMENT is a folder of any
     kind. The exit code is 0 if the data can be diagnosed, and 1 if they must be corrected first.
     """
-    from contextlib import nullcontext
-
-    from tmlattice.errors import MeasurementError, UnknownNameError
-    from tmlattice.files import output_file, write_json
-
-    with output_file(json_file) if json_file else nullcontext() as path:
+    with outputs(None, json_file) as (_, write):
         from tmlattice.diagnosis.data_checks import check_data
 
         ring = open_ring(lattice)
-        data, _ = read_data(measurement, ring, quiet)
-        try:
+        data, _ = read_data(measurement, ring)
+        with named_data(measurement):
             found = check_data(ring, data, assumed=assumed, radiation=radiation)
-        except (MeasurementError, UnknownNameError) as error:
-            raise MeasurementError(f"{measurement}: {error}") from error
-        except (ArithmeticError, AssertionError, ValueError, MemoryError) as error:
-            raise MeasurementError(f"{measurement}: {no_numbers(error)}") from error
-        if path:
-            document = found.as_json()
-            document["provenance"] = {**document["provenance"], "measurement": str(measurement)}
-            write_json(path, document)
-    if not quiet:
-        _print(found, json_file)
+        document = found.as_json()
+        document["provenance"] = {**document["provenance"], "measurement": str(measurement)}
+        write(document)
+    _print(found, json_file)
     if found.status == "wrong":
         context.exit(WRONG)
 

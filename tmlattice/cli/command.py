@@ -14,10 +14,10 @@ from typing import Any, NoReturn, TextIO
 import click
 
 from tmlattice import __version__
+from tmlattice.cli.challenge import challenge
 from tmlattice.cli.check import check
 from tmlattice.cli.compare import compare
 from tmlattice.cli.correct import correct
-from tmlattice.cli.dev import dev
 from tmlattice.cli.diagnose import diagnose
 from tmlattice.cli.effects import effects
 from tmlattice.cli.import_files import import_files
@@ -27,7 +27,9 @@ from tmlattice.cli.options import FILE, lattice_options
 from tmlattice.cli.predict import predict
 from tmlattice.cli.progress import stopped_in
 from tmlattice.cli.report import report
+from tmlattice.cli.reproduce import reproduce
 from tmlattice.cli.simulate import simulate
+from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit
 from tmlattice.errors import TmlatticeError, harmless
 
@@ -83,6 +85,12 @@ class Sections(click.Group):
                 formatter.write_dl(rows)
 
 
+dev = click.Group(
+    "dev",
+    commands=[study, challenge, reproduce],
+    help="Study the method: tune fits of many magnets, blind challenges, the paper's systems.",
+)
+
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
     "Describe": (info, init),
     "Measure": (simulate, import_files, check),
@@ -94,7 +102,11 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
 
 @click.group(
     cls=Sections,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "max_content_width": 100,
+        "show_default": True,
+    },
 )
 @click.version_option(__version__, prog_name="tmlattice")
 @click.option("--machine", "machines", type=FILE, multiple=True, metavar="FILE",

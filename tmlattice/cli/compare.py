@@ -1,19 +1,17 @@
 """`tmlattice compare`: what two diagnoses, two lattices or two orbit responses differ in."""
 
-from contextlib import nullcontext
 from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import Careful, console, json_option, quiet_option
+from tmlattice.cli.options import Careful, console, json_option, outputs
 
 
 @click.command("compare", cls=Careful)
 @click.argument("first", metavar="A")
 @click.argument("second", metavar="B")
 @json_option
-@quiet_option
-def compare(first: str, second: str, json_file: Path | None, quiet: bool) -> None:
+def compare(first: str, second: str, json_file: Path | None) -> None:
     """List what A and B differ in: two diagnoses, two lattices or two orbit responses.
 
     A and B are folders of `tmlattice diagnose --out` (or a diagnosis.json); built-in names or
@@ -21,15 +19,12 @@ def compare(first: str, second: str, json_file: Path | None, quiet: bool) -> Non
     taken as independent. Of a response each corrector's orbits are compared at the kick of A: rms
     of the difference, the rms that the noise alone makes, and the ratio of the two responses.
     """
-    from tmlattice.files import output_file, write_json
     from tmlattice.report.compare import compare as run
 
-    with output_file(json_file) if json_file else nullcontext() as path:
+    with outputs(None, json_file) as (_, write):
         found = run(first, second)
-        if path:
-            write_json(path, found.as_json())
-    if not quiet:
-        screen = console()
-        screen.print(found.report(), soft_wrap=True)
-        if json_file:
-            screen.print(f"written: {json_file}")
+        write(found.as_json())
+    screen = console()
+    screen.print(found.report(), soft_wrap=True)
+    if json_file:
+        screen.print(f"written: {json_file}")

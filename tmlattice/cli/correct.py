@@ -9,11 +9,14 @@ from tmlattice.cli.options import (
     FILE,
     HINT,
     OfMachine,
+    Word,
     console,
     json_option,
     machine_file,
+    named_number,
     open_ring,
-    quiet_option,
+    outputs,
+    require,
 )
 from tmlattice.cli.progress import tell
 
@@ -23,25 +26,13 @@ if TYPE_CHECKING:
 KINDS = "supplies, quadrupoles, skew_quadrupoles, correctors, sextupoles, rf"
 
 
-class TargetText(click.ParamType):  # type: ignore[type-arg]
-    """NAME or NAME=TOLERANCE."""
+def _target(text: str) -> tuple[str, float | None]:
+    name, tolerance = named_number(text)
+    require(tolerance is None or 0 < tolerance < float("inf"))
+    return name, tolerance
 
-    name = "NAME[=TOLERANCE]"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, float | None]:
-        """Target and tolerance, or None for the usual one."""
-        if isinstance(value, tuple):
-            return value
-        name, _, text = str(value).partition("=")
-        try:
-            tolerance = float(text) if text else None
-        except ValueError:
-            tolerance = -1.0
-        if tolerance is not None and not 0 < tolerance < float("inf"):
-            self.fail(f"'{text}' is no tolerance; give for example {name}=0.01", param, ctx)
-        return name.strip(), tolerance
+TARGET = Word("NAME[=TOLERANCE]", _target, "'{2}' is no tolerance; give for example {1}=0.01")
 
 
 @click.command("correct", cls=OfMachine)
@@ -64,7 +55,7 @@ class TargetText(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--target",
     "targets",
-    type=TargetText(),
+    type=TARGET,
     multiple=True,
     help="Repeat for more: beta_beating, phase_advance, dispersion, tunes, chromaticity, coupling, "
     "closed_orbit, with the rms error that is tolerated; or first_turn alone, which threads a beam "
@@ -84,7 +75,6 @@ class TargetText(click.ParamType):  # type: ignore[type-arg]
     metavar="DIR",
     help="Folder for settings.csv, statements of MAD-X, AT and elegant, report.html.",
 )
-@quiet_option
 def correct(
     estimated: Path,
     design: str | None,
@@ -94,7 +84,6 @@ def correct(
     example_file: Path | None,
     json_file: Path | None,
     out: Path | None,
-    quiet: bool,
 ) -> None:
     """Settings of power supplies that bring the ESTIMATED ring to the design, with their gain.
 
@@ -102,18 +91,14 @@ def correct(
     uncertainties next to it, or the folder of `diagnose --out` with it. Predicted rms errors have
     68 % intervals. A correction whose expected gain is below its error changes no setting.
     """
-    from contextlib import ExitStack
-
     from tmlattice.correction import correct as run
     from tmlattice.correction.estimate import read_estimate
     from tmlattice.correction.knobs import write_knobs
-    from tmlattice.files import output_file, output_folder, write_json
+    from tmlattice.files import output_file
     from tmlattice.report.correction_texts import correction_text
     from tmlattice.report.speaking import write_correction
 
-    with ExitStack() as files:
-        folder = files.enter_context(output_folder(out)) if out else None
-        extra = files.enter_context(output_file(json_file)) if json_file else None
+    with outputs(out, json_file) as (folder, write):
         path, named = _sources(estimated)
         machine = machine_file()
         start = design or named or (machine.lattice_name() if machine else None)
@@ -133,17 +118,15 @@ def correct(
         found = run(estimate, goal=wanted, knobs=devices, progress=tell, **options)
         if folder:
             write_correction(found, folder)
-        if extra:
-            write_json(extra, found.as_json())
-    if not quiet:
-        screen = console()
-        screen.print(correction_text(found, min(screen.width, 120)), soft_wrap=True)
-        for sentence in said:
-            screen.print(f"\nNote: {sentence}.", soft_wrap=True)
-        written = [f"{out}/: report.html, settings.csv, ..."] if out else []
-        written += [str(json_file)] if json_file else []
-        if written:
-            screen.print(f"\nwritten: {'; '.join(written)}", soft_wrap=True)
+        write(found.as_json())
+    screen = console()
+    screen.print(correction_text(found, min(screen.width, 120)), soft_wrap=True)
+    for sentence in said:
+        screen.print(f"\nNote: {sentence}.", soft_wrap=True)
+    written = [f"{out}/: report.html, settings.csv, ..."] if out else []
+    written += [str(json_file)] if json_file else []
+    if written:
+        screen.print(f"\nwritten: {'; '.join(written)}", soft_wrap=True)
 
 
 def _sources(estimated: Path) -> tuple[Path, str | None]:

@@ -2,7 +2,6 @@
 
 import logging
 import warnings
-from contextlib import ExitStack
 from dataclasses import replace
 from math import isfinite
 from pathlib import Path
@@ -12,17 +11,19 @@ import click
 
 from tmlattice.cli.options import (
     FILE,
-    NameList,
+    NAMES,
     OfMachine,
     assume_option,
     background_option,
     console,
     json_option,
     lattice_argument,
-    no_numbers,
+    named_data,
     open_ring,
-    quiet_option,
+    outputs,
+    radiation_option,
     read_data,
+    seed_option,
 )
 from tmlattice.cli.progress import tell
 
@@ -69,7 +70,7 @@ log = logging.getLogger(__name__)
 )
 @click.option(
     "--effects",
-    type=NameList(),
+    type=NAMES,
     help="Look for these alone, or of an orbit response fit families of these alone; else for all "
     "usual ones (`tmlattice effects`).",
 )
@@ -84,14 +85,8 @@ log = logging.getLogger(__name__)
     is_flag=True,
     help="Of an orbit response: weigh on held-out readings which effect the result still lacks.",
 )
-@click.option("--radiation", is_flag=True, help="The model radiates in bends and wigglers.")
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Of the split, the threshold's simulation and the bootstrap.",
-)
+@radiation_option
+@seed_option("Of the split, the threshold's simulation and the bootstrap.")
 @click.option(
     "--lattice-out",
     type=FILE,
@@ -115,7 +110,6 @@ log = logging.getLogger(__name__)
     metavar="DIR",
     help="Folder for diagnosis.json, report.html, report.txt and the figures.",
 )
-@quiet_option
 def diagnose(
     lattice: str,
     measurements: tuple[Path, ...],
@@ -130,7 +124,6 @@ def diagnose(
     assumed: tuple[str, ...],
     json_file: Path | None,
     out: Path | None,
-    quiet: bool,
     **options: Any,
 ) -> None:
     """Find where the ring differs from LATTICE, by which effect, and how far the misfit shrinks.
@@ -144,11 +137,7 @@ def diagnose(
     an orbit response alone has a step for each family of errors; options about launches do not
     apply to it.
     """
-    from tmlattice.files import output_file, output_folder
-
-    with ExitStack() as files:
-        folder = files.enter_context(output_folder(out)) if out else None
-        extra = files.enter_context(output_file(json_file)) if json_file else None
+    with outputs(out, json_file) as (folder, write):
         from tmlattice.correction.applied import applied, read_settings
         from tmlattice.correction.applied import sentence as of_device
         from tmlattice.effects import background_rms, names
@@ -159,10 +148,11 @@ def diagnose(
         if settings_file and not references:
             raise click.UsageError("--settings needs the measurement from before: --reference")
         asked = read_settings(settings_file) if settings_file else {}
+        from tmlattice.diagnosis import diagnose as run
         from tmlattice.measurement import Measurement, OrbitResponse
 
         ring = open_ring(lattice)
-        (data, said), (before, _) = (_read(p, ring, quiet) for p in (measurements, references))
+        (data, said), (before, _) = (_read(p, ring) for p in (measurements, references))
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more
         turns = isinstance(first, Measurement) and not more
@@ -193,10 +183,8 @@ def diagnose(
         for option, path in (("lattice", lattice_out), ("corrected", corrected_out)):
             if path:
                 _check_out(ring, f"--{option}-out", path)
-        where = " or ".join(str(path) for path in (*measurements, *references))
-        result = _diagnosed(
-            ring, data, where, effects=effects, assume=assumed, progress=tell, **options
-        )
+        with named_data(" or ".join(str(path) for path in (*measurements, *references))):
+            result = run(ring, data, effects=effects, assume=assumed, progress=tell, **options)
         reading = None
         if network:
             assert isinstance(first, Measurement)
@@ -217,21 +205,25 @@ def diagnose(
         calibrations = applied(result, asked) if asked else []
         if calibrations:
             source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]
-        _write(result, source, folder, extra, correction)
+        document = result.as_json()
+        document["provenance"] = {**document["provenance"], **source}
+        if folder:
+            from tmlattice.report.speaking import write_files
+
+            tell("figures")
+            write_files(result, folder, document, correction)
+        write(document)
         written = _write_rings(result, known, lattice_out, corrected_out)
         if folder and reading:
             _write_weights(reading, folder)
-    if not quiet:
-        _print(result, correction, out, json_file, written)
-        for own in calibrations:
-            console().print(of_device(own), soft_wrap=True)
-        if reading:
-            _print_weights(ring, reading)
+    _print(result, correction, out, json_file, written)
+    for own in calibrations:
+        console().print(of_device(own), soft_wrap=True)
+    if reading:
+        _print_weights(ring, reading)
 
 
-def _read(
-    paths: tuple[Path, ...], ring: "Ring", quiet: bool
-) -> "tuple[dict[str, Measured], list[str]]":
+def _read(paths: tuple[Path, ...], ring: "Ring") -> "tuple[dict[str, Measured], list[str]]":
     """Measurements by the names of their folders, by the whole path where two have one name; and
     what was assumed of files that are none.
 
@@ -246,7 +238,7 @@ def _read(
     found: dict[str, Measured] = {}
     said: list[str] = []
     for name, path in zip(names, paths, strict=True):
-        found[str(path) if twice else name], own = read_data(path, ring, quiet)
+        found[str(path) if twice else name], own = read_data(path, ring)
         said += own
     return found, said
 
@@ -278,25 +270,6 @@ def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
             stacklevel=2,
         )
     return None
-
-
-def _write(
-    result: "Diagnosis",
-    source: dict[str, Any],
-    folder: Path | None,
-    extra: Path | None,
-    correction: "Correction | None",
-) -> None:
-    """What was asked for."""
-    from tmlattice.files import write_json
-
-    document = result.as_json()
-    document["provenance"] = {**document["provenance"], **source}
-    if folder:
-        tell("figures")
-        _write_folder(result, folder, document, correction)
-    if extra:
-        write_json(extra, document)
 
 
 def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Correction | None":
@@ -418,28 +391,6 @@ def _print_weights(ring: "Ring", reading: "WeightReading") -> None:
         f"their error, at {score.name} (s = {score.s:.2f} m)",
         soft_wrap=True,
     )
-
-
-def _diagnosed(ring: Any, data: Any, where: str, **options: Any) -> "Diagnosis":
-    """The diagnosis; an error of the data names their folder."""
-    from tmlattice.diagnosis import diagnose as run
-    from tmlattice.errors import MeasurementError, UnknownNameError
-
-    try:
-        return run(ring, data, **options)
-    except (MeasurementError, UnknownNameError) as error:
-        raise MeasurementError(f"{where}: {error}") from error
-    except (ArithmeticError, AssertionError, ValueError, MemoryError) as error:  # singular, lost
-        log.info("the numbers of a measurement", exc_info=True)
-        raise MeasurementError(f"{where}: {no_numbers(error)}") from error
-
-
-def _write_folder(
-    result: "Diagnosis", folder: Path, document: dict[str, Any], correction: "Correction | None"
-) -> None:
-    from tmlattice.report.speaking import write_files
-
-    write_files(result, folder, document, correction)
 
 
 LINES = 34

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from tmlattice.cli.options import FILE, OfMachine, console, machine_file, open_ring, quiet_option
+from tmlattice.cli.options import FILE, OfMachine, console, machine_file, open_ring
 
 if TYPE_CHECKING:
     from tmlattice.importers import Imported
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     "--iteration",
     type=click.Choice(["first", "last"]),
     default="first",
-    show_default=True,
     help="Of a LOCO fit: the model before the fit, with the parameters of the first iteration; or "
     "the fitted lattice, with those of the last.",
 )
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
 )
 @click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
-@quiet_option
 def import_files(
     files: tuple[Path, ...],
     out: Path,
@@ -63,7 +61,6 @@ def import_files(
     example: bool,
     keep_bad: bool,
     force: bool,
-    quiet: bool,
 ) -> None:
     """Bring measured data in: a measurement folder of FILES of other programs.
 
@@ -78,7 +75,7 @@ def import_files(
             raise click.UsageError("--example writes templates and reads no FILES")
         machine = machine_file()
         own = machine.lattice_name() if machine is not None and machine.lattice else "petra3"
-        _example(lattice or own, out, quiet)
+        _example(lattice or own, out)
         return
     if not files:
         raise click.UsageError("name the FILES to import, or --example for a template of each")
@@ -102,11 +99,10 @@ def import_files(
         )
     brought = bring_in(files, options)
     write_imported(brought, out, force)
-    if not quiet:
-        _print(brought, out)
+    _print(brought, out)
 
 
-def _example(lattice: str, out: Path, quiet: bool) -> None:
+def _example(lattice: str, out: Path) -> None:
     from tmlattice.effects import Cause
     from tmlattice.importers.example import FILES, write_example
     from tmlattice.lattice import middle_of_first_arc
@@ -117,8 +113,6 @@ def _example(lattice: str, out: Path, quiet: bool) -> None:
     write_example(
         out, lattice, ring, simulate(ring, [fault], shots=6, engine="ocelot").measurement()
     )
-    if quiet:
-        return
     screen = console()
     for name, what in FILES.items():
         screen.print(f"{out / name}: {what}", soft_wrap=True)

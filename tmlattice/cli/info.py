@@ -11,7 +11,7 @@ from tmlattice.cli.options import (
     json_option,
     lattice_argument,
     open_ring,
-    quiet_option,
+    outputs,
     table,
 )
 
@@ -22,19 +22,12 @@ if TYPE_CHECKING:
 @click.command("info", cls=WithDefault)
 @lattice_argument
 @json_option
-@quiet_option
-def info(lattice: str, json_file: Path | None, quiet: bool) -> None:
+def info(lattice: str, json_file: Path | None) -> None:
     """Print counts, length, tunes, chromaticity and betas of LATTICE."""
-    from contextlib import nullcontext
-
-    from tmlattice.files import output_file, write_json
-
-    with output_file(json_file) if json_file else nullcontext() as path:
+    with outputs(None, json_file) as (_, write):
         facts = _facts(open_ring(lattice, read=False))
-        if path:
-            write_json(path, facts)
-    if not quiet:
-        _print(facts)
+        write(facts)
+    _print(facts)
 
 
 def _facts(ring: "Ring") -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, checked_ring, console, quiet_option, stated_options
+from tmlattice.cli.options import FILE, Careful, checked_ring, console, stated_options
 
 if TYPE_CHECKING:
     from tmlattice.lattice import Ring
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 @click.argument("lattice", required=False)
 @click.argument("measurement", metavar="[DATA]", type=FILE, required=False)
 @click.option("--force", is_flag=True, help="Replace a machine file that is there.")
-@quiet_option
 @click.pass_context
 def init(
     context: click.Context,
@@ -25,7 +24,6 @@ def init(
     lattice: str | None,
     measurement: Path | None,
     force: bool,
-    quiet: bool,
 ) -> None:
     """Write the machine file tmlattice.toml, or that of --machine, of LATTICE and of DATA.
 
@@ -60,8 +58,6 @@ def init(
     )  # fmt: skip
     with output_file(path) as file:
         file.write_text(text, encoding="utf-8")
-    if quiet:
-        return
     counts = ring.counts()
     correctors = counts.get("hcorrector", 0) + counts.get("vcorrector", 0)
     screen = console()

@@ -1,10 +1,11 @@
 """Options that several commands share."""
 
-import functools
+import logging
 import os
 import re
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,81 +19,86 @@ if TYPE_CHECKING:
 
     from tmlattice.lattice import Ring
     from tmlattice.machine_file import MachineFile
-    from tmlattice.measurement import AnyMeasurement, Measurement
+    from tmlattice.measurement import AnyMeasurement
+
+log = logging.getLogger(__name__)
 
 FILE = click.Path(path_type=Path)
 
 
-class Launch(click.ParamType):  # type: ignore[type-arg]
-    """A launch as one word."""
+class Word(click.ParamType):  # type: ignore[type-arg]
+    """A word of the command line that a function reads.
 
-    name = "x,px,y,py"
+    Args:
+        name: of the type, in the help.
+        read: of the word; ValueError where it cannot be read.
+        refusal: the message then; {0} is the word, {1} and {2} its parts around the first "=".
+    """
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        """Four finite numbers."""
-        if isinstance(value, tuple):
+    def __init__(self, name: str, read: Callable[[str], Any], refusal: str) -> None:
+        self.name, self.read, self.refusal = name, read, refusal
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read it; a default that is no text is taken as it is."""
+        if not isinstance(value, str):
             return value
         try:
-            numbers = tuple(float(part) for part in str(value).split(","))
+            return self.read(value)
         except ValueError:
-            numbers = ()
-        if len(numbers) != 4 or not all(abs(n) < float("inf") for n in numbers):
-            say = "is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0"
-            self.fail(f"'{value}' {say}", param, ctx)
-        return numbers
+            name, _, rest = value.partition("=")
+            self.fail(self.refusal.format(value, name, rest), param, ctx)
 
 
-class BackgroundText(click.ParamType):  # type: ignore[type-arg]
-    """NAME or NAME=RMS."""
+def require(condition: bool) -> None:
+    """Refuse a word."""
+    if not condition:
+        raise ValueError
 
-    name = "NAME[=RMS]"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, float | None]:
-        """Effect and rms, or None for the catalogue's."""
-        if isinstance(value, tuple):
-            return value
-        name, _, size = str(value).partition("=")
-        try:
-            return name.strip(), float(size) if size else None
-        except ValueError:
-            self.fail(f"'{size}' is no rms; give for example {name}=1e-3", param, ctx)
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    require(bool(names))
+    return names
+
+
+def _workers(text: str) -> dict[str, Any]:
+    """The option `jobs` or `scheduler` of `run_batch`."""
+    if ":" in text:
+        return {"scheduler": text}
+    require(int(text) > 0)
+    return {"jobs": int(text)}
+
+
+def named_number(text: str) -> tuple[str, float | None]:
+    """NAME or NAME=NUMBER."""
+    name, _, number = text.partition("=")
+    return name.strip(), float(number) if number else None
+
+
+NAMES = Word("NAME,NAME", _names, "give one name or more, separated by commas")
+WORKERS = Word("N|ADDRESS", _workers, "'{0}': give a number of processes, or tcp://HOST:PORT")
+BACKGROUND = Word("NAME[=RMS]", named_number, "'{2}' is no rms; give for example {1}=1e-3")
 
 
 def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """`--background NAME[=RMS]`, repeated."""
     return click.option(
         "--background",
-        type=BackgroundText(),
+        type=BACKGROUND,
         multiple=True,
         help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
         "one, or `none`.",
     )
 
 
-class NameList(click.ParamType):  # type: ignore[type-arg]
-    """Names separated by commas."""
-
-    name = "NAME,NAME"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        """One name or more."""
-        if isinstance(value, tuple):
-            return value
-        names = tuple(name.strip() for name in str(value).split(",") if name.strip())
-        if not names:
-            self.fail("give one name or more, separated by commas", param, ctx)
-        return names
+def seed_option(purpose: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """`--seed N`."""
+    return click.option("--seed", type=click.IntRange(0), default=0, help=purpose)
 
 
 INPUTS = (
     "lattice", "measurement", "measurements", "references", "calibration", "settings_file",
-    "network", "files", "map_file", "estimated", "design", "goal", "knobs",
+    "settings", "network", "files", "estimated", "design", "goal", "knobs",
 )  # fmt: skip
 OUTPUTS = ("json_file", "truth", "out", "lattice_out", "corrected_out", "example_file")
 OF_MEASUREMENTS = ("measurement.json", "readings.csv", "response.csv", "tunes.csv")
@@ -252,7 +258,8 @@ def stated_options() -> dict[str, Any]:
 
 def is_quiet() -> bool:
     """Whether `--quiet` was given, anywhere on the command line."""
-    return bool(click.get_current_context().find_root().params.get("quiet"))
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.find_root().params.get("quiet"))
 
 
 def machine_file() -> "MachineFile | None":
@@ -307,15 +314,24 @@ def _identities(path: Path) -> set[Any]:
     return names if status is None else names | {(status.st_dev, status.st_ino)}
 
 
-def no_numbers(error: Exception) -> str:
-    """The message for data whose numbers end a calculation: singular, not finite, too many."""
-    from tmlattice.errors import plain
+@contextmanager
+def named_data(where: object) -> Iterator[None]:
+    """An error of the data names their folder; numbers that end a calculation (singular, not
+    finite, too many) are one."""
+    from tmlattice.errors import MeasurementError, UnknownNameError, plain
 
-    said = plain(str(error), 100) or type(error).__name__
-    return (
-        f"with these numbers nothing can be worked out ({said}); check launches, settings, noise "
-        "and readings for units and for values that are far off (`tmlattice check`)"
-    )
+    try:
+        yield
+    except (MeasurementError, UnknownNameError) as error:
+        raise MeasurementError(f"{where}: {error}") from error
+    except (ArithmeticError, AssertionError, ValueError, MemoryError) as error:  # singular, lost
+        log.info("the numbers of a measurement", exc_info=True)
+        reason = plain(str(error), 100) or type(error).__name__
+        raise MeasurementError(
+            f"{where}: with these numbers nothing can be worked out ({reason}); check launches, "
+            "settings, noise and readings for units and for values that are far off (`tmlattice "
+            "check`)"
+        ) from error
 
 
 def open_ring(lattice: str, read: bool = True) -> "Ring":
@@ -356,65 +372,44 @@ def checked_ring(lattice: str, options: Mapping[str, Any], read: bool = True) ->
 lattice_argument = click.argument("lattice", required=False)
 
 
-class Workers(click.ParamType):  # type: ignore[type-arg]
-    """A number of local processes, or the address of a Dask scheduler."""
-
-    name = "N|ADDRESS"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> dict[str, Any]:
-        """The option `jobs` or `scheduler` of `run_batch`."""
-        if isinstance(value, dict):
-            return value
-        if ":" in str(value):
-            return {"scheduler": str(value)}
-        try:
-            number = int(value)
-        except ValueError:
-            number = 0
-        if number < 1:
-            self.fail(f"'{value}': give a number of processes, or tcp://HOST:PORT", param, ctx)
-        return {"jobs": number}
-
-
 epochs_option = click.option(
-    "--epochs", type=click.IntRange(1), default=1000, show_default=True,
-    help="Gradient steps at most.",
-)  # fmt: skip
-
+    "--epochs", type=click.IntRange(1), default=1000, help="Gradient steps at most."
+)
 jobs_option = click.option(
-    "--jobs", "workers", type=Workers(), default={},
+    "--jobs", "workers", type=WORKERS, default={}, show_default=False,
     help="Local processes (else one a core), or the address of a Dask scheduler.",
 )  # fmt: skip
+assume_option = click.option(
+    "--assume", "assumed", multiple=True, metavar="NAME",
+    help="What is written down wrongly everywhere, such as x-reversed or launches-in-mm; it is "
+    "undone first. Repeat for more (docs: check).",
+)  # fmt: skip
+radiation_option = click.option(
+    "--radiation", is_flag=True, help="The model radiates in bends and wigglers."
+)
+json_option = click.option(
+    "--json", "json_file", type=FILE, metavar="FILE", help="Write the result as JSON."
+)
 
 
-def assume_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """--assume NAME, repeated."""
-    return click.option(
-        "--assume", "assumed", multiple=True, metavar="NAME",
-        help="What is written down wrongly everywhere, such as x-reversed or launches-in-mm; it is "
-        "undone first. Repeat for more (docs: check).",
-    )(function)  # fmt: skip
+@contextmanager
+def outputs(
+    folder: Path | None, json_file: Path | None
+) -> Iterator[tuple[Path | None, Callable[[Any], None]]]:
+    """What a command writes: all of it when it ends well, else nothing.
+
+    Yields the folder that is filled (None: none was asked for), and the function that writes the
+    result as JSON, where that was asked for.
+    """
+    from tmlattice.files import output_file, output_folder, write_json
+
+    with ExitStack() as files:
+        made = files.enter_context(output_folder(folder)) if folder else None
+        path = files.enter_context(output_file(json_file)) if json_file else None
+        yield made, lambda result: write_json(path, result) if path else None
 
 
-def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """--json FILE."""
-    return click.option("--json", "json_file", type=FILE, metavar="FILE",
-                        help="Write the result as JSON.")(function)  # fmt: skip
-
-
-def quiet_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`quiet`, which `--quiet` of the whole command line sets."""
-
-    @functools.wraps(function)
-    def run(*arguments: Any, **options: Any) -> Any:
-        return function(*arguments, quiet=is_quiet(), **options)
-
-    return run
-
-
-def read_data(path: Path, ring: "Ring", quiet: bool) -> "tuple[AnyMeasurement, tuple[str, ...]]":
+def read_data(path: Path, ring: "Ring") -> "tuple[AnyMeasurement, tuple[str, ...]]":
     """A measurement folder, or a file of another program, and what was assumed of it.
 
     The assumptions are printed too: nothing is taken for granted silently.
@@ -428,33 +423,17 @@ def read_data(path: Path, ring: "Ring", quiet: bool) -> "tuple[AnyMeasurement, t
     machine = machine_file()
     brought = bring_in([path], Options(ring=ring, told=None if machine is None else machine.told))
     said = (*brought.assumed, *brought.doubts)
-    if not quiet:
-        screen = console()
-        screen.print(f"{path}: {described(brought)}", soft_wrap=True)
-        for sentence in said:
-            screen.print(f"- {sentence}", soft_wrap=True)
-        screen.print()
+    screen = console()
+    screen.print(f"{path}: {described(brought)}", soft_wrap=True)
+    for sentence in said:
+        screen.print(f"- {sentence}", soft_wrap=True)
+    screen.print()
     return brought.measurement, said
 
 
-def trajectories(path: Path, refusal: str, ring: "Ring", quiet: bool) -> "Measurement":
-    """The first turns of a measurement folder, or of a file of readings; see `read_data`.
-
-    Raises:
-        MeasurementError: a measurement of another kind, with the command's message about it.
-    """
-    from tmlattice.errors import MeasurementError
-    from tmlattice.measurement import Measurement, in_words
-
-    data, _ = read_data(path, ring, quiet)
-    if not isinstance(data, Measurement):
-        raise MeasurementError(f"'{path}' is {in_words(data)}{refusal}")
-    return data
-
-
 def console() -> "Console":
-    """Where results are printed: as wide as the terminal, else 100 columns; names from files steer
-    nothing there."""
+    """Where results are printed: as wide as the terminal, else 100 columns; nowhere with `--quiet`.
+    Names from files steer nothing there."""
     from rich.console import Console
     from rich.text import Text
 
@@ -472,8 +451,9 @@ def console() -> "Console":
             clear()  # the progress line
             super().print(*objects, **options)
 
-    wide = Screen(highlight=False, markup=False)
-    return wide if wide.is_terminal else Screen(highlight=False, markup=False, width=100)
+    look: dict[str, Any] = {"highlight": False, "markup": False, "quiet": is_quiet()}
+    wide = Screen(**look)
+    return wide if wide.is_terminal else Screen(**look, width=100)
 
 
 def table(*columns: str) -> "Table":

@@ -10,7 +10,6 @@ from tmlattice.cli.options import (
     console,
     lattice_argument,
     open_ring,
-    quiet_option,
 )
 
 
@@ -30,16 +29,14 @@ from tmlattice.cli.options import (
     metavar="NAME",
     help="Predict this one; repeat for more. Else all.",
 )
-@click.option("--kick", type=float, default=1e-4, show_default=True, help="Of each, rad.")
+@click.option("--kick", type=float, default=1e-4, help="Of each, rad.")
 @click.option("--out", type=FILE, required=True, metavar="FILE", help="A table: .csv.")
-@quiet_option
 def predict(
     lattice: str,
     calibration: Path | None,
     correctors: tuple[str, ...],
     kick: float,
     out: Path,
-    quiet: bool,
 ) -> None:
     """Predict how the stored beam's orbit answers a kick of each corrector, at fixed RF frequency.
 
@@ -69,8 +66,7 @@ def predict(
         monitors = [monitor.name for monitor in ring.monitors]
         orbits = list(zip(columns.names, kick * response, strict=True))
         write_response_table(file, monitors, orbits)
-    if not quiet:
-        console().print(
-            f"{ring.name}: {len(columns.names)} correctors, {len(monitors)} monitors, kick "
-            f"{1e6 * kick:g} µrad\nwritten: {out}"
-        )
+    console().print(
+        f"{ring.name}: {len(columns.names)} correctors, {len(monitors)} monitors, kick "
+        f"{1e6 * kick:g} µrad\nwritten: {out}"
+    )

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, console, quiet_option
+from tmlattice.cli.options import FILE, Careful, console
 
 
 @click.command("report", cls=Careful)
@@ -12,8 +12,7 @@ from tmlattice.cli.options import FILE, Careful, console, quiet_option
 @click.option(
     "--out", type=FILE, metavar="DIR", help="Folder to write to; where none is named, FOLDER."
 )
-@quiet_option
-def report(result: Path, out: Path | None, quiet: bool) -> None:
+def report(result: Path, out: Path | None) -> None:
     """Render report.html and report.txt again from the diagnosis.json of FOLDER.
 
     FOLDER is that of `tmlattice diagnose --out`, or a diagnosis.json. Figures of the readings and
@@ -23,11 +22,10 @@ def report(result: Path, out: Path | None, quiet: bool) -> None:
     from tmlattice.report.speaking import render
 
     found = render(result, out)
-    if not quiet:
-        screen = console()
-        screen.print(report_text(found), soft_wrap=True)
-        folder = result if result.is_dir() else result.parent
-        if (folder / "correction.json").is_file():
-            screen.print("\nThe correction is not in the new page: see correction.txt.")
-        place = out or folder
-        screen.print(f"\nwritten: {place / 'report.html'}, {place / 'report.txt'}")
+    screen = console()
+    screen.print(report_text(found), soft_wrap=True)
+    folder = result if result.is_dir() else result.parent
+    if (folder / "correction.json").is_file():
+        screen.print("\nThe correction is not in the new page: see correction.txt.")
+    place = out or folder
+    screen.print(f"\nwritten: {place / 'report.html'}, {place / 'report.txt'}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, console, quiet_option
+from tmlattice.cli.options import FILE, console, is_quiet, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,12 +23,11 @@ SYSTEMS = ["free-fall", "lotka-volterra", "pendulum", "magnets", "cavitation"]
 
 @click.command("reproduce")
 @click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
-@click.option("--out", type=FILE, default="reproduce", show_default=True, metavar="DIR",
+@click.option("--out", type=FILE, default="reproduce", metavar="DIR",
               help="Folder for the figures and reproduction.json.")  # fmt: skip
 @click.option("--small", is_flag=True,
               help="Fewer networks, a gentler collapse: seconds, not minutes.")  # fmt: skip
-@quiet_option
-def reproduce(systems: tuple[str, ...], out: Path, small: bool, quiet: bool) -> None:
+def reproduce(systems: tuple[str, ...], out: Path, small: bool) -> None:
     """Reproduce the paper's SYSTEMS (all, where none is named): table and figures.
 
     Every number under "here" is computed anew; those under "paper" are as printed there.
@@ -46,17 +45,16 @@ def reproduce(systems: tuple[str, ...], out: Path, small: bool, quiet: bool) -> 
         entries = []
         for name in chosen:
             begin = perf_counter()
-            rows, figure = _RUN[name](small, not quiet)
+            rows, figure = _RUN[name](small, not is_quiet())
             figure.savefig(folder / f"{name}.png", dpi=150)
             plt.close(figure)
             entries.append({
                 "system": name,
                 "figure": f"{name}.png",
                 "seconds": perf_counter() - begin,
-                "rows": [row.as_json() for row in rows],
+                "rows": [vars(row) for row in rows],
             })  # fmt: skip
-            if not quiet:
-                _print(name, rows)
+            _print(name, rows)
         result = {
             "format": "tmlattice-reproduction",
             "version": 1,
@@ -65,9 +63,8 @@ def reproduce(systems: tuple[str, ...], out: Path, small: bool, quiet: bool) -> 
             "systems": entries,
         }
         write_json(folder / "reproduction.json", result)
-    if not quiet:
-        names = ", ".join(f"{name}.png" for name in chosen)
-        console().print(f"written: {out}/: {names}, reproduction.json")
+    names = ", ".join(f"{name}.png" for name in chosen)
+    console().print(f"written: {out}/: {names}, reproduction.json")
 
 
 def _free_fall(small: bool, progress: bool) -> "Reproduced":
@@ -125,14 +122,10 @@ _RUN: dict[str, Callable[[bool, bool], "Reproduced"]] = {
 
 
 def _print(name: str, rows: "list[Comparison]") -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    made = Table(box=SIMPLE_HEAD, pad_edge=False)
-    made.add_column(name, ratio=5)
-    made.add_column("paper", justify="right")
-    made.add_column("here", justify="right", ratio=3)
-    made.add_column("why they differ", ratio=4)
+    made = table(name, "paper", "here", "why they differ")
+    for column, ratio in zip(made.columns, (5, None, 3, 4), strict=True):
+        column.ratio = ratio
+    made.columns[-1].justify = "left"
     for row in rows:
         made.add_row(row.quantity, _text(row.paper), _text(row.here), row.why)
     console().print(made)

@@ -1,5 +1,6 @@
 """`tmlattice simulate`: a measurement whose cause is known."""
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -9,41 +10,43 @@ import click
 from tmlattice.cli.options import (
     FILE,
     WithDefault,
+    Word,
     background_option,
     console,
+    is_quiet,
     lattice_argument,
     machine_file,
     open_ring,
-    quiet_option,
+    require,
+    seed_option,
     table,
 )
-from tmlattice.cli.simulate_stored import KINDS, simulate_stored
+
+SHOTS = frozenset({"shots", "settings"})
+KINDS: Mapping[str, frozenset[str]] = {
+    "trajectory": SHOTS | {"turns", "amplitude", "radiation", "engine", "jobs"},
+    "orbit-response": frozenset({"correctors", "engine"}),
+    "turn-by-turn": SHOTS | {"turns", "amplitude", "radiation", "particles"},
+    "closed-orbit": SHOTS | {"radiation"},
+    "dispersion": frozenset(),
+    "tunes": SHOTS,
+}
+"""The options that a kind has in addition to those of all."""
+OF_ALL = frozenset({"background", "seed", "machine_seed", "noise"})
 
 
-class CauseText(click.ParamType):  # type: ignore[type-arg]
-    """ "NAME [ELEMENT] AMOUNT" as one word."""
+def _cause(text: str) -> tuple[str, str | None, float]:
+    """Effect, element or None, amount; an element's name may have blanks."""
+    words = text.split()
+    require(len(words) > 1)
+    return words[0], " ".join(words[1:-1]) or None, float(words[-1])
 
-    name = '"NAME [ELEMENT] AMOUNT"'
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, str | None, float]:
-        """Effect, element or None, amount."""
-        if isinstance(value, tuple):
-            return value
-        words = str(value).split()
-        try:
-            amount = float(words[-1])
-        except (ValueError, IndexError):
-            words = []
-        if len(words) < 2:  # NAME AMOUNT; ELEMENT may have blanks
-            self.fail(
-                f"'{value}' is no effect; give NAME [ELEMENT] AMOUNT in quotes, such as "
-                "\"quadrupole_gradient qd::12 -0.2\" ('tmlattice effects' lists the names)",
-                param,
-                ctx,
-            )
-        return words[0], " ".join(words[1:-1]) or None, amount
+CAUSE = Word(
+    '"NAME [ELEMENT] AMOUNT"', _cause,
+    "'{0}' is no effect; give NAME [ELEMENT] AMOUNT in quotes, such as "
+    "\"quadrupole_gradient qd::12 -0.2\" ('tmlattice effects' lists the names)",
+)  # fmt: skip
 
 
 @click.command("simulate", cls=WithDefault)
@@ -51,7 +54,7 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--effect",
     "effects",
-    type=CauseText(),
+    type=CAUSE,
     multiple=True,
     help="What is wrong with the machine; repeat for more.",
 )
@@ -60,7 +63,6 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     "--kind",
     type=click.Choice(list(KINDS)),
     default="trajectory",
-    show_default=True,
     help="First turns; or of the stored beam: its orbit for steps of the correctors and of the RF, "
     "its turns after a kick, its orbit, its orbit for a step of the RF, its tunes.",
 )
@@ -82,7 +84,6 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     "--amplitude",
     type=click.FloatRange(0, min_open=True),
     default=1e-3,
-    show_default=True,
     help="Rms orbit over monitors and planes, m.",
 )
 @click.option(
@@ -95,30 +96,22 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     "--engine",
     type=click.Choice(["at", "ocelot"]),
     default="at",
-    show_default=True,
     help="Thick symplectic tracking, or second-order maps.",
 )
 @click.option("--radiation", is_flag=True, help="Bends and wigglers radiate.")
 @click.option(
     "--settings",
-    "settings_file",
     type=FILE,
     metavar="FILE",
     help="JSON: a list with the settings of each shot, as in the measurement format.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Of launches, settings and noise.",
-)
+@seed_option("Of launches, settings and noise.")
 @click.option(
     "--machine-seed",
     type=click.IntRange(0),
     help="Of the background; the same machine has the same one. Else the seed.",
 )
-@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option("--jobs", type=click.IntRange(1), default=1, help="Processes.")
 @click.option(
     "--corrector",
     "correctors",
@@ -130,7 +123,6 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     "--particles",
     type=click.IntRange(1),
     default=1,
-    show_default=True,
     help="Turn by turn: 1 is the middle of the beam; some hundreds decohere.",
 )
 @click.option("--out", type=FILE, required=True, metavar="DIR", help="The measurement folder.")
@@ -141,24 +133,17 @@ class CauseText(click.ParamType):  # type: ignore[type-arg]
     help="Write the causes there; never inside a measurement folder.",
 )
 @click.option("--force", is_flag=True, help="Replace a measurement that --out holds already.")
-@quiet_option
 @click.pass_context
 def simulate(
     context: click.Context,
     /,
     lattice: str,
     effects: tuple[tuple[str, str | None, float], ...],
-    background: tuple[tuple[str, float | None], ...],
     kind: str,
-    settings_file: Path | None,
     jobs: int,
-    noise: float | None,
-    correctors: tuple[str, ...],
     out: Path,
     truth: Path | None,
     force: bool,
-    quiet: bool,
-    particles: int,
     **options: Any,
 ) -> None:
     """Measure a machine whose errors are known.
@@ -172,8 +157,7 @@ def simulate(
     """
     from tmlattice.effects import Cause, find
     from tmlattice.files import output_file
-    from tmlattice.machine import simulate as run
-    from tmlattice.measurement import write_truth
+    from tmlattice.measurement import write_measurement, write_truth
     from tmlattice.measurement.write import check_free
 
     check_free(out, force)
@@ -182,51 +166,82 @@ def simulate(
     _check_options(context, kind)
     ring = open_ring(lattice)
     machine = machine_file()
-    if noise is None and machine is not None and kind in ("trajectory", "turn-by-turn"):
-        noise = machine.told.noise
+    if options["noise"] is None and machine is not None and kind in ("trajectory", "turn-by-turn"):
+        options["noise"] = machine.told.noise
     _warn_of_large(effects)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]
-    if kind != "trajectory":
-        chosen = {
-            **options, "background": dict(background), "correctors": correctors or None,
-            "noise": noise, "particles": particles,
-            "settings": _settings(settings_file),
-        }  # fmt: skip
-        for name in ("shots", "turns"):  # first turns' own defaults
-            if context.get_parameter_source(name) != click.core.ParameterSource.COMMANDLINE:
-                del chosen[name]
-        table_of, sentence, rms = simulate_stored(
-            kind, ring, causes, out, truth, force, quiet, chosen
-        )
-        if not quiet:
-            console().print(sentence)
-            _print_causes(ring, causes)
-            _print_background(rms)
-            _print_written(out, table_of, truth)
-        return
-    options["noise"] = 2e-5 if noise is None else noise
-    simulation = run(
-        ring,
-        causes,
-        background=dict(background),
-        settings=_settings(settings_file),
-        **options,
-    )
+    options["background"] = dict(options["background"])
+    options["correctors"] = options["correctors"] or None
+    options["settings"] = _settings(options["settings"])
+    options = {name: v for name, v in options.items() if name in OF_ALL | KINDS[kind]}
+    if options["noise"] is None:
+        del options["noise"]
+    for name in ("shots", "turns"):  # the command's defaults are those of first turns
+        if kind != "trajectory" and not _is_given(context, name):
+            options.pop(name, None)
     with ExitStack() as both:  # the folder and the truth, or neither
-        if truth is not None:
-            write_truth(both.enter_context(output_file(truth)), **simulation.truth())
-        simulation.write(out, jobs, progress=not quiet, force=force)
-    if quiet:
-        return
-    console().print(
-        f"{ring.name}: {options['shots']} shots of {options['turns']} turn(s), "
-        f"{len(ring.monitors)} monitors, {1e3 * options['amplitude']:g} mm rms, noise "
-        f"{1e6 * options['noise']:g} µm, engine {options['engine']}, seed {options['seed']}"
-    )
+        file = None if truth is None else both.enter_context(output_file(truth))
+        simulation, sentence = _run(kind, ring, causes, options)
+        if file is not None:
+            write_truth(file, **simulation.truth())
+        if kind == "trajectory":
+            simulation.write(out, jobs, progress=not is_quiet(), force=force)
+        else:
+            write_measurement(out, simulation.measured, force)
+    console().print(f"{ring.name}: {sentence}, seed {options['seed']}")
     _print_causes(ring, causes)
-    _print_background(simulation.background)
-    _print_written(out, "readings.csv", truth)
+    for name, rms in simulation.background.items():
+        console().print(f"background {name}: rms {rms:g} {find(name).unit}")
+    file_of = {"orbit-response": "response.csv", "tunes": "tunes.csv"}.get(kind, "readings.csv")
+    more = f"; {truth}" if truth else ""
+    console().print(f"written: {out}/: measurement.json, {file_of}{more}")
+
+
+def _run(kind: str, ring: Any, causes: list[Any], options: dict[str, Any]) -> tuple[Any, str]:
+    """The simulation, and what it measures in a line."""
+    from tmlattice.machine import simulate, stored_beam
+    from tmlattice.machine.response import simulate_response
+
+    monitors = f"{len(ring.monitors)} monitors"
+    made: Any
+    if kind == "trajectory":
+        made = simulate(ring, causes, **options)
+        return made, (
+            f"{options['shots']} shots of {options['turns']} turn(s), {monitors}, "
+            f"{1e3 * options['amplitude']:g} mm rms, noise {1e6 * made.machine.noise[0]:g} µm, "
+            f"engine {options['engine']}"
+        )
+    if kind == "orbit-response":
+        made = simulate_response(ring, causes, progress=not is_quiet(), **options)
+        rf = "" if made.measured.rf is None else f", RF step {made.measured.rf.step:g} Hz"
+        return made, (
+            f"{len(made.measured.correctors)} correctors, {monitors}, two-sided steps of "
+            f"{1e6 * abs(made.measured.kicks[0]):g} µrad{rf}, engine {options['engine']}"
+        )
+    if kind == "turn-by-turn":
+        made = stored_beam.simulate_turns(ring, causes, **options)
+        shots, turns = made.measured.readings.shape[:2]
+        return made, (
+            f"{shots} shots of {turns} turns of a stored beam, {monitors}, "
+            f"{1e3 * options['amplitude']:g} mm rms, {options['particles']} particle(s), engine at"
+        )
+    if kind == "closed-orbit":
+        made = stored_beam.simulate_orbits(ring, causes, **options)
+        return made, f"{len(made.measured.shots)} closed orbit(s), {monitors}, engine at"
+    if kind == "dispersion":
+        made = stored_beam.simulate_dispersion(ring, causes, **options)
+        (step,) = (one.step for one in made.measured.steps)
+        return made, f"{monitors}, a two-sided RF step of {step:g} Hz, engine at"
+    if "noise" in options:
+        options["noise"] = options["noise"], stored_beam.TUNE_NOISE[1]
+    made = stored_beam.simulate_tunes(ring, causes, **options)
+    return made, f"{len(made.measured.shots)} reading(s) of the tunes, engine at"
+
+
+def _is_given(context: click.Context, name: str) -> bool:
+    """Whether the command line states an option."""
+    return context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE
 
 
 def _check_options(context: click.Context, kind: str) -> None:
@@ -234,19 +249,12 @@ def _check_options(context: click.Context, kind: str) -> None:
     of_kinds = set().union(*KINDS.values())
     for option in context.command.params:
         name = option.name or ""
-        given = context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE
-        if given and name in of_kinds and name not in KINDS[kind]:
+        if _is_given(context, name) and name in of_kinds and name not in KINDS[kind]:
             kinds = [other for other, own in KINDS.items() if name in own]
             raise click.UsageError(
                 f"{option.opts[0]} has no meaning for --kind {kind}; take it out, or give "
                 f"--kind {' or '.join(kinds)}"
             )
-
-
-def _print_written(out: Path, table_of: str, truth: Path | None) -> None:
-    console().print(
-        f"written: {out}/: measurement.json, {table_of}" + (f"; {truth}" if truth else "")
-    )
 
 
 def _print_causes(ring: Any, causes: list[Any]) -> None:
@@ -261,13 +269,6 @@ def _print_causes(ring: Any, causes: list[Any]) -> None:
         unit = find(cause.effect).unit
         shown.add_row(cause.effect, place, places.get(place, "-"), f"{cause.amount:g}", unit)
     console().print(shown)
-
-
-def _print_background(background: Any) -> None:
-    from tmlattice.effects import find
-
-    for name, rms in background.items():
-        console().print(f"background {name}: rms {rms:g} {find(name).unit}")
 
 
 def _check_apart(truth: Path, out: Path) -> None:

@@ -1,6 +1,5 @@
 """`tmlattice dev study`: an experiment over many magnets."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +8,15 @@ import click
 from tmlattice.cli.options import (
     FILE,
     Careful,
+    Word,
     checked_ring,
     console,
     epochs_option,
+    is_quiet,
     jobs_option,
     json_option,
-    quiet_option,
+    outputs,
+    require,
     table,
 )
 
@@ -24,39 +26,28 @@ def study() -> None:
     """Run an experiment over many magnets."""
 
 
-class _Number(click.ParamType):  # type: ignore[type-arg]
-    """A number of magnets, or all of them (None)."""
+def _number(text: str) -> int | None:
+    """None: all of them."""
+    if text == "all":
+        return None
+    require(int(text) > 0)
+    return int(text)
 
-    name = "all|N"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> int | None:
-        """All, or one at least."""
-        if str(value) == "all":
-            return None
-        try:
-            number = int(value)
-        except ValueError:
-            number = 0
-        if number < 1:
-            self.fail(f"'{value}' is no number of magnets; give 'all' or 1, 2, ...", param, ctx)
-        return number
+NUMBER = Word("all|N", _number, "'{0}' is no number of magnets; give 'all' or 1, 2, ...")
 
 
 @study.command("tune-fit", cls=Careful)
 @click.argument("lattice", default="petra3")
 @click.option(
     "--magnets",
-    type=_Number(),
+    type=NUMBER,
     default="40",
-    show_default=True,
     help="Powered magnets, evenly spread over the ring.",
 )
 @click.option(
     "--methods",
     default="adam,map,sparse",
-    show_default=True,
     metavar="NAME,...",
     help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, told (sparse with "
     "the known magnet).",
@@ -65,7 +56,6 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     "--out",
     type=FILE,
     default="study-tune-fit",
-    show_default=True,
     metavar="DIR",
     help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",
 )
@@ -73,17 +63,14 @@ class _Number(click.ParamType):  # type: ignore[type-arg]
     "--change",
     type=float,
     default=-0.2,
-    show_default=True,
     help="Relative change of the magnet's strength.",
 )
 @epochs_option
 @jobs_option
-@quiet_option
 def tune_fit(
     lattice: str,
     methods: str,
     out: Path,
-    quiet: bool,
     workers: dict[str, Any],
     **options: Any,
 ) -> None:
@@ -93,7 +80,9 @@ def tune_fit(
     from tmlattice.fitting.study import study_tune_fit, summarise
 
     chosen = tuple(name.strip() for name in methods.split(","))
-    cases = study_tune_fit(lattice, chosen, progress=not quiet, folder=out, **workers, **options)
+    cases = study_tune_fit(
+        lattice, chosen, progress=not is_quiet(), folder=out, **workers, **options
+    )
     cases.sort(key=lambda case: (case.s, case.magnet, case.method, case.seed))
     summary = {
         "format": "tmlattice-study-tune-fit",
@@ -122,8 +111,7 @@ def tune_fit(
     with output_file(out / "study.json") as own:
         write_json(own, summary)
     _draw(lattice, cases, out)
-    if not quiet:
-        _print(summary)
+    _print(summary)
 
 
 @study.command("localisation", cls=Careful)
@@ -132,7 +120,6 @@ def tune_fit(
     "--cases",
     type=click.IntRange(1),
     default=40,
-    show_default=True,
     help="Faults, at random.",
 )
 @click.option(
@@ -140,7 +127,6 @@ def tune_fit(
     type=click.FloatRange(0, min_open=True),
     multiple=True,
     default=(20.0,),
-    show_default=True,
     help="Norm of the change of all readings over the noise, launch fitted; repeat for several.",
 )
 @click.option(
@@ -148,46 +134,33 @@ def tune_fit(
     type=click.IntRange(1),
     multiple=True,
     default=(1, 4),
-    show_default=True,
     help="Of a measurement; repeat for several.",
 )
 @epochs_option
 @json_option
-@quiet_option
 def localisation(
     lattice: str,
     json_file: Path | None,
-    quiet: bool,
     **options: Any,
 ) -> None:
     """The place of a gradient fault, as a network's raw and its normalised weights name it."""
     from tmlattice import __version__
     from tmlattice.challenge.localisation import study_localisation, summarise
-    from tmlattice.files import output_file, write_json
 
-    with output_file(json_file) if json_file else nullcontext() as path:
+    with outputs(None, json_file) as (_, write):
         ring = checked_ring(lattice, {})
-        cases = list(study_localisation(ring, progress=not quiet, **options))
+        cases = list(study_localisation(ring, progress=not is_quiet(), **options))
         rows = summarise(cases)
-        if path:
-            summary = {
-                "format": "tmlattice-study-localisation",
-                "version": 1,
-                "package": __version__,
-                "lattice": lattice,
-                "options": {name: _plain(value) for name, value in options.items()},
-                "summary": rows,
-                "results": [
-                    {name: _plain(value) for name, value in vars(case).items()} for case in cases
-                ],
-            }
-            write_json(path, summary)
-    if not quiet:
-        _print_localisation(rows)
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+        write({
+            "format": "tmlattice-study-localisation",
+            "version": 1,
+            "package": __version__,
+            "lattice": lattice,
+            "options": options,
+            "summary": rows,
+            "results": [vars(case) for case in cases],
+        })  # fmt: skip
+    _print_localisation(rows)
 
 
 def _print_localisation(rows: list[dict[str, Any]]) -> None:

@@ -1,7 +1,6 @@
 """`tmlattice tune-fit`: from one perturbed first-turn orbit to the tunes."""
 
 from collections.abc import Iterable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,16 +9,19 @@ from click.core import ParameterSource
 
 from tmlattice.cli.options import (
     FILE,
-    Launch,
     WithDefault,
+    Word,
     console,
     epochs_option,
+    is_quiet,
     json_option,
     lattice_argument,
     open_ring,
-    quiet_option,
+    outputs,
+    read_data,
+    require,
+    seed_option,
     table,
-    trajectories,
 )
 
 METHODS = ("adam", "sparse", "map")
@@ -29,7 +31,18 @@ if TYPE_CHECKING:
 
     from tmlattice.fitting import TuneFit
     from tmlattice.lattice import Ring
-    from tmlattice.measurement import Measurement
+
+
+def _launch(text: str) -> tuple[float, ...]:
+    numbers = tuple(map(float, text.split(",")))
+    require(len(numbers) == 4 and all(abs(number) < float("inf") for number in numbers))
+    return numbers
+
+
+LAUNCH = Word(
+    "x,px,y,py", _launch,
+    "'{0}' is no launch; give four numbers in m and rad, such as 1e-3,0,1e-3,0",
+)  # fmt: skip
 
 
 @click.command("tune-fit", cls=WithDefault)
@@ -51,7 +64,6 @@ if TYPE_CHECKING:
     "--out",
     type=FILE,
     default="tune-fit",
-    show_default=True,
     metavar="DIR",
     help="Folder for the figures, tune-fit.json and network.pt.",
 )
@@ -70,34 +82,24 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--launch",
-    type=Launch(),
+    type=LAUNCH,
     default="1e-3,0,1e-3,0",
-    show_default=True,
     help="State at the start of the ring, m and rad.",
 )
 @click.option(
     "--noise",
     type=click.FloatRange(0),
     default=2e-5,
-    show_default=True,
     help="Rms of one reading, m.",
 )
 @epochs_option
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Of the readings' noise.",
-)
+@seed_option("Of the readings' noise.")
 @json_option
-@quiet_option
 def tune_fit(
     lattice: str,
     measurement: Path | None,
     out: Path,
     json_file: Path | None,
-    quiet: bool,
     methods: tuple[str, ...],
     **options: Any,
 ) -> None:
@@ -114,33 +116,26 @@ def tune_fit(
     """  # fmt: skip
     if measurement is not None:
         _refuse_own_data(click.get_current_context())
-    from tmlattice.files import output_file, output_folder, write_json
+    from tmlattice.files import write_json
 
-    with ExitStack() as files:
-        folder = files.enter_context(output_folder(out))
-        extra = files.enter_context(output_file(json_file)) if json_file else None
+    with outputs(out, json_file) as (folder, write):
         options["methods"] = methods or METHODS
         from tmlattice.fitting import tune_fit as run
         from tmlattice.network import save_network
 
+        ring = open_ring(lattice)
         if measurement is None:
-            ring = open_ring(lattice)
-            outcome = run(ring, progress=not quiet, **options)
+            outcome = run(ring, progress=not is_quiet(), **options)
         else:
-            ring = open_ring(lattice)
-            refusal = "; tune-fit takes a trajectory, the first turn of a beam"
-            data = trajectories(measurement, refusal, ring, quiet)
-            outcome = _fit(ring, data, measurement, quiet, options)
-        written = _draw(outcome, folder)
-        result = outcome.as_json()
+            outcome = _fit(ring, measurement, options)
         best = outcome.best.fit
+        assert folder is not None
         assert best is not None
+        written = _draw(outcome, folder)
         save_network(best.network, folder / "network.pt")
-        for path in (folder / "tune-fit.json", extra):
-            if path:
-                write_json(path, result)
-    if not quiet:
-        _print(outcome, out, [*written, "tune-fit.json", "network.pt"], json_file)
+        write_json(folder / "tune-fit.json", outcome.as_json())
+        write(outcome.as_json())
+    _print(outcome, out, [*written, "tune-fit.json", "network.pt"], json_file)
 
 
 OWN_DATA = ("magnet", "change", "launch", "noise")
@@ -155,15 +150,19 @@ def _refuse_own_data(context: click.Context) -> None:
             )
 
 
-def _fit(
-    ring: "Ring", data: "Measurement", path: Path, quiet: bool, options: dict[str, Any]
-) -> "TuneFit":
+def _fit(ring: "Ring", path: Path, options: dict[str, Any]) -> "TuneFit":
     from tmlattice.errors import MeasurementError, UnknownNameError
     from tmlattice.fitting import tune_fit_measurement
+    from tmlattice.measurement import Measurement, in_words
 
+    data, _ = read_data(path, ring)
+    if not isinstance(data, Measurement):
+        raise MeasurementError(
+            f"'{path}' is {in_words(data)}; tune-fit takes a trajectory, the first turn of a beam"
+        )
     recipe = {k: v for k, v in options.items() if k not in (*OWN_DATA, "seed")}
     try:
-        return tune_fit_measurement(ring, data, source=str(path), progress=not quiet, **recipe)
+        return tune_fit_measurement(ring, data, source=str(path), progress=not is_quiet(), **recipe)
     except (MeasurementError, UnknownNameError) as error:
         raise MeasurementError(f"{path}: {error}") from error
 

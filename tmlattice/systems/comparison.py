@@ -1,7 +1,6 @@
 """A figure of the paper compared with ours, and the reason of a difference."""
 
 from dataclasses import dataclass
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -19,12 +18,3 @@ class Comparison:
     paper: float | str | None
     here: float | str
     why: str = ""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the row for `reproduction.schema.json`."""
-        return {
-            "quantity": self.quantity,
-            "paper": self.paper,
-            "here": self.here,
-            "why": self.why,
-        }

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 GRAVITY = 9.8  # m/s^2
 DRAG = 0.392  # kg/m
 LEARNED_FROM = (100.0, 80.0)  # kg
+ORDERS = (2, 4, 8)  # of the compared maps
+FALL: Array = 0.5 * np.arange(31.0)  # s
 
 
 def equation(mass: float = 100.0) -> dict[tuple[int, ...], list[float]]:
@@ -26,11 +28,10 @@ def equation(mass: float = 100.0) -> dict[tuple[int, ...], list[float]]:
     return {(0,): [GRAVITY], (2,): [-DRAG / mass]}
 
 
-def velocity(time: ArrayLike, mass: ArrayLike = 100.0, start: ArrayLike = 0.0) -> Array:
-    """The closed solution v(t), m/s, of a fall that begins at `start` below the final velocity."""
+def velocity(time: ArrayLike, mass: ArrayLike = 100.0) -> Array:
+    """The closed solution v(t), m/s, of a fall from rest."""
     final = np.sqrt(GRAVITY * np.asarray(mass, dtype=float) / DRAG)
-    phase = np.arctanh(np.asarray(start, dtype=float) / final)
-    return np.asarray(final * np.tanh(GRAVITY * np.asarray(time, dtype=float) / final + phase))
+    return np.asarray(final * np.tanh(GRAVITY * np.asarray(time, dtype=float) / final))
 
 
 def euler_map(step: float, mass: float = 100.0) -> TaylorMap:
@@ -63,43 +64,28 @@ class StepErrors:
     runge_kutta: Array
 
 
-def step_errors(
-    steps: ArrayLike, orders: Sequence[int] = (2, 4, 8), mass: float = 100.0
-) -> StepErrors:
+def step_errors(steps: ArrayLike) -> StepErrors:
     """Return errors of Euler, the truncated maps and Runge-Kutta in 15 s, for each step [s]."""
     steps = np.asarray(steps, dtype=float)
     errors = []
     for step in steps:
         count = round(15 / step)
-        truth = velocity(step * np.arange(count + 1), mass)[:, None]
-        maps = (
-            euler_map(step, mass),
-            runge_kutta_map(step, mass),
-            *(taylor_map_of_ode(equation(mass), order, step) for order in orders),
-        )
+        truth = velocity(step * np.arange(count + 1))[:, None]
+        maps = [euler_map(step), runge_kutta_map(step)]
+        maps += [taylor_map_of_ode(equation(), order, step) for order in ORDERS]
         errors.append([np.abs(follow(m, [0.0], count) - truth).max() for m in maps])
     euler, kutta, *taylor = np.array(errors).T
-    return StepErrors(steps, euler, dict(zip(orders, taylor, strict=True)), kutta)
+    return StepErrors(steps, euler, dict(zip(ORDERS, taylor, strict=True)), kutta)
 
 
-def masses_map(
-    masses: Sequence[float] = LEARNED_FROM, step: float = 0.5, order: int = 3
-) -> TaylorMap:
-    """Return a map of (v, 100 kg / m) fitted to one fall from rest per mass, 15 s, every 0.5 s.
+def masses_map() -> TaylorMap:
+    """Return a map of third order of (v, 100 kg / m) fitted to the falls of `LEARNED_FROM`.
 
     Two masses determine no more than a straight line in 1 / m, so only monomials with at most its
     first power are fitted; the map has no other physics.
-
-    Args:
-        masses: kg, two or more.
-        step: s.
-        order: in v and 1 / m together.
     """
-    count = round(15 / step)
-    falls = velocity(step * np.arange(count + 1), np.array(masses)[:, None])
-    inverse = np.broadcast_to(100 / np.array(masses)[:, None], falls.shape)
-    states = np.stack([falls, inverse], axis=2)
-    identity = TaylorMap.identity(2, order)
+    states = _learned_falls()
+    identity = TaylorMap.identity(2, 3)
     columns = identity.monomials(states[:, :-1].reshape(-1, 2))
     exponents = identity.exponents
     free = exponents[:, 1] <= 1
@@ -108,7 +94,7 @@ def masses_map(
     rows = weights_of(identity)
     rows[0] = 0.0
     rows[0, free] = found / scale[free]
-    return map_of_weights(rows, order)
+    return map_of_weights(rows, 3)
 
 
 @dataclass(frozen=True)
@@ -124,6 +110,13 @@ class MassErrors:
     forest_falls: Array | None
 
 
+def _learned_falls() -> Array:
+    """(v, 100 kg / m) of one fall from rest a mass, [mass, step + 1, 2]."""
+    falls = velocity(FALL, np.array(LEARNED_FROM)[:, None])
+    inverse = np.broadcast_to(100 / np.array(LEARNED_FROM)[:, None], falls.shape)
+    return np.stack([falls, inverse], axis=2)
+
+
 def predicted_masses(masses: Sequence[float], forest: bool = True, seed: int = 0) -> MassErrors:
     """Return falls of other masses by the fitted map and by a random forest on the same two falls.
 
@@ -132,37 +125,32 @@ def predicted_masses(masses: Sequence[float], forest: bool = True, seed: int = 0
         forest: whether to train one; it needs scikit-learn, and is skipped without it.
         seed: of the forest.
     """
-    step, count = 0.5, 30
-    time: Array = np.asarray(step * np.arange(count + 1), dtype=np.float64)
-    truth = velocity(time, np.array(masses)[:, None])
+    truth = velocity(FALL, np.array(masses)[:, None])
     starts = np.stack([np.zeros(len(masses)), 100 / np.array(masses)], axis=1)
-    by_map = follow(masses_map(step=step), starts, count)[:, :, 0].T
-    by_forest = _forest_falls(starts, step, count, seed) if forest else None
+    by_map = follow(masses_map(), starts, len(FALL) - 1)[:, :, 0].T
+    by_forest = _forest_falls(starts, seed) if forest else None
     return MassErrors(
         np.array(masses, dtype=float),
         np.abs(by_map - truth).max(axis=1),
         None if by_forest is None else np.abs(by_forest - truth).max(axis=1),
-        time,
+        FALL,
         truth,
         by_map,
         by_forest,
     )
 
 
-def _forest_falls(starts: Array, step: float, count: int, seed: int) -> Array | None:
+def _forest_falls(starts: Array, seed: int) -> Array | None:
     try:
         from sklearn.ensemble import RandomForestRegressor
     except ImportError:
         return None
-    time = step * np.arange(count + 1)
-    falls = velocity(time, np.array(LEARNED_FROM)[:, None])
-    inverse = np.broadcast_to(100 / np.array(LEARNED_FROM)[:, None], falls.shape)
-    inputs = np.stack([falls[:, :-1], inverse[:, :-1]], axis=2).reshape(-1, 2)
+    learned = _learned_falls()
     forest = RandomForestRegressor(n_estimators=200, random_state=seed)
-    forest.fit(inputs, falls[:, 1:].ravel())
+    forest.fit(learned[:, :-1].reshape(-1, 2), learned[:, 1:, 0].ravel())
     states = starts.copy()
     result = [states[:, 0].copy()]
-    for _ in range(count):
+    for _ in FALL[1:]:
         states[:, 0] = forest.predict(states)
         result.append(states[:, 0].copy())
     return np.array(result).T

@@ -82,7 +82,7 @@ def follow(taylor_map: TaylorMap, start: ArrayLike, steps: int) -> Array:
     return np.array(states)
 
 
-def fit_step_by_step(solution: ArrayLike, order: int, ridge: float = 0.0) -> TaylorMap:
+def fit_step_by_step(solution: ArrayLike, order: int) -> TaylorMap:
     """Return the map from each observed state to the next, by linear least squares.
 
     It needs all coordinates. Columns are scaled to unit length; of equivalent solutions the one
@@ -91,7 +91,6 @@ def fit_step_by_step(solution: ArrayLike, order: int, ridge: float = 0.0) -> Tay
     Args:
         solution: [step, n], or several solutions of one length [solution, step, n].
         order: of the map.
-        ridge: relative size of singular values to ignore; 0 for rounding alone.
     """
     solution = np.asarray(solution, dtype=float)
     n = solution.shape[-1]
@@ -100,7 +99,7 @@ def fit_step_by_step(solution: ArrayLike, order: int, ridge: float = 0.0) -> Tay
     columns = TaylorMap.identity(n, order).monomials(before)
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0] = 1.0
-    weights, *_ = np.linalg.lstsq(columns / scale, after, rcond=ridge or None)
+    weights, *_ = np.linalg.lstsq(columns / scale, after, rcond=None)
     return map_of_weights((weights / scale[:, None]).T, order)
 
 
@@ -113,7 +112,6 @@ def fit_map(
     free: Bools | None = None,
     free_start: Sequence[int] = (),
     prior: Array | float | None = None,
-    evaluations: int = 100,
 ) -> MapFit:
     """Fine-tune a map on one solution.
 
@@ -127,7 +125,6 @@ def fit_map(
         free_start: coordinates of the start to fit.
         prior: rms of the weights' changes from `first`, one or [n, monomial]; it determines what
             the solution does not. None: no prior.
-        evaluations: at most.
 
     Returns:
         The map, with covariance for the noise given.
@@ -182,7 +179,7 @@ def fit_map(
         )
     found = least_squares(
         residuals, begin, slopes, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12,
-        max_nfev=evaluations,
+        max_nfev=100,
     )  # fmt: skip
     learned, begun = unpacked(found.x)
     _, singular, axes = np.linalg.svd(np.asarray(found.jac), full_matrices=False)

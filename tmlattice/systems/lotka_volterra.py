@@ -39,10 +39,10 @@ GOOD = 0.05  # rms of a solution's error: a tenth of the amplitude that was lear
 SEEN = 5  # states that every network is given before it runs alone
 
 
-def solutions(starts: ArrayLike, steps: int = STEPS) -> Array:
+def solutions(starts: ArrayLike) -> Array:
     """True states every 0.01 s, [start, step + 1, 2], by a tight numerical solver."""
     slope = right_hand_side(EQUATION)
-    times = STEP * np.arange(steps + 1)
+    times = STEP * np.arange(STEPS + 1)
     return np.array([
         solve_ivp(
             slope, (0, times[-1]), x, method="DOP853", t_eval=times, rtol=1e-12, atol=1e-14

@@ -39,16 +39,14 @@ def equation(length: float, damping: float = 0.0) -> dict[tuple[int, ...], list[
     return {(0, 1): [1.0, -damping], (1, 0): [0.0, -k], (3, 0): [0.0, k / 6]}
 
 
-def ideal_map(length: float = IDEAL_LENGTH) -> TaylorMap:
-    """The third-order map over one frame of an undamped pendulum, length in m."""
-    return taylor_map_of_ode(equation(length), 3, FRAME)
+def ideal_map() -> TaylorMap:
+    """The third-order map over one frame of an undamped pendulum of `IDEAL_LENGTH`."""
+    return taylor_map_of_ode(equation(IDEAL_LENGTH), 3, FRAME)
 
 
 def filmed(
     angle: float,
     rng: np.random.Generator,
-    length: float = TRUE_LENGTH,
-    damping: float = TRUE_DAMPING,
     noise: float = CAMERA_NOISE,
     velocity: float = 0.0,
 ) -> Array:
@@ -57,13 +55,12 @@ def filmed(
     Args:
         angle: at the first frame, rad.
         rng: of the camera's noise.
-        length, damping: m, 1/s.
         noise: rms of one angle, rad.
         velocity: at the first frame, rad/s.
     """
     times = FRAME * np.arange(LAYERS + 1)
     done = solve_ivp(
-        lambda t, x: [x[1], -damping * x[1] - GRAVITY / length * np.sin(x[0])],
+        lambda t, x: [x[1], -TRUE_DAMPING * x[1] - GRAVITY / TRUE_LENGTH * np.sin(x[0])],
         (0, times[-1]), [angle, velocity], method="DOP853", t_eval=times, rtol=1e-11, atol=1e-13,
     )  # fmt: skip
     return np.asarray(done.y[0] + noise * rng.normal(size=len(times)))
@@ -116,15 +113,15 @@ class LearnedPendulum:
         """Recovered through map -> equation, and its standard error, 1/s."""
         return damping_of(self.fit.taylor_map), self.fit.error_of(damping_of)
 
-    def swing(self, angle: float, velocity: float = 0.0, frames: int = LAYERS) -> Array:
-        """Return angles [frames + 1] from a start, rad and rad/s.
+    def swing(self, angle: float, velocity: float = 0.0) -> Array:
+        """Return the angles of 50 frames from a start, rad and rad/s.
 
         The latent coordinate is only nearly the velocity: here it is chosen so that the angle
         begins to change with `velocity` under the learned equation.
         """
         A = _linear(self.fit.taylor_map)
         latent = (velocity - A[0, 0] * angle) / A[0, 1]
-        return follow(self.fit.taylor_map, [angle, latent], frames)[:, 0]
+        return follow(self.fit.taylor_map, [angle, latent], LAYERS)[:, 0]
 
 
 def learn(angles: ArrayLike, start_velocity: float = 0.0) -> LearnedPendulum:
