@@ -28,10 +28,10 @@ from tmlattice.effects.apply import (
     monitors_with,
     set_elements,
 )
-from tmlattice.effects.cause import Cause
 from tmlattice.effects.directions import Directions, directions
 from tmlattice.effects.effect import (
     CATALOGUE,
+    Cause,
     Effect,
     LaunchEffect,
     ReadingEffect,

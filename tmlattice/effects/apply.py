@@ -5,8 +5,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.effects.cause import Cause
-from tmlattice.effects.effect import LaunchEffect, ReadingEffect, RingEffect, find
+from tmlattice.effects.effect import Cause, LaunchEffect, ReadingEffect, RingEffect, find
 from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError
 from tmlattice.lattice import Element, Ring

@@ -69,7 +69,6 @@ class CorrectorCalibration(_OnCorrector, StrengthEffect):
     acts_on_settings = True
     calibrates = True
     strength = "angle"
-    unit = "relative"
     sign = "kick = (1 + amount) x setting; -2 is a reversed one"
     quantity = "calibration"
     recommended_action = "calibrate {}"

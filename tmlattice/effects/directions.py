@@ -185,15 +185,12 @@ def ring_effect(name: str) -> RingEffect:
     return effect
 
 
-def directions(
-    layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], step: float = STEP
-) -> Directions:
+def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) -> Directions:
     """Return the directions of effects in the weights of a ring's layers.
 
     Args:
         layers: of the ring, with its settings.
         hypotheses: (effect, place); see `Effect.places`.
-        step: of the central differences, in units of the effect's largest fault.
     """
     ring, n = layers.ring, layers.dimension
     known: dict[Hashable, Quadratic | None] = {}
@@ -203,7 +200,7 @@ def directions(
     first_monitor = np.concatenate([[0], np.cumsum([e.kind == "monitor" for e in ring.elements])])
     for owner, (name, place) in enumerate(hypotheses):
         effect = ring_effect(name)
-        h = step * effect.largest
+        h = STEP * effect.largest
         for member in effect.members(ring, place):
             element = ring.elements[member]
             k = int(layers.layer_of[member])

@@ -8,13 +8,13 @@ of them and `register` it: see docs/new_effect.md.
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects.build import Build, Where
-from tmlattice.effects.cause import Cause
 from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError, UnknownNameError, unknown_name
 from tmlattice.lattice import Element, Ring
@@ -32,6 +32,26 @@ Group = Literal[
 
 MIN_STRENGTH = 0.01
 """Smallest remaining share of a strength."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A difference between a machine and its model.
+
+    Attributes:
+        effect: a name in the catalogue.
+        element: the element, or the family, that it sits on; None for the beam and for effects of
+            all elements of a kind.
+        amount: in the effect's unit and sign convention.
+    """
+
+    effect: str
+    element: str | None
+    amount: float
+
+    def __str__(self) -> str:
+        place = f" {self.element}" if self.element else ""
+        return f"{self.effect}{place} {self.amount:g}"
 
 
 class Effect(ABC):
@@ -238,6 +258,28 @@ class ErrorEffect(RingEffect):
         setattr(it, self.error, getattr(it, self.error) + amount)
 
 
+class OffsetX(ErrorEffect):
+    """A horizontal misalignment of a magnet."""
+
+    error = "dx"
+    unit = "m"
+    sign = "x of the magnet's centre"
+    quantity = "horizontal displacement"
+    recommended_action = "move {} back horizontally"
+    background = 1e-4
+
+
+class OffsetY(ErrorEffect):
+    """A vertical misalignment of a magnet."""
+
+    error = "dy"
+    unit = "m"
+    sign = "y of the magnet's centre"
+    quantity = "vertical displacement"
+    recommended_action = "move {} back vertically"
+    background = 1e-4
+
+
 class ThinKickEffect(RingEffect):
     """A thin kick that grows with the beam's displacement.
 
@@ -267,6 +309,7 @@ class StrengthEffect(RingEffect):
     """
 
     multiplies = True
+    unit = "relative"
     strength: ClassVar[str]
 
     def changed(self, element: Element, amount: float, energy: float) -> Element:
@@ -289,6 +332,12 @@ class StrengthEffect(RingEffect):
 
 class FamilyEffect(StrengthEffect):
     """The same error of all magnets of a family: of their power supply."""
+
+    recommended_action = "set or repair the supply of the family {}"
+    to_check = (
+        "Read back the current of the family's common supply with a second instrument; compare its "
+        "setting with the lattice file."
+    )
 
     def places(self, ring: Ring) -> list[str | None]:
         """Return families in the order of their first members; common prefixes of names where each

@@ -4,6 +4,8 @@ from tmlattice.effects.build import Build
 from tmlattice.effects.effect import (
     ErrorEffect,
     FamilyEffect,
+    OffsetX,
+    OffsetY,
     RingEffect,
     StrengthEffect,
     register,
@@ -29,7 +31,6 @@ class QuadrupoleGradient(_OnQuadrupole, StrengthEffect):
     words = "wrong strength of a quadrupole"
     headline = True
     strength = "k1"
-    unit = "relative"
     sign = "k1 becomes (1 + amount) k1"
     quantity = "integrated gradient"
     recommended_action = "set or repair the gradient of {}"
@@ -136,36 +137,24 @@ class QuadrupoleRoll(_OnQuadrupole, ErrorEffect):
 
 
 @register
-class QuadrupoleOffsetX(_OnQuadrupole, ErrorEffect):
+class QuadrupoleOffsetX(_OnQuadrupole, OffsetX):
     """A horizontal misalignment of a quadrupole."""
 
     name = "quadrupole_offset_x"
     words = "quadrupole displaced horizontally"
     headline = True
-    error = "dx"
-    unit = "m"
-    sign = "x of the magnet's centre"
-    quantity = "horizontal displacement"
-    recommended_action = "move {} back horizontally"
     to_check = "Survey its horizontal position against its neighbours; look at its supports."
-    background = 1e-4
     largest = 2e-3
 
 
 @register
-class QuadrupoleOffsetY(_OnQuadrupole, ErrorEffect):
+class QuadrupoleOffsetY(_OnQuadrupole, OffsetY):
     """A vertical misalignment of a quadrupole."""
 
     name = "quadrupole_offset_y"
     words = "quadrupole displaced vertically"
     headline = True
-    error = "dy"
-    unit = "m"
-    sign = "y of the magnet's centre"
-    quantity = "vertical displacement"
-    recommended_action = "move {} back vertically"
     to_check = "Survey its height against its neighbours; look at its supports and its girder."
-    background = 1e-4
     largest = 2e-3
 
 
@@ -177,14 +166,8 @@ class FamilyGradient(_OnQuadrupole, FamilyEffect):
     responds = True
     words = "wrong strength of a whole family of quadrupoles"
     strength = "k1"
-    unit = "relative"
     sign = "k1 of every member becomes (1 + amount) k1"
     quantity = "integrated gradient of every member"
-    recommended_action = "set or repair the supply of the family {}"
-    to_check = (
-        "Read back the current of the family's common supply with a second instrument; compare its "
-        "setting with the lattice file."
-    )
     largest = 0.05
     sits_on_text = (
         "families of two or more quadrupoles with k1 not 0, by the family's name, or groups of "

@@ -8,8 +8,7 @@ k = mean of h^2 by R33 = cos(sqrt(k) L).
 import numpy as np
 
 from tmlattice.effects.build import Build
-from tmlattice.effects.cause import Cause
-from tmlattice.effects.effect import CATALOGUE, RingEffect, register
+from tmlattice.effects.effect import CATALOGUE, Cause, RingEffect, register
 from tmlattice.lattice import Element, Ring
 
 C_GAMMA = 8.846e-5

@@ -1,8 +1,9 @@
 """Errors of sextupoles."""
 
 from tmlattice.effects.effect import (
-    ErrorEffect,
     FamilyEffect,
+    OffsetX,
+    OffsetY,
     RingEffect,
     StrengthEffect,
     register,
@@ -27,7 +28,6 @@ class SextupoleStrength(_OnSextupole, StrengthEffect):
     words = "wrong strength of a sextupole"
     headline = True
     strength = "k2"
-    unit = "relative"
     sign = "k2 becomes (1 + amount) k2; -2 is a reversed one"
     quantity = "integrated strength"
     recommended_action = "set or repair the strength of {}"
@@ -40,38 +40,26 @@ class SextupoleStrength(_OnSextupole, StrengthEffect):
 
 
 @register
-class SextupoleOffsetX(_OnSextupole, ErrorEffect):
+class SextupoleOffsetX(_OnSextupole, OffsetX):
     """A horizontal misalignment of a sextupole."""
 
     name = "sextupole_offset_x"
     responds = True
     words = "sextupole displaced horizontally"
     curved = True  # the field at the offset is quadratic
-    error = "dx"
-    unit = "m"
-    sign = "x of the magnet's centre"
-    quantity = "horizontal displacement"
-    recommended_action = "move {} back horizontally"
     to_check = "Survey its horizontal position against the adjacent quadrupoles."
-    background = 1e-4
     largest = 3e-3
 
 
 @register
-class SextupoleOffsetY(_OnSextupole, ErrorEffect):
+class SextupoleOffsetY(_OnSextupole, OffsetY):
     """A vertical misalignment of a sextupole."""
 
     name = "sextupole_offset_y"
     responds = True
     words = "sextupole displaced vertically"
     curved = True  # the field at the offset is quadratic
-    error = "dy"
-    unit = "m"
-    sign = "y of the magnet's centre"
-    quantity = "vertical displacement"
-    recommended_action = "move {} back vertically"
     to_check = "Survey its height against the adjacent quadrupoles."
-    background = 1e-4
     largest = 3e-3
 
 
@@ -83,13 +71,7 @@ class FamilySextupole(_OnSextupole, FamilyEffect):
     words = "wrong strength of a whole family of sextupoles"
     usual = False  # between two measurements of one machine, or on request
     strength = "k2"
-    unit = "relative"
     sign = "k2 of every member becomes (1 + amount) k2; -2 reverses them"
     quantity = "integrated strength of every member"
-    recommended_action = "set or repair the supply of the family {}"
-    to_check = (
-        "Read back the current of the family's common supply with a second instrument; compare its "
-        "setting with the lattice file."
-    )
     largest = 2.0
     sits_on_text = "families of two or more sextupoles with k2 not 0, by the family's name"

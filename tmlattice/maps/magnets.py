@@ -60,14 +60,13 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
     return TaylorMap(quadratic_map(element, energy, dimension).reduced())
 
 
-def part_maps(element: Element, energy: float, dimension: int = 4) -> list[TaylorMap]:
+def part_maps(element: Element, energy: float) -> list[TaylorMap]:
     """Return OCELOT's second-order maps of an element's parts: the body, or edge, body and edge.
 
     Args:
-        element, energy, dimension: see `element_map`.
+        element, energy: see `element_map`.
     """
-    parts = parts_of(element, energy, False)
-    return [TaylorMap(of_ocelot(part, dimension).reduced()) for part in parts]
+    return [TaylorMap(of_ocelot(part, 4).reduced()) for part in parts_of(element, energy, False)]
 
 
 def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
