@@ -71,7 +71,7 @@ def diagnose(
         TmlatticeError: two measurements of one name, no scheduler answers, or Dask is not
             installed.
     """
-    from tmlattice.importers.speaking import measured
+    from tmlattice.importers.bring_in import measured
     from tmlattice.lattice import Ring, load_ring
     from tmlattice.lattice.load import contents
     from tmlattice.version import __version__

@@ -18,7 +18,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 MEASURED = ("measurement", "data", "reference", "heldout")
 """Parameters that are measurements."""
 
-_open = Method("tmlattice.importers.speaking", "measured", "A measurement by its path or frame.")
+_open = Method("tmlattice.importers.bring_in", "measured", "A measurement by its path or frame.")
 
 
 def by_name(function: F) -> F:

@@ -5,9 +5,8 @@
 >>> print("\\n".join(brought.assumed))          # units, signs, steps: what the files do not prove
 """
 
-from tmlattice.importers.bring_in import Options, bring_in, import_data
+from tmlattice.importers.bring_in import Options, bring_in, import_data, read_measurement
 from tmlattice.importers.imported import Imported, described, write_imported
-from tmlattice.importers.speaking import read_measurement
 from tmlattice.importers.told import Told
 
 __all__ = [

@@ -1,4 +1,5 @@
-"""Which importer files are for: by what they hold, not by their names."""
+"""Which importer files are for, by what they hold and not by their names; and a measurement by its
+path, of any kind of file: for `diagnose(ring, "readings.csv")`."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from tmlattice.by_name import is_frame
+from tmlattice.by_name import by_name, is_frame
 from tmlattice.errors import MeasurementError, TmlatticeError, plain, unknown_name
 from tmlattice.importers.columns import (
     CSV,
@@ -24,15 +25,21 @@ from tmlattice.importers.columns import (
 from tmlattice.importers.conventions import compared
 from tmlattice.importers.hdf5 import bring_hdf5, read_hdf5, read_mapping
 from tmlattice.importers.imported import Imported, counted
-from tmlattice.importers.lattices import Elements, elements_of
-from tmlattice.importers.loco import Iteration, bring_loco, is_loco
-from tmlattice.importers.middle_layer import bring_middle_layer, is_beside, is_response
+from tmlattice.importers.loco import Iteration, bring_loco
+from tmlattice.importers.matlab_ring import Elements, elements_of
+from tmlattice.importers.middle_layer import bring_middle_layer
 from tmlattice.importers.readings import bring_readings, with_unit
 from tmlattice.importers.tables import bring_table, bring_turns, is_response_table
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
-from tmlattice.measurement import Measurement, OrbitResponse, TuneReading
+from tmlattice.measurement import (
+    AnyMeasurement,
+    Measurement,
+    OrbitResponse,
+    TuneReading,
+    folder,
+)
 from tmlattice.measurement.arrays import Unit
 from tmlattice.measurement.assume import ASSUMPTIONS, assume
 from tmlattice.measurement.frames import of_document
@@ -207,8 +214,8 @@ def _bring(
             return _with_conventions(_table(path, ring, options), ring, options)
         if options.turns or suffix not in NAMES:
             return _with_conventions(_turns(path, ring, options), ring, options)
-    loco = [(path, content) for path, content in matlab if is_loco(content)]
-    rest = [(path, content) for path, content in matlab if not is_loco(content)]
+    loco = [(path, content) for path, content in matlab if "LocoMeasData" in content]
+    rest = [(path, content) for path, content in matlab if "LocoMeasData" not in content]
     if hdf5:
         names = [path for path in files if path.suffix.lower() in NAMES]
         if not rest or not names:
@@ -218,7 +225,7 @@ def _bring(
             )
         mapping = {key: place for path in names for key, place in read_mapping(path).items()}
         return bring_hdf5(hdf5, mapping, _lattice(rest, options))
-    responses = [content for _, content in rest if is_response(content)]
+    responses = [content for _, content in rest if "Rmat" in content]
     if responses and not loco:
         raise MeasurementError(
             "a response of the Middle Layer names devices, not elements: give the machine's LOCO "
@@ -229,7 +236,9 @@ def _bring(
         if not rest:
             return bring_loco(content, path, options.iteration, options.keep_bad, options.energy)
         if len(responses) == 1:
-            beside = [content for _, content in rest if is_beside(content)]
+            beside = [
+                content for _, content in rest if not {"BPMxDisp", "BPMxData"}.isdisjoint(content)
+            ]
             return bring_middle_layer(
                 responses[0], beside, content, path, options.iteration, options.keep_bad,
                 options.energy,
@@ -308,3 +317,65 @@ def _lattice(matlab: Sequence[tuple[Path, Content]], options: Options) -> Elemen
         raise MeasurementError(f"two lattices, '{matlab[0][0]}' and '{matlab[1][0]}'; give one")
     ((path, content),) = matlab
     return elements_of(content, path, options.sequence)
+
+
+# --- a measurement by its path --------------------------------------------------------------------
+@by_name
+def read_measurement(
+    path: str | PathLike[str] | Any,
+    monitors: Sequence[str] | None = None,
+    turn_by_turn: str | None = None,
+    unit: Unit | None = None,
+    *,
+    ring: Ring | None = None,
+) -> AnyMeasurement:
+    """Read a measurement: a folder, or any file that `diagnose` reads.
+
+    What is assumed of a file (units, names, signs) is logged (logger `tmlattice.importers`, level
+    info). Without `ring` and `monitors` the names are those of the file.
+
+    Args:
+        path: a measurement folder, its measurement.json, or a file that `bring_in` takes: a table
+            (`.csv`, `.tsv`, `.txt`, `.h5`, `.sdds`), turns, a LOCO file; or a pandas DataFrame or
+            an xarray Dataset.
+        monitors: the ring's names. Of a folder, a monitor that is not among them is an error.
+        turn_by_turn: the path is a turn-by-turn file of this kind, see `read_turn_by_turn`.
+        unit: of the readings of a file that states none; else taken from their size.
+        ring: the lattice, which knows the names of monitors and correctors.
+
+    Raises:
+        MeasurementError: nothing there, or nothing that is known; one sentence.
+        UnknownNameError: a monitor that the ring does not have.
+    """
+    if is_frame(path):
+        return _logged(bring_in([path], Options(ring=ring, unit=unit)), label(path))
+    place = Path(path)
+    if turn_by_turn is not None or not place.is_file() or place.name == "measurement.json":
+        return folder.read_measurement(place, monitors, turn_by_turn, unit or "m")
+    if monitors is not None and place.suffix.lower() in (*CSV, *HDF5, *SDDS):
+        columns = read_columns(place)
+        if place.suffix.lower() not in CSV or not is_response_table(columns):
+            told = with_unit(None, unit, None)
+            return _logged(bring_readings(str(place), columns, None, told, monitors), str(place))
+    brought = bring_in([place], Options(ring=ring, unit=unit))
+    return _logged(brought, str(place))
+
+
+def _logged(brought: Imported, name: str) -> AnyMeasurement:
+    for sentence in (*brought.assumed, *brought.doubts):
+        log.info("%s: %s", name, sentence)
+    return brought.measurement
+
+
+def measured(path: str | PathLike[str] | Any, ring: Ring | None = None) -> Any:
+    """The measurement of a path or a frame that was given where a measurement is taken.
+
+    Raises:
+        MeasurementError: a file of another program without the ring; see `read_measurement`.
+    """
+    if is_frame(path):
+        return read_measurement(path, ring=ring)
+    place = Path(path)
+    if ring is None and place.is_file() and place.name != "measurement.json":
+        raise MeasurementError(f"'{place}' is a file of another program: give the ring with it")
+    return read_measurement(place, ring=ring)

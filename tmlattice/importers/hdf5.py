@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, device_names, numbers
-from tmlattice.importers.lattices import Elements
-from tmlattice.importers.matlab_ring import Roles, ring_of_elements
+from tmlattice.importers.matlab_ring import Elements, Roles, planes_by, ring_of_elements
 from tmlattice.input_files import MOST_DIGITS, json_of, short
 from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement import OrbitResponse
@@ -51,7 +50,8 @@ def read_hdf5(path: Path) -> dict[str, Any]:
     if twice := [n for n in (*ARRAYS, *SCALARS, *TEXTS) if names.count(n) > 1]:
         raise MeasurementError(f"'{path}': '{twice[0]}' stands in two groups; keep one of the two")
     content = {**attributes[""], **dict(zip(names, arrays.values(), strict=True))}
-    content = {name: value for name, value in content.items() if not _nothing(value)}
+    for name in [n for n, own in content.items() if isinstance(own, str) and own == NOTHING]:
+        del content[name]
     for name, value in content.items():
         single = np.ndim(value) == 0 and isinstance(value, np.generic) and np.isfinite(value)
         if name in SCALARS and not single:
@@ -61,10 +61,6 @@ def read_hdf5(path: Path) -> dict[str, Any]:
         if name in TEXTS and not isinstance(value, list | str):
             raise MeasurementError(f"'{path}': {name} should be a list of texts")
     return content
-
-
-def _nothing(value: Any) -> bool:
-    return isinstance(value, str) and value == NOTHING
 
 
 def read_mapping(path: Path) -> dict[str, tuple[int, str]]:
@@ -117,12 +113,12 @@ def bring_hdf5(
         raise MeasurementError(
             f"'{unknown[0]}' stands in no table of names; give its name_mapping.json too"
         )
-    monitors = tuple(i for i, fields in enumerate(lattice.fields) if _is_monitor(fields))
+    monitors = tuple(
+        i for i, own in enumerate(lattice.fields)
+        if str(own.get("Class", "")).lower() == "monitor" or "GCR" in own
+    )  # fmt: skip
     rows = 2 * len(monitors)
-    kicks: dict[int, frozenset[str]] = {}
-    for name in names:
-        place, plane = mapping[name]
-        kicks[place] = kicks.get(place, frozenset()) | {plane}
+    kicks = planes_by(mapping[name] for name in names)
     own = {mapping[name]: name.lower() for name in names}
     placed = ring_of_elements(
         lattice.fields, lattice.name, lattice.energy, Roles(monitors, kicks, own)
@@ -157,10 +153,6 @@ def bring_hdf5(
 
 def _with(parts: Sequence[tuple[Path, Mapping[str, Any]]], name: str) -> Mapping[str, Any] | None:
     return next((content for _, content in parts if name in content), None)
-
-
-def _is_monitor(fields: Mapping[str, Any]) -> bool:
-    return str(fields.get("Class", "")).lower() == "monitor" or "GCR" in fields
 
 
 def _orbits(data: Mapping[str, Any], steps: Array, rows: int) -> tuple[Array, str]:

@@ -19,9 +19,14 @@ from tmlattice.measurement import (
     in_words,
     write_measurement,
 )
+from tmlattice.measurement.shots import FEWEST, MOST
+from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.write import check_free
 
 Array = NDArray[np.float64]
+
+LIGHT = 299792458.0
+"""m/s."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +114,31 @@ def is_number(value: Any) -> TypeGuard[int | float]:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return abs(value) < 1e300
+
+
+def is_positive(value: Any) -> bool:
+    """Whether something of a file is one finite number above zero."""
+    return is_number(value) and value > 0
+
+
+def gev(energy: float) -> float:
+    """An energy of a file, GeV: AT has it in eV."""
+    return float(energy) * (1e-9 if energy > 1e5 else 1.0)
+
+
+def first_turns_or_stored(readings: Array, monitors: Sequence[str], **more: Any) -> AnyMeasurement:
+    """Readings [shot, turn, monitor, 2] without launches: sixteen turns and more are those of a
+    stored beam that was kicked, fewer are first turns. `more` are attributes of both."""
+    if readings.shape[1] >= FEWEST:
+        return TurnByTurn(readings[:, :MOST], tuple(monitors), **more)
+    shots = len(readings)
+    return Measurement(
+        launches=np.zeros((shots, 5)),
+        readings=readings,
+        monitors=tuple(monitors),
+        launch_sigma=np.tile(UNKNOWN_LAUNCH, (shots, 1)),
+        **more,
+    )
 
 
 def counted(names: Sequence[str], most: int = 8) -> str:

@@ -20,9 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers.imported import Imported, counted, device_names, is_number, numbers
+from tmlattice.importers.imported import (
+    Imported,
+    counted,
+    device_names,
+    gev,
+    is_number,
+    is_positive,
+    numbers,
+)
 from tmlattice.importers.loco_forms import usual_form
-from tmlattice.importers.matlab_ring import Placed, Roles, ring_of_elements
+from tmlattice.importers.matlab_ring import Placed, Roles, planes_by, ring_of_elements
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
 
@@ -31,9 +39,8 @@ Indices = NDArray[np.int64]
 Fields = Mapping[str, Any]
 Iteration = Literal["first", "last"]
 
-VARIABLES = (
-    "LocoMeasData", "BPMData", "CMData", "RINGData", "FitParameters", "LocoFlags", "LocoModel",
-)  # fmt: skip
+LETTERS = {"x": "H", "y": "V"}
+"""LOCO's names of the planes."""
 FURTHEST = 1e9
 """No list of places goes there."""
 SAME = 1e-6
@@ -41,11 +48,6 @@ SAME = 1e-6
 COMPUTED = 1e-4
 """Relative difference of a dispersion and LOCO's first model's: it was computed, not measured. The
 measured ones of ten rings differ by 0.04 to 1."""
-
-
-def is_loco(content: Fields) -> bool:
-    """Whether the variables of a MATLAB file are LOCO's."""
-    return "LocoMeasData" in content
 
 
 def bring_loco(
@@ -77,12 +79,9 @@ def bring_loco(
     flags = content.get("LocoFlags")
     flags = flags if isinstance(flags, Mapping) else {}
     at_monitor = _index(monitors, "BPMIndex")
-    every = {
-        "HBPMIndex": np.arange(len(at_monitor)) + 1,
-        "VBPMIndex": np.arange(len(at_monitor)) + 1,
-    }
-    reads = {p: _index({**every, **monitors}, f"{k}BPMIndex") for p, k in (("x", "H"), ("y", "V"))}
-    kickers = {plane: _index(correctors, f"{k}CMIndex") for plane, k in (("x", "H"), ("y", "V"))}
+    every = dict.fromkeys(("HBPMIndex", "VBPMIndex"), np.arange(len(at_monitor)) + 1)
+    reads = {p: _index({**every, **monitors}, f"{k}BPMIndex") for p, k in LETTERS.items()}
+    kickers = {plane: _index(correctors, f"{k}CMIndex") for plane, k in LETTERS.items()}
     for plane, index in reads.items():
         if len(index) and not 0 <= index.min() <= index.max() < len(at_monitor):
             raise MeasurementError(
@@ -90,10 +89,9 @@ def bring_loco(
                 "BPMIndex; correct BPMData"
             )
     elements, of_lattice, model = _elements(lattice, content.get("FitParameters"), iteration)
-    kicks: dict[int, frozenset[str]] = {}
-    for plane, index in kickers.items():
-        for place in index.tolist():
-            kicks[place] = kicks.get(place, frozenset()) | {plane}
+    kicks = planes_by(
+        (place, plane) for plane, index in kickers.items() for place in index.tolist()
+    )
     placed = ring_of_elements(
         elements,
         path.name.split(".")[0],
@@ -155,14 +153,13 @@ def _index(structure: Fields, name: str) -> Indices:
 
 def _energy(lattice: Fields, elements: Sequence[Fields]) -> float:
     """GeV; LOCO has it in GeV, AT's elements in eV."""
-    given = (own.get("Energy") for own in (lattice, *elements))
-    stated = [value for value in given if is_number(value) and value > 0]
+    stated = [own["Energy"] for own in (lattice, *elements) if is_positive(own.get("Energy"))]
     if not stated:
         raise MeasurementError(
             "neither RINGData nor its elements state an energy: name it: `energy` in [lattice] of "
             "tmlattice.toml, GeV"
         )
-    return float(stated[0]) * (1e-9 if stated[0] > 1e5 else 1.0)
+    return gev(stated[0])
 
 
 # --- the lattice ----------------------------------------------------------------------------------
@@ -258,7 +255,7 @@ def _good(
 ) -> tuple[dict[str, NDArray[np.bool_]], list[str]]:
     """Flags of the good lists by list ("x" and "y" of monitors, "H" and "V" of correctors)."""
     good, said = {}, []
-    for plane, letter in (("x", "H"), ("y", "V")):
+    for plane, letter in LETTERS.items():
         for key, structure, index, kind in (
             (plane, monitors, reads[plane], "BPM"), (letter, correctors, kickers[plane], "CM")
         ):  # fmt: skip
@@ -297,7 +294,7 @@ def _columns(
     rows = len(reads["x"]) + len(reads["y"])
     M = 1e-3 * numbers(_field(data, "M"), "LocoMeasData.M", (rows, horizontal + vertical))
     names, planes, kicks, kept = [], [], [], []
-    for plane, letter in (("x", "H"), ("y", "V")):
+    for plane, letter in LETTERS.items():
         index = kickers[plane]
         names += [placed.correctors[place, plane] for place in index.tolist()]
         planes += [plane] * len(index)
@@ -360,11 +357,11 @@ def _steps(correctors: Fields, letter: str, count: int) -> Array:
 
 def _unkicked(correctors: Fields, kickers: Mapping[str, Indices]) -> list[str]:
     """Correctors without a step, which no response can be of."""
-    counts = [
+    count = sum(
         int(np.count_nonzero(_steps(correctors, letter, len(kickers[plane])) == 0))
-        for plane, letter in (("x", "H"), ("y", "V"))
-    ]
-    return [f"{sum(counts)} correctors have a step of 0 and are left out"] if sum(counts) else []
+        for plane, letter in LETTERS.items()
+    )
+    return [f"{count} correctors have a step of 0 and are left out"] if count else []
 
 
 def _spread(

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.importers.imported import is_number
+from tmlattice.importers.imported import LIGHT, is_number, is_positive
 
 Array = NDArray[np.float64]
 Fields = Mapping[str, Any]
 
-LIGHT = 299792458.0
 SAME_RF = 0.02
 """Share by which a frequency may differ from the one that the ring's length and harmonic make."""
 TINY_STEP = 1e-9
@@ -74,10 +73,10 @@ def _energy(new: dict[str, Any], energy: float | None, said: list[str]) -> None:
     if energy is not None:
         ring["Energy"] = energy
         return
-    if any(_positive(own.get("Energy")) for own in (ring, *_elements(ring))):
+    if any(is_positive(own.get("Energy")) for own in (ring, *_elements(ring))):
         return
     others = [own.get("E0") for own in (_first(new.get("GLOBVAL")), *_elements(ring))]
-    found = next((own for own in others if _positive(own)), None)
+    found = next((own for own in others if is_positive(own)), None)
     if found is not None:
         ring["Energy"] = found
         said.append("the energy is E0, of GLOBVAL or of the lattice's elements")
@@ -104,7 +103,7 @@ def _rf(new: dict[str, Any], said: list[str]) -> None:
         *((cavity, ("Frequency", "HarmNumber")) for cavity in cavities),
     ):  # fmt: skip
         for name in names:  # an empty one, NaN or 0 states nothing
-            if not _positive(own.get(name)):
+            if not is_positive(own.get(name)):
                 own.pop(name, None)
     stated = (data.get("RF"), ring.get("CavityFrequency"), *(e.get("Frequency") for e in cavities))
     frequencies = [own for own in stated if own is not None]
@@ -136,10 +135,6 @@ def _is_cavity(element: Fields) -> bool:
     known = any(is_number(element.get(name)) for name in ("Frequency", "HarmNumber", "Voltage"))
     by_method = "Cavity" in str(element.get("PassMethod"))
     return known or by_method or element.get("Class") == "RFCavity"
-
-
-def _positive(value: Any) -> bool:
-    return is_number(value) and value > 0
 
 
 def _frequency(

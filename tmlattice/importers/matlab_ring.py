@@ -18,12 +18,14 @@ import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from tmlattice.errors import LatticeError
 from tmlattice.importers.at_element import at_element
+from tmlattice.importers.imported import gev, is_positive
 from tmlattice.lattice import Ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
@@ -32,6 +34,68 @@ AS_AT = 2e-3
 """By which tunes of the model may differ from AT's own: edges and integrators make 1e-4."""
 _LETTER = {"x": "h", "y": "v"}
 _MAD = {"x": "HKICKER", "y": "VKICKER"}
+
+
+@dataclass(frozen=True)
+class Elements:
+    """A lattice as AT's elements, before anything of it is a monitor or a corrector.
+
+    Attributes:
+        name: of the ring.
+        fields: of each element, in beam order.
+        energy: GeV.
+        harmonic: number, and frequency, Hz, of the RF where the lattice states it.
+        frequency: Hz.
+    """
+
+    name: str
+    fields: list[dict[str, Any]]
+    energy: float
+    harmonic: int | None = None
+    frequency: float | None = None
+
+
+def elements_of(content: Mapping[str, Any], path: Path, sequence: str | None = None) -> Elements:
+    """The lattice among a MATLAB file's variables.
+
+    Args:
+        content: of `read_mat`.
+        path: of the file.
+        sequence: the variable, where several are lattices.
+
+    Raises:
+        LatticeError: none is one, or more than one are, or no energy is stated.
+    """
+    found = {
+        name: value
+        for name, value in content.items()
+        if isinstance(value, list)
+        and len(value) > 1
+        and all(isinstance(e, Mapping) and "PassMethod" in e for e in value)
+        and sequence in (None, name)
+    }
+    if len(found) != 1:
+        which = ", ".join(found) if found else f"none of {', '.join(content) or 'its variables'}"
+        raise LatticeError(
+            f"'{path}' has no single lattice ({which}); name its variable: `sequence` in "
+            "[lattice] of tmlattice.toml"
+        )
+    ((name, elements),) = found.items()
+    fields = [dict(e) for e in elements if str(e.get("Class", "")).lower() != "ringparam"]
+    energy = next((e["Energy"] for e in elements if is_positive(e.get("Energy"))), None)
+    if energy is None:
+        raise LatticeError(f"the lattice '{name}' of '{path}' states no energy; add Energy")
+    cavities = [
+        e for e in fields if is_positive(e.get("Frequency")) and is_positive(e.get("HarmNumber"))
+    ]
+    main = min(cavities, key=lambda e: e["Frequency"], default=None)
+    return Elements(
+        name=path.name.split(".")[0],
+        fields=fields,
+        energy=gev(energy),
+        harmonic=None if main is None else round(main["HarmNumber"]),
+        frequency=None if main is None else float(main["Frequency"]),
+    )
 
 
 @dataclass(frozen=True)
@@ -66,6 +130,17 @@ class Placed:
     correctors: Mapping[tuple[int, str], str]
     said: tuple[str, ...]
     doubts: tuple[str, ...]
+
+
+Key = TypeVar("Key", int, str)
+
+
+def planes_by(pairs: Iterable[tuple[Key, str]]) -> dict[Key, frozenset[str]]:
+    """The planes of each place, or family, of pairs with one plane."""
+    planes: dict[Key, frozenset[str]] = {}
+    for key, plane in pairs:
+        planes[key] = planes.get(key, frozenset()) | {plane}
+    return planes
 
 
 def ring_of_elements(
@@ -201,12 +276,12 @@ def _planes_of_families(
     """Planes in which some corrector of a family kicks."""
     import at
 
-    planes: dict[str, frozenset[str]] = {}
-    for i, own in kicks.items():
-        if isinstance(made[i], at.Corrector):
-            family = _family(made[i])
-            planes[family] = planes.get(family, frozenset()) | own
-    return planes
+    return planes_by(
+        (_family(made[i]), plane)
+        for i, own in kicks.items()
+        if isinstance(made[i], at.Corrector)
+        for plane in own
+    )
 
 
 def _parts(

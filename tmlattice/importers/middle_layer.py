@@ -36,16 +36,6 @@ FIELDS = {
 """Types of what is read of a structure."""
 
 
-def is_response(content: Fields) -> bool:
-    """Whether the variables of a MATLAB file are a response of the Middle Layer."""
-    return "Rmat" in content
-
-
-def is_beside(content: Fields) -> bool:
-    """Whether they are its dispersion or noise."""
-    return any(f"BPMx{kind}" in content for kind in ("Disp", "Data"))
-
-
 def bring_middle_layer(
     response: Fields,
     beside: Sequence[Fields],

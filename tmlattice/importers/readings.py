@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
 from tmlattice.importers.columns import Column
-from tmlattice.importers.imported import Imported, counted, device_names
+from tmlattice.importers.imported import (
+    Imported,
+    counted,
+    device_names,
+    first_turns_or_stored,
+)
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, TurnByTurn
+from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.arrays import METRES
 from tmlattice.measurement.lost_beam import about_sums, no_beam
-from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
-from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
 Array = NDArray[np.float64]
 
@@ -122,12 +125,10 @@ def bring_readings(
     devices_of = device_names(
         (names[at], device) for device in devices if (at := monitor.get(device)) in read.tolist()
     )
-    data: Measurement | TurnByTurn = Measurement(
-        launches=np.zeros((len(order), 5)),
-        readings=readings[:, :, read],
-        monitors=tuple(names[i] for i in read),
+    data = first_turns_or_stored(
+        readings[:, :, read],
+        [names[i] for i in read],
         noise=noise,
-        launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(order), 1)),
         lattice=hints[0],
         energy=hints[1],
         devices=devices_of,
@@ -138,16 +139,8 @@ def bring_readings(
         else f"the noise is {1e6 * told.noise:g} µm, as stated"
     )
     beam = "the launch of the beam is unknown"
-    if isinstance(data, Measurement) and data.readings.shape[1] >= FEWEST:  # as of other files
-        beam = f"{data.readings.shape[1]} turns are those of a stored beam that was kicked before"
-        data = TurnByTurn(
-            data.readings[:, :MOST],
-            data.monitors,
-            noise,
-            lattice=hints[0],
-            energy=hints[1],
-            devices=devices_of,
-        )
+    if isinstance(data, TurnByTurn):
+        beam = f"{readings.shape[1]} turns are those of a stored beam that was kicked before"
     sums = about_sums(both[..., SUM], silent, before, names)
     said = [of_unit, beam, of_noise, *finder.said, *sums]
     if bad:

@@ -15,26 +15,25 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.importers.columns import SDDS, Column
-from tmlattice.importers.imported import Imported, counted, device_names
+from tmlattice.importers.imported import (
+    LIGHT,
+    Imported,
+    counted,
+    device_names,
+    first_turns_or_stored,
+)
 from tmlattice.importers.middle_layer import RADIANS
 from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring
-from tmlattice.measurement import (
-    Measurement,
-    OrbitResponse,
-    TurnByTurn,
-    read_turn_by_turn,
-)
+from tmlattice.measurement import Measurement, OrbitResponse, read_turn_by_turn
 from tmlattice.measurement.arrays import METRES, Unit
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
+from tmlattice.measurement.shots import FEWEST, MOST
 from tmlattice.measurement.tables import KINDS
-from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
-from tmlattice.measurement.turn_by_turn import FEWEST, MOST
 
 Array = NDArray[np.float64]
 
-LIGHT = 299792458.0
 KICK = 1e-4
 """rad; the step that a wide table is taken to have been made with."""
 _PLANES = {"hcorrector": "x", "vcorrector": "y"}
@@ -124,11 +123,18 @@ def bring_turns(
         turns = data.readings.shape[1]
         if turns < FEWEST:
             said.append("turn 0 is the first in the file; the launch of the beam is unknown")
-            return Imported(_unlaunched(data, ring), ring, tuple(said), doubts)
-        said.append(f"{turns} turns are those of a stored beam that was kicked before the first")
+        else:
+            said.append(f"{turns} turns are those of a stored beam, kicked before the first")
         if turns > MOST:
             said.append(f"the first {MOST} turns are taken")
-        return Imported(_stored(data, ring), ring, tuple(said), doubts)
+        measured = first_turns_or_stored(
+            data.readings,
+            data.monitors,
+            shots=data.shots,
+            lattice=None if ring is None else "lattice.json",
+            energy=None if ring is None else ring.energy,
+        )
+        return Imported(measured, ring, tuple(said), doubts)
     table = (
         "for its columns name the lattice with --lattice; " if path.suffix.lower() in SDDS else ""
     )
@@ -152,29 +158,6 @@ def _of_ring(data: Measurement, ring: Ring, told: Told) -> tuple[Measurement, tu
     )
     what = f"monitors that the lattice does not have, left out: {counted(missing)}"
     return data, (what,) if missing else ()
-
-
-def _unlaunched(data: Measurement, ring: Ring | None) -> Measurement:
-    return Measurement(
-        launches=np.zeros((len(data.shots), 5)),
-        readings=data.readings,
-        monitors=data.monitors,
-        noise=None,
-        launch_sigma=np.tile(UNKNOWN_LAUNCH, (len(data.shots), 1)),
-        shots=data.shots,
-        lattice=None if ring is None else "lattice.json",
-        energy=None if ring is None else ring.energy,
-    )
-
-
-def _stored(data: Measurement, ring: Ring | None) -> TurnByTurn:
-    return TurnByTurn(
-        readings=data.readings[:, :MOST],
-        monitors=data.monitors,
-        shots=data.shots,
-        lattice=None if ring is None else "lattice.json",
-        energy=None if ring is None else ring.energy,
-    )
 
 
 # --- an orbit response ----------------------------------------------------------------------------

@@ -7,15 +7,14 @@
 ...     writer.add(0, launch, None, {}, readings)     # readings [turn, monitor, 2]
 """
 
-from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.folder import AnyMeasurement, in_words, read_measurement
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
+from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.tables import read_table, read_turn_by_turn
 from tmlattice.measurement.trajectory import Comparison, Measurement
 from tmlattice.measurement.truth import Truth, read_truth, write_truth
 from tmlattice.measurement.tune_reading import TuneReading
-from tmlattice.measurement.turn_by_turn import TurnByTurn
 from tmlattice.measurement.write import MeasurementWriter, measurement_writer, write_measurement
 
 __all__ = [

@@ -9,8 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.checks import check_energy, check_values, monitor_places, spread
-from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.monitors import (
+    Names,
+    check_energy,
+    check_values,
+    noise_table,
+    places_of,
+    spread,
+)
 from tmlattice.measurement.orbit_response import RfStep, check_rf
 from tmlattice.measurement.shown import Shown
 
@@ -110,7 +116,7 @@ class Dispersion(Shown):
         Raises:
             UnknownNameError: this measurement has a monitor that is not among them.
         """
-        places, number = monitor_places(monitors, self.monitors), len(monitors)
+        places, number = places_of("monitor", monitors, self.monitors), len(monitors)
         return replace(
             self,
             steps=tuple(replace(s, orbit=spread(s.orbit, places, number)) for s in self.steps),
@@ -125,7 +131,7 @@ class Dispersion(Shown):
             UnknownNameError: one that is not there.
             MeasurementError: nothing is left.
         """
-        here = monitor_places(self.monitors, monitors)
+        here = places_of("monitor", self.monitors, monitors)
         return replace(
             self,
             steps=tuple(

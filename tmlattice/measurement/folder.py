@@ -15,24 +15,17 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement.arrays import Unit
-from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import check_table, located, read_document
 from tmlattice.measurement.header import FORMAT, number, read_noise
-from tmlattice.measurement.monitors import Names
+from tmlattice.measurement.monitors import Names, Settings, check_settings
 from tmlattice.measurement.orbit_response import OrbitResponse, RfStep
 from tmlattice.measurement.rows import dense, match_names, read_rows
+from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.stored_files import KINDS, TURNS, places_of
 from tmlattice.measurement.tables import read_table, read_turn_by_turn
-from tmlattice.measurement.trajectory import (
-    COORDINATES,
-    UNKNOWN_LAUNCH,
-    Measurement,
-    Settings,
-    check_settings,
-)
+from tmlattice.measurement.trajectory import COORDINATES, UNKNOWN_LAUNCH, Measurement
 from tmlattice.measurement.tune_reading import TuneReading
-from tmlattice.measurement.turn_by_turn import TurnByTurn
 from tmlattice.temporaries import locked
 
 Array = NDArray[np.float64]

@@ -9,7 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
+from tmlattice.measurement.monitors import (
+    Names,
+    check_energy,
+    check_values,
+    noise_table,
+    places_of,
+    spread,
+)
 from tmlattice.measurement.shown import Shown
 
 Array = NDArray[np.float64]
@@ -166,17 +173,11 @@ class OrbitResponse(Shown):
                         f"the RF step's orbit has the shape {orbit.shape}, not [{monitors}, 2]"
                     )
                 self._keep(rf=replace(rf, orbit=orbit))
-        if self.energy is not None and not 0 < self.energy < HIGHEST_ENERGY:
-            raise MeasurementError(
-                f"an energy of {self.energy:g} GeV cannot be; it is above zero, and in GeV"
-            )
-        everything = [response] if self.rf is None or self.rf.orbit is None else [
-            response, self.rf.orbit
+        check_energy(self.energy)
+        orbits = [response] if self.rf is None or self.rf.orbit is None else [
+            response, self.rf.orbit[None]
         ]  # fmt: skip
-        if any(np.isinf(a).any() for a in everything):
-            raise MeasurementError("an orbit change is infinite; a missing one is NaN")
-        if not any(np.isfinite(a).any() for a in everything):
-            raise MeasurementError("every orbit change is missing; nothing can be fitted")
+        check_values(np.concatenate(orbits), "orbit change")
         self._keep(noise=noise_table(self.noise, self.monitors))
 
     def in_order_of(self, monitors: Sequence[str]) -> "OrbitResponse":
@@ -185,21 +186,14 @@ class OrbitResponse(Shown):
         Raises:
             UnknownNameError: this measurement has a monitor that is not among them.
         """
-        names = Names("monitor", monitors)
-        place = [names[name] for name in self.monitors]
-
-        def spread(values: Array | None) -> Array | None:
-            if values is None:
-                return None
-            full = np.full((*values.shape[:-2], len(names.names), 2), np.nan)
-            full[..., place, :] = values
-            return full
-
-        rf = None if self.rf is None else replace(self.rf, orbit=spread(self.rf.orbit))
-        response = spread(self.response)
-        assert response is not None
+        places, number = places_of("monitor", monitors, self.monitors), len(monitors)
+        orbit = None if self.rf is None else spread(self.rf.orbit, places, number)
         return replace(
-            self, response=response, monitors=names.names, noise=spread(self.noise), rf=rf
+            self,
+            response=spread(self.response, places, number),
+            monitors=tuple(monitors),
+            noise=spread(self.noise, places, number),
+            rf=None if self.rf is None else replace(self.rf, orbit=orbit),
         )
 
     def select(
@@ -212,8 +206,7 @@ class OrbitResponse(Shown):
         """
         part = self
         if correctors is not None:
-            names = Names("corrector", self.correctors)
-            column = [names[name] for name in correctors]
+            column = places_of("corrector", self.correctors, correctors)
             part = replace(
                 part,
                 correctors=tuple(self.correctors[i] for i in column),
@@ -222,8 +215,7 @@ class OrbitResponse(Shown):
                 response=self.response[column],
             )
         if monitors is not None:
-            names = Names("monitor", self.monitors)
-            place = [names[name] for name in monitors]
+            place = places_of("monitor", self.monitors, monitors)
             rf = part.rf
             if rf is not None and rf.orbit is not None:
                 rf = replace(rf, orbit=rf.orbit[place])

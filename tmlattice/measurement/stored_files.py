@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement.closed_orbit import ClosedOrbit
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import located
 from tmlattice.measurement.header import header, read_noise
+from tmlattice.measurement.monitors import Settings, check_settings
 from tmlattice.measurement.orbit_response import RfStep
 from tmlattice.measurement.rows import Rows, check_size, dense, match_names, read_rows
-from tmlattice.measurement.trajectory import Settings, check_settings
+from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.tune_reading import TuneReading
-from tmlattice.measurement.turn_by_turn import TurnByTurn
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -36,56 +35,45 @@ QUANTITIES = ("tune_x", "tune_y", "chromaticity_x", "chromaticity_y")
 
 
 # --- reading --------------------------------------------------------------------------------------
+def _read(
+    file: Path, columns: Sequence[str], known: Sequence[int], monitors: Known
+) -> tuple[tuple[str, ...], Array]:
+    """Monitors and readings [shot or step, turn, monitor, 2] of the table of a document."""
+    rows = read_rows(file.with_name("readings.csv"), columns)
+    rows.check(*columns[:-2])
+    names, place = match_names(rows, "monitor", monitors)
+    at = places_of(rows, columns[0], known)
+    return names, dense(rows, at, len(known), place, len(names))
+
+
 def _turn_by_turn(file: Path, document: Document, monitors: Known) -> TurnByTurn:
     shots, settings = _shots(file, document)
-    rows = read_rows(file.with_name("readings.csv"), TURNS)
-    rows.check("shot", "turn", "monitor")
-    names, place = match_names(rows, "monitor", monitors)
-    at = places_of(rows, "shot", shots)
-    readings = dense(rows, at, len(shots), place, len(names))
+    names, readings = _read(file, TURNS, shots, monitors)
     with located(file):
+        common = _common(document, names, monitors)
+        devices = document.get("devices") or {}
         return TurnByTurn(
-            readings=readings,
-            monitors=names,
-            settings=settings,
-            shots=shots,
-            devices=document.get("devices") or {},
-            **_common(document, names, monitors),
+            readings, names, settings=settings, shots=shots, devices=devices, **common
         )
 
 
 def _closed_orbit(file: Path, document: Document, monitors: Known) -> ClosedOrbit:
     shots, settings = _shots(file, document)
-    rows = read_rows(file.with_name("readings.csv"), ORBITS)
-    rows.check("shot", "monitor")
-    names, place = match_names(rows, "monitor", monitors)
-    orbit = dense(rows, places_of(rows, "shot", shots), len(shots), place, len(names))[:, 0]
+    names, orbit = _read(file, ORBITS, shots, monitors)
     with located(file):
-        return ClosedOrbit(
-            orbit=orbit,
-            monitors=names,
-            settings=settings,
-            shots=shots,
-            **_common(document, names, monitors),
-        )
+        common = _common(document, names, monitors)
+        return ClosedOrbit(orbit[:, 0], names, settings=settings, shots=shots, **common)
 
 
 def _dispersion(file: Path, document: Document, monitors: Known) -> Dispersion:
     steps = document["steps"]
-    rows = read_rows(file.with_name("readings.csv"), STEPS)
-    rows.check("step", "monitor")
-    names, place = match_names(rows, "monitor", monitors)
-    at = places_of(rows, "step", range(len(steps)))
-    orbits = dense(rows, at, len(steps), place, len(names))[:, 0]
+    names, orbits = _read(file, STEPS, range(len(steps)), monitors)
     with located(file):
-        return Dispersion(
-            steps=tuple(
-                RfStep(float(s["frequency_hz"]), int(s["harmonic"]), float(s["step_hz"]), orbit)
-                for s, orbit in zip(steps, orbits, strict=True)
-            ),
-            monitors=names,
-            **_common(document, names, monitors),
+        made = tuple(
+            RfStep(float(s["frequency_hz"]), int(s["harmonic"]), float(s["step_hz"]), orbit)
+            for s, orbit in zip(steps, orbits[:, 0], strict=True)
         )
+        return Dispersion(made, names, **_common(document, names, monitors))
 
 
 def _tunes(file: Path, document: Document, monitors: Known) -> TuneReading:
@@ -249,9 +237,7 @@ KINDS = {
 
 def check_readable(measured: TurnByTurn | ClosedOrbit | Dispersion | TuneReading) -> None:
     """Raises a MeasurementError for a reading that no reader would take (above 0.2 m)."""
-    if isinstance(measured, TurnByTurn):
-        check_size(measured.readings, measured.monitors)
-    elif isinstance(measured, ClosedOrbit):
-        check_size(measured.orbit, measured.monitors)
-    elif isinstance(measured, Dispersion):
+    if isinstance(measured, Dispersion):
         check_size(measured.orbits, measured.monitors)
+    elif not isinstance(measured, TuneReading):
+        check_size(getattr(measured, measured.READ), measured.monitors)

@@ -2,27 +2,23 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tmlattice.errors import MeasurementError, first_of, unknown_name
+from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
-from tmlattice.measurement.monitors import HIGHEST_ENERGY, Names, noise_table
-from tmlattice.measurement.shown import Shown
+from tmlattice.measurement.monitors import Settings
+from tmlattice.measurement.shots import Shots
 
 Array = NDArray[np.float64]
-Settings = Mapping[str, Mapping[str, float]]
 
 COORDINATES = ("x", "px", "y", "py", "delta")
 """Of a launch: m, and units of the reference momentum; delta is the relative energy deviation."""
 
 UNKNOWN_LAUNCH = (np.inf, np.inf, np.inf, np.inf, 0.0)
 """The sigma of a launch of which nothing is known, but that the energy is the nominal one."""
-
-SETTINGS = ("kick", "k1_relative", "k2_relative", "frequency_relative")
-"""What may be changed on purpose: rad, relative strengths, and the RF's relative frequency."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +46,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measurement(Shown):
+class Measurement(Shots):
     """Readings of one or more shots, each launched at the start of the ring.
 
     Attributes:
@@ -74,6 +70,8 @@ class Measurement(Shown):
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
     """
+
+    OF_SHOTS: ClassVar[tuple[str, ...]] = ("launches", "launch_sigma")
 
     launches: Array
     readings: Array
@@ -126,49 +124,17 @@ class Measurement(Shown):
         )  # fmt: skip
 
     def __post_init__(self) -> None:
-        readings = np.asarray(self.readings, dtype=float)
-        monitors = tuple(self.monitors)
-        number = len(self.launches)
-        if readings.ndim != 4 or readings.shape[::2] != (number, len(monitors)) or (
-            readings.shape[3] != 2
-        ):  # fmt: skip
-            raise MeasurementError(
-                f"readings have the shape {readings.shape}; {number} launches and "
-                f"{len(monitors)} monitors need [{number}, turns, {len(monitors)}, 2]"
-            )
-        Names("monitor", monitors)
+        super().__post_init__()
+        number = len(self.readings)
         launches = _five(self.launches, number, "launches")
         if not np.isfinite(launches).all():
             raise MeasurementError("a launch is not finite; give x, px, y, py of every shot")
-        if np.isinf(readings).any():
-            raise MeasurementError("a reading is infinite; a missing one is NaN")
-        if not np.isfinite(readings).any():
-            raise MeasurementError("every reading is missing; nothing can be fitted")
-        shots = tuple(int(i) for i in self.shots) or tuple(range(number))
-        if len(shots) != number or len(set(shots)) != number:
-            raise MeasurementError(f"{number} launches need {number} shot ids, each once")
+        self._keep(launches=launches)
         if self.launch_sigma is not None:
             sigma = _five(self.launch_sigma, number, "launch_sigma")
             if not (sigma >= 0).all():
                 raise MeasurementError("a launch_sigma is negative or NaN; it is an rms, or inf")
             self._keep(launch_sigma=sigma)
-        settings = tuple(self.settings)
-        if settings and len(settings) != number:
-            raise MeasurementError(f"{len(settings)} settings for {number} shots; one a shot")
-        if self.energy is not None and not 0 < self.energy < HIGHEST_ENERGY:
-            raise MeasurementError(
-                f"an energy of {self.energy:g} GeV cannot be; it is above zero, and in GeV"
-            )
-        for shot, changed in zip(shots, settings, strict=False):
-            check_settings(shot, changed)
-        self._keep(
-            launches=launches,
-            readings=readings,
-            monitors=monitors,
-            noise=noise_table(self.noise, monitors),
-            settings=settings if any(settings) else (),
-            shots=shots,
-        )
 
     def states(self, dimension: int) -> Array:
         """The launches in the coordinates of a network.
@@ -199,28 +165,12 @@ class Measurement(Shown):
         states[:, 5] = self.launches[:, 4]
         return states
 
-    def in_order_of(self, monitors: Sequence[str]) -> "Measurement":
-        """The same with other monitors, such as a ring's: NaN where one was not read.
-
-        Raises:
-            UnknownNameError: this measurement has a monitor that is not among them.
-        """
-        names = Names("monitor", monitors)
-        place = [names[name] for name in self.monitors]
-        readings = np.full((*self.readings.shape[:2], len(names.names), 2), np.nan)
-        readings[:, :, place] = self.readings
-        noise = None
-        if self.noise is not None:
-            noise = np.full((len(names.names), 2), np.nan)
-            noise[place] = self.noise
-        return replace(self, readings=readings, monitors=names.names, noise=noise)
-
     def select(
         self,
         shots: Sequence[int] | None = None,
         monitors: Sequence[str] | None = None,
         turns: Sequence[int] | None = None,
-    ) -> "Measurement":
+    ) -> Self:
         """A part of the measurement, shots and monitors in the order asked for; None: all.
 
         Args:
@@ -233,45 +183,18 @@ class Measurement(Shown):
             MeasurementError: a shot or turn that is not there, or no reading left.
             UnknownNameError: a monitor that is not there.
         """
-        part = self
-        if shots is not None:
-            index = {shot: i for i, shot in enumerate(self.shots)}
-            missing = [shot for shot in shots if shot not in index]
-            if missing:
-                known = first_of(self.shots)
-                raise MeasurementError(f"no shot {missing[0]}; there are {known}")
-            part = part._take([index[shot] for shot in shots])
-        if monitors is not None:
-            names = Names("monitor", self.monitors)
-            place = [names[name] for name in monitors]
-            part = replace(
-                part,
-                readings=part.readings[:, :, place],
-                monitors=tuple(self.monitors[i] for i in place),
-                noise=None if self.noise is None else self.noise[place],
+        part = super().select(shots, monitors)
+        if turns is None:
+            return part
+        there = self.readings.shape[1]
+        outside = [turn for turn in turns if not 0 <= turn < there]
+        if outside or not len(turns):
+            raise MeasurementError(
+                f"no turn {outside[0] if outside else 'named'}; there are 0 to {there - 1}"
             )
-        if turns is not None:
-            there = self.readings.shape[1]
-            outside = [turn for turn in turns if not 0 <= turn < there]
-            if outside or not len(turns):
-                raise MeasurementError(
-                    f"no turn {outside[0] if outside else 'named'}; there are 0 to {there - 1}"
-                )
-            readings = part.readings[:, : max(turns) + 1].copy()
-            readings[:, np.setdiff1d(np.arange(max(turns) + 1), turns)] = np.nan
-            part = replace(part, readings=readings)
-        return part
-
-    def _take(self, places: Sequence[int]) -> "Measurement":
-        index = list(places)
-        return replace(
-            self,
-            launches=self.launches[index],
-            readings=self.readings[index],
-            launch_sigma=None if self.launch_sigma is None else self.launch_sigma[index],
-            settings=tuple(self.settings[i] for i in index) if self.settings else (),
-            shots=tuple(self.shots[i] for i in index),
-        )
+        readings = part.readings[:, : max(turns) + 1].copy()
+        readings[:, np.setdiff1d(np.arange(max(turns) + 1), turns)] = np.nan
+        return replace(part, readings=readings)
 
     def split(self, holdout: float, seed: int = 0) -> tuple["Measurement", "Measurement | None"]:
         """Shots to fit, and held-out shots for validation; both in their order.
@@ -296,8 +219,8 @@ class Measurement(Shown):
         if holdout == 0 or number < 1:
             return self, None
         out = set(np.random.default_rng(seed).choice(read, number, replace=False).tolist())
-        places = range(len(self.shots))
-        return self._take([i for i in places if i not in out]), self._take(sorted(out))
+        fit = [shot for i, shot in enumerate(self.shots) if i not in out]
+        return self.select(fit), self.select([self.shots[i] for i in sorted(out)])
 
     def compare(self, model: Array) -> Comparison:
         """What is left of the readings when a model is taken away.
@@ -353,26 +276,3 @@ def _five(states: Any, number: int, name: str) -> Array:
             f"need [{number}, 4] or [{number}, 5]"
         )
     return array if array.shape[1] == 5 else np.pad(array, ((0, 0), (0, 1)))
-
-
-def check_settings(shot: int, settings: Settings) -> None:
-    """Settings of a shot are known, finite, and each element's own.
-
-    Raises:
-        MeasurementError: states which is not.
-        UnknownNameError: a setting that no element has.
-    """
-    Names("element", settings)
-    for element, changed in settings.items():
-        for name, amount in changed.items():
-            if name not in SETTINGS:
-                raise unknown_name("setting", name, SETTINGS)
-            if (name == "frequency_relative") != (element.casefold() == "rf"):
-                raise MeasurementError(
-                    f"shot {shot} sets '{name}' of '{element}'; frequency_relative belongs to "
-                    "the name 'rf', and nothing else does"
-                )
-            if not abs(amount) < np.inf:
-                raise MeasurementError(
-                    f"shot {shot} sets '{name}' of '{element}' to {amount}; give a finite number"
-                )

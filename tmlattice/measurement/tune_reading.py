@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement.checks import check_energy, checked_shots
+from tmlattice.measurement.monitors import Settings, check_energy, checked_shots
 from tmlattice.measurement.shown import Shown
-from tmlattice.measurement.trajectory import Settings
 
 Array = NDArray[np.float64]
 

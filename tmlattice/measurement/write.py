@@ -15,7 +15,7 @@ from tmlattice.files import output_folder, write_json
 from tmlattice.measurement.documents import Digest
 from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
 from tmlattice.measurement.header import finite, header
-from tmlattice.measurement.monitors import Names, noise_table
+from tmlattice.measurement.monitors import Names, Settings, check_settings, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse
 from tmlattice.measurement.rows import check_size
 from tmlattice.measurement.stored_files import (
@@ -27,12 +27,7 @@ from tmlattice.measurement.stored_files import (
     quoted,
     reading_lines,
 )
-from tmlattice.measurement.trajectory import (
-    COORDINATES,
-    Measurement,
-    Settings,
-    check_settings,
-)
+from tmlattice.measurement.trajectory import COORDINATES, Measurement
 
 Array = NDArray[np.float64]
 
