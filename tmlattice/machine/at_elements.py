@@ -105,13 +105,21 @@ def _matrix(element: Element, energy: float) -> Array:
     return matrix
 
 
-def _turned(wrong: Build, angle: float) -> list[float]:
+def _turned(x: float, y: float, angle: float) -> list[float]:
     """The kick (x, y) turned from x towards y."""
     cosine, sine = np.cos(angle), np.sin(angle)
-    return [
-        float(cosine * wrong.kick_x - sine * wrong.kick_y),
-        float(sine * wrong.kick_x + cosine * wrong.kick_y),
-    ]
+    return [float(cosine * x - sine * y), float(sine * x + cosine * y)]
+
+
+def _frame(wrong: Build, angle: float) -> dict[str, Array]:
+    """The displacement and the rotation of an element, as AT has them."""
+    frame: dict[str, Array] = {}
+    if wrong.dx or wrong.dy:
+        shift = np.array([wrong.dx, 0, wrong.dy, 0, 0, 0])
+        frame |= {"T1": -shift, "T2": shift}
+    if angle:
+        frame |= {"R1": rotation(angle), "R2": rotation(-angle)}
+    return frame
 
 
 def errors_of(element: Element, energy: float) -> Build:
@@ -203,7 +211,9 @@ class Builder:
         """Return the body, or its two halves (`body` of a share of the length) and thin kicks."""
         thin = self._thin(element, wrong, "middle")
         if wrong.kick_x or wrong.kick_y:
-            thin.append(at.Corrector(element.name, 0.0, _turned(wrong, wrong.roll)))
+            thin.append(
+                at.Corrector(element.name, 0.0, _turned(wrong.kick_x, wrong.kick_y, wrong.roll))
+            )
         return [*body(0.5), *thin, *body(0.5)] if thin else body(1.0)
 
     def _marker(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
@@ -234,12 +244,7 @@ class Builder:
     ) -> Callable[[float], list[Any]]:
         """Return a straight multipole of strengths k_n, rolled about its own centre."""
         more: dict[str, Any] = dict(self.walls) if walls else {}
-        angle = element.tilt + wrong.roll
-        if wrong.dx or wrong.dy:
-            shift = np.array([wrong.dx, 0, wrong.dy, 0, 0, 0])
-            more |= {"T1": -shift, "T2": shift}
-        if angle:
-            more |= {"R1": rotation(angle), "R2": rotation(-angle)}
+        more |= _frame(wrong, element.tilt + wrong.roll)
         source = element.source
         skew = [0.0] * len(normal)
         combined = type(source).__name__ == "CombinedMultipole"
@@ -292,9 +297,7 @@ class Builder:
         if strengths[0]:
             raise LatticeError(f"AT cannot build '{element.name}', a thin multipole that bends")
         factorials = np.cumprod([1, *range(1, len(strengths))])
-        more = {}
-        if element.tilt:
-            more = {"R1": rotation(element.tilt), "R2": rotation(-element.tilt)}
+        more = _frame(NOTHING, element.tilt)
         zero = np.zeros(len(strengths))
         return [at.ThinMultipole(element.name, zero, strengths / factorials, **more)]
 
@@ -313,15 +316,13 @@ class Builder:
         if length <= 0 or source.h_pole1 or source.h_pole2:
             raise LatticeError(f"AT cannot build '{element.name}', a thin bend or curved poles")
         roll = wrong.roll
-        kick_x, kick_y = _turned(wrong, -element.tilt)
+        kick_x, kick_y = _turned(wrong.kick_x, wrong.kick_y, -element.tilt)
         horizontal = angle * (wrong.scale - 1) - roll**2 * angle / 2 - kick_x  # minus px
         vertical = kick_y - roll * angle
         # The body is exact in one step; only its errors, losses and gradients are distributed.
         k1 = element.k1 * (1 + setting["k1_relative"]) + wrong.k1
         steps = self.steps if k1 or element.k2 else 4
-        more: dict[str, Any] = {}
-        if element.tilt:
-            more = {"R1": rotation(element.tilt), "R2": rotation(-element.tilt)}
+        more: dict[str, Any] = _frame(NOTHING, element.tilt)
 
         def body(share: float, **edges: float) -> Any:
             return at.Dipole(
@@ -355,9 +356,7 @@ class Builder:
         kick = setting.get("kick", element.angle) * wrong.scale
         x = kick * np.cos(element.tilt) + wrong.kick_x
         y = kick * np.sin(element.tilt) + wrong.kick_y
-        cosine, sine = np.cos(wrong.roll), np.sin(wrong.roll)
-        turned = [cosine * x - sine * y, sine * x + cosine * y]
-        return [at.Corrector(element.name, element.length, turned)]
+        return [at.Corrector(element.name, element.length, _turned(x, y, wrong.roll))]
 
     _vcorrector = _hcorrector  # OCELOT tilts a vertical corrector by a right angle
 

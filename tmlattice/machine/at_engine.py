@@ -225,14 +225,14 @@ class AtEngine:
         for orbits, changed, frequency in self._groups(settings):
             line = self._set(changed)
             late = -self.ring.length * frequency / (1 + frequency)
-            turn = functools.partial(self._pass, line)
+            turn = functools.partial(self.one_pass, line)
             readings[orbits] = at_orbit.settle(turn, start, solve, late)[1]
         return readings
 
     @functools.cached_property
     def _stored(self) -> tuple[Array, Array]:
         """The unset ring's closed orbit, and its Jacobian, for every setting."""
-        return at_orbit.stored(functools.partial(self._pass, self._line))
+        return at_orbit.stored(functools.partial(self.one_pass, self._line))
 
     def stored_line(self, settings: Settings) -> tuple[list[Any], list[Any], float]:
         """Return the line with the settings of one shot, without RF; with the RF that acts on a
@@ -257,8 +257,8 @@ class AtEngine:
             for place in self._cavities:
                 line[place] = self._cavity(line[place], frequency)
 
-    def _pass(self, line: list[Any], beam: Array) -> Array:
-        """Readings of the first of the states [6, shot], which are moved to the line's end."""
+    def one_pass(self, line: list[Any], beam: Array) -> Array:
+        """Return readings of the first state of [6, shot]; all are moved to the line's end."""
         return np.asarray(self.run(line, beam.T, 1, beam)[0, 0])
 
     def lattice(self) -> Any:

@@ -64,7 +64,7 @@ def turns_of(
     state = _orbit(engine, line, late)
     rf = any(isinstance(element, at.RFCavity) for element in with_rf)
     if rf:
-        state = at_orbit.closed(functools.partial(_pass, engine, with_rf), state, ALL, late)
+        state = at_orbit.closed(functools.partial(engine.one_pass, with_rf), state, ALL, late)
     states = np.tile(state, (beam.particles, 1))
     if beam.particles > 1:
         states += _matched(engine, with_rf, state, rf, beam, random)
@@ -89,7 +89,7 @@ def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
     """
     line, _, late = engine.stored_line(settings)
     state = _orbit(engine, line, late)
-    turn = functools.partial(_pass, engine, line)
+    turn = functools.partial(engine.one_pass, line)
     tune = _tunes(turn, state)
     slopes = []
     for step in (ENERGY, -ENERGY):
@@ -100,14 +100,9 @@ def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
 
 def _orbit(engine: AtEngine, line: list[Any], late: float) -> Array:
     """State of the stored beam at the start of the line, without RF, [6]."""
-    turn = functools.partial(_pass, engine, line)
+    turn = functools.partial(engine.one_pass, line)
     start, solve = at_orbit.stored(turn)
     return at_orbit.settle(turn, start, solve, late)[0] if late else start
-
-
-def _pass(engine: AtEngine, line: list[Any], beam: Array) -> Array:
-    """Readings of the first of the states [6, shot], which are moved to the line's end."""
-    return np.asarray(engine.run(line, beam.T, 1, beam)[0, 0])
 
 
 def _tunes(turn: at_orbit.Turn, state: Array) -> Array:
@@ -138,7 +133,7 @@ def _matched(
 
     With the RF they fill its bucket. Without it each keeps its energy, on the orbit of that energy.
     """
-    matrix = at_orbit.one_turn(functools.partial(_pass, engine, line), state)
+    matrix = at_orbit.one_turn(functools.partial(engine.one_pass, line), state)
     drawn = random.standard_normal((beam.particles, 6))
     drawn -= drawn.mean(axis=0)
     sizes = np.sqrt(np.repeat([*beam.emittance, 0.0], 2))

@@ -3,19 +3,20 @@
 import logging
 import pickle
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.by_name import by_name
-from tmlattice.effects import Cause, Settings, beams, check, monitors_with
+from tmlattice.effects import Cause, Settings, background_rms, beams, check, monitors_with
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.lattice.checks import need_monitors
-from tmlattice.machine.shots import Shots, stream
+from tmlattice.machine.shots import Shots, draw_background, stream
 from tmlattice.workers import Caught, Processes, heard
 
 Array = NDArray[np.float64]
@@ -28,18 +29,99 @@ CHUNK = 64
 """Shots tracked at once: memory does not grow with their number."""
 
 
-def true_causes(ring: Ring, causes: Sequence[Cause]) -> list[dict[str, Any]]:
-    """Return causes as in a truth file: "effect", "element", "s" (m, or None), "amount"."""
-    positions = {element.name: element.s for element in ring.elements}
-    return [
-        {
-            "effect": cause.effect,
-            "element": cause.element,
-            "s": positions.get(cause.element or ""),
-            "amount": cause.amount,
+@dataclass(frozen=True, kw_only=True)
+class Errors:
+    """The errors of a simulated machine, as a truth file states them.
+
+    Attributes:
+        ring: the design.
+        causes: errors, without the background.
+        background: rms by effect.
+        seed, machine_seed: of the noise, of the background.
+        more: further inputs: engine, particles, ...
+    """
+
+    ring: Ring
+    causes: tuple[Cause, ...]
+    background: Mapping[str, float]
+    seed: int
+    machine_seed: int
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    def every(self) -> list[Cause]:
+        """Return all errors, those of the background first.
+
+        Raises:
+            EffectError, UnknownNameError: an error that the ring cannot have.
+            LatticeError: a ring without monitors.
+        """
+        causes = [*draw_background(self.ring, self.background, self.machine_seed), *self.causes]
+        need_monitors(self.ring)
+        check(self.ring, causes)
+        return causes
+
+    def truth(self) -> dict[str, Any]:
+        """Return the true state, for `write_truth`: effects, launches, background, seeds."""
+        positions = {element.name: element.s for element in self.ring.elements}
+        return {
+            "effects": [
+                {**vars(cause), "s": positions.get(cause.element or "")} for cause in self.causes
+            ],
+            "launches": np.zeros((0, 5)),
+            "background": {**self.background, **self.more, "machine_seed": self.machine_seed},
+            "seed": self.seed,
         }
-        for cause in causes
-    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredSimulation(Errors):
+    """A simulated measurement of a stored beam and its inputs.
+
+    Attributes:
+        measured: of the simulated kind.
+    """
+
+    measured: Any
+
+
+def errors(
+    ring: Ring,
+    causes: Sequence[Cause],
+    background: Mapping[str, float | None] | None,
+    seed: int,
+    machine_seed: int | None,
+    **more: Any,
+) -> Errors:
+    """Return the errors of a machine, as the arguments of a simulation state them.
+
+    Raises:
+        EffectError, UnknownNameError: a background that is unknown.
+    """
+    return Errors(
+        ring=ring,
+        causes=tuple(causes),
+        background=background_rms(background or {}),
+        seed=seed,
+        machine_seed=seed if machine_seed is None else machine_seed,
+        more=more,
+    )
+
+
+def rms_of(noise: float | Sequence[float]) -> Array:
+    """Return the rms of a reading in x and y, m, [2].
+
+    Raises:
+        TmlatticeError: neither one number nor two, or a negative one.
+    """
+    rms = np.asarray(noise, dtype=float)
+    if rms.shape not in ((), (2,)) or not ((rms >= 0) & (rms < np.inf)).all():
+        raise TmlatticeError(f"the noise is {noise} m; it is an rms, or two (x, y): zero or more")
+    return np.broadcast_to(rms, (2,))
+
+
+def stated_noise(rms: Array, monitors: int) -> Array | None:
+    """Return the noise in the record, [monitor, 2]; None: without noise in a plane."""
+    return np.tile(rms, (monitors, 1)) if (rms > 0).all() else None
 
 
 class Engine(Protocol):
@@ -51,17 +133,26 @@ class Engine(Protocol):
         """Return (x, y) at every monitor, [shot, turn, monitor, 2], from launches [shot, 6]."""
 
 
+def check_engine(name: str) -> None:
+    """Check the name of an engine.
+
+    Raises:
+        TmlatticeError: it is unknown.
+    """
+    if name not in ENGINES:
+        raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(ENGINES)}")
+
+
 def _engine(name: str, ring: Ring, causes: Sequence[Cause], radiation: bool) -> Engine:
-    scale = 1.0 if radiation else 0.0
+    check_engine(name)
+    scale = float(radiation)
     if name == "at":
         from tmlattice.machine.at_engine import AtEngine
 
         return AtEngine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
-    if name == "ocelot":
-        from tmlattice.machine.ocelot_engine import OcelotEngine
+    from tmlattice.machine.ocelot_engine import OcelotEngine
 
-        return OcelotEngine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
-    raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(ENGINES)}")
+    return OcelotEngine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
 
 
 class Machine:
@@ -96,12 +187,7 @@ class Machine:
         self.ring = ring
         self.causes = tuple(causes)
         self.monitors = monitors_with(ring, causes)
-        rms = np.asarray(noise, dtype=float)
-        if rms.shape not in ((), (2,)) or not ((rms >= 0) & (rms < np.inf)).all():
-            raise TmlatticeError(
-                f"the noise is {noise} m; it is an rms, or two (x, y): zero or more"
-            )
-        self.noise = np.broadcast_to(rms, (2,))
+        self.noise = rms_of(noise)
         self.engine = engine
         self._made_of: dict[str, Any] = {"engine": engine, "radiation": radiation, "noise": noise}
         self._engine = _engine(engine, ring, causes, radiation)

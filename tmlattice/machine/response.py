@@ -1,8 +1,6 @@
 """A simulated orbit response: closed orbits of a machine whose errors are known."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +9,17 @@ from tqdm.auto import tqdm
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.rf import rf_of
 from tmlattice.by_name import by_name
-from tmlattice.effects import Cause, Settings, apply, background_rms, check, monitors_with
-from tmlattice.errors import TmlatticeError
+from tmlattice.effects import Cause, Settings, apply, monitors_with
 from tmlattice.lattice import Ring
-from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.at_engine import AtEngine
-from tmlattice.machine.machine import ENGINES, true_causes
-from tmlattice.machine.shots import draw_background, stream
+from tmlattice.machine.machine import (
+    StoredSimulation,
+    check_engine,
+    errors,
+    rms_of,
+    stated_noise,
+)
+from tmlattice.machine.shots import stream
 from tmlattice.measurement import OrbitResponse, RfStep
 from tmlattice.observe.calibration import corrector_scales, offset_of
 
@@ -27,39 +29,6 @@ NOISE = (2e-6, 1.2e-6)
 """rms of an orbit change, m: averaged readings of a stored beam (x, y)."""
 RF_ORBIT = 1.3e-3
 """m; rms over the monitors of the orbit change by the RF's step: hundreds of times the noise."""
-
-
-@dataclass(frozen=True)
-class ResponseSimulation:
-    """A simulated response and its inputs.
-
-    Attributes:
-        measured: the response.
-        ring, causes, background, engine, seed, machine_seed, one_sided: see `simulate_response`.
-    """
-
-    measured: OrbitResponse
-    ring: Ring
-    causes: tuple[Cause, ...]
-    background: Mapping[str, float]
-    engine: str
-    seed: int
-    machine_seed: int
-    one_sided: bool
-
-    def truth(self) -> dict[str, Any]:
-        """Return the true state, for `write_truth`."""
-        return {
-            "effects": true_causes(self.ring, self.causes),
-            "launches": np.zeros((0, 5)),
-            "background": {
-                **self.background,
-                "engine": self.engine,
-                "machine_seed": self.machine_seed,
-                "one_sided": self.one_sided,
-            },
-            "seed": self.seed,
-        }
 
 
 @by_name
@@ -77,7 +46,7 @@ def simulate_response(
     seed: int = 0,
     machine_seed: int | None = None,
     progress: bool = True,
-) -> ResponseSimulation:
+) -> StoredSimulation:
     """Return the response of a machine with known errors to correctors and RF, one by one.
 
     Args:
@@ -103,13 +72,11 @@ def simulate_response(
         TmlatticeError: another engine.
         UnstableRingError: no closed orbit.
     """
-    if engine not in ENGINES:
-        raise TmlatticeError(f"no engine '{engine}'; there are {' and '.join(ENGINES)}")
-    rms = background_rms(background or {})
-    machine_seed = seed if machine_seed is None else machine_seed
-    every = [*draw_background(ring, rms, machine_seed), *causes]
-    check(ring, every)
-    need_monitors(ring)
+    check_engine(engine)
+    made_of = errors(
+        ring, causes, background, seed, machine_seed, engine=engine, one_sided=one_sided
+    )
+    every = made_of.every()
     names = tuple(monitor.name for monitor in ring.monitors)
     design = ResponseModel(ring)
     columns = design.columns(correctors)
@@ -133,7 +100,7 @@ def simulate_response(
         ]
     )
     changes[:, monitors.frozen] = 0.0
-    sigma = np.broadcast_to(np.asarray(noise, dtype=float), (2,))
+    sigma = rms_of(noise)
     for i, change in enumerate(changes):
         change += sigma * stream(seed, "response", i).standard_normal(change.shape)  # noqa: PLW2901
     count = len(columns.names)
@@ -144,14 +111,12 @@ def simulate_response(
         kicks=np.full(count, kick),
         monitors=names,
         response=changes[:count],
-        noise=np.tile(sigma, (len(names), 1)) if (sigma > 0).all() else None,
+        noise=stated_noise(sigma, len(names)),
         rf=stepped,
         lattice=ring.name,
         energy=ring.energy,
     )
-    return ResponseSimulation(
-        measured, ring, tuple(causes), rms, engine, seed, machine_seed, one_sided
-    )
+    return StoredSimulation(measured=measured, **vars(made_of))
 
 
 def rf_step_of(ring: Ring, design: ResponseModel | None = None) -> float:

@@ -117,12 +117,21 @@ def _rms(chain: Chain, launch: Array) -> Array:
     return np.asarray(np.sqrt((readings**2).mean(axis=(1, 2))))
 
 
+def each_setting(given: Sequence[Settings], shots: int) -> tuple[Settings, ...]:
+    """Return the settings of each shot; () are the design's in every one.
+
+    Raises:
+        TmlatticeError: their number differs from that of the shots.
+    """
+    if given and len(given) != shots:
+        raise TmlatticeError(f"{len(given)} settings do not fit {shots} shots; give one for each")
+    return tuple(given) or ({},) * shots
+
+
 def _draw_settings(
     ring: Ring, shots: int, kicks: float, given: Sequence[Settings], seed: int
 ) -> tuple[Settings, ...]:
-    if given and len(given) != shots:
-        raise TmlatticeError(f"{len(given)} settings do not fit {shots} shots; give one for each")
-    own = [{k: dict(v) for k, v in one.items()} for one in given] or [{} for _ in range(shots)]
+    own = [{k: dict(v) for k, v in one.items()} for one in each_setting(given, shots)]
     if kicks:
         correctors = [e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")]
         drawn = kicks * stream(seed, "kicks").standard_normal((shots, len(correctors)))

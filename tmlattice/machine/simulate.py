@@ -9,57 +9,42 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from tmlattice.by_name import by_name
-from tmlattice.effects import Cause, Settings, background_rms
+from tmlattice.effects import Cause, Settings
 from tmlattice.lattice import Ring
-from tmlattice.machine.machine import Machine, true_causes
-from tmlattice.machine.shots import (
-    LAUNCH_SIGMA,
-    Shots,
-    draw_background,
-    draw_shots,
-)
+from tmlattice.machine.machine import Errors, Machine, errors, stated_noise
+from tmlattice.machine.shots import LAUNCH_SIGMA, Shots, draw_shots
 from tmlattice.measurement import Measurement, measurement_writer
 
 
-@dataclass(frozen=True)
-class Simulation:
+@dataclass(frozen=True, kw_only=True)
+class Simulation(Errors):
     """A machine and the shots of its measurement.
 
     Attributes:
         machine: with causes and background.
         shots: launches and settings.
-        causes: without the background.
-        background: rms by effect.
-        turns, seed: of the measurement; the seed is that of the noise.
-        machine_seed: of the background.
-        radiation: whether bends and wigglers radiate.
+        turns: of the measurement.
     """
 
     machine: Machine
     shots: Shots
-    causes: tuple[Cause, ...]
-    background: Mapping[str, float]
     turns: int
-    seed: int
-    machine_seed: int
-    radiation: bool
 
     def measurement(self) -> Measurement:
         """Return all shots."""
         readings = [
             reading for _, reading in self.machine.measure(self.shots, self.turns, self.seed)
         ]
-        names = tuple(monitor.name for monitor in self.machine.ring.monitors)
-        noise = np.tile(self.machine.noise, (len(names), 1))
+        names = tuple(monitor.name for monitor in self.ring.monitors)
         return Measurement(
             launches=self.shots.nominal,
             readings=np.stack(readings),
             monitors=names,
-            noise=noise if (noise > 0).all() else None,
+            noise=stated_noise(self.machine.noise, len(names)),
             launch_sigma=np.tile(self.shots.sigma, (len(self.shots), 1)),
             settings=self.shots.settings,
-            lattice=self.machine.ring.name,
-            energy=self.machine.ring.energy,
+            lattice=self.ring.name,
+            energy=self.ring.energy,
         )
 
     def write(
@@ -77,10 +62,9 @@ class Simulation:
             OutputError: it cannot be written.
             MeasurementError: the folder contains a measurement.
         """
-        ring, noise = self.machine.ring, self.machine.noise
+        ring, noise, shots = self.ring, self.machine.noise, self.shots
         names = [monitor.name for monitor in ring.monitors]
         known = (float(noise[0]), float(noise[1])) if (noise > 0).all() else None
-        shots = self.shots
         with measurement_writer(folder, names, known, ring.name, ring.energy, force) as writer:
             measured = self.machine.measure(shots, self.turns, self.seed, jobs)
             for shot, readings in tqdm(
@@ -90,17 +74,7 @@ class Simulation:
 
     def truth(self) -> dict[str, Any]:
         """Return the true state, for `write_truth`: effects, launches, background, seeds."""
-        return {
-            "effects": true_causes(self.machine.ring, self.causes),
-            "launches": self.shots.launches[:, [0, 1, 2, 3, 5]],
-            "background": {
-                **self.background,
-                "radiation": self.radiation,
-                "engine": self.machine.engine,
-                "machine_seed": self.machine_seed,
-            },
-            "seed": self.seed,
-        }
+        return {**super().truth(), "launches": self.shots.launches[:, [0, 1, 2, 3, 5]]}
 
 
 @by_name
@@ -142,11 +116,11 @@ def simulate(
     Raises:
         EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
     """
-    rms = background_rms(background or {})
-    machine_seed = seed if machine_seed is None else machine_seed
-    small = draw_background(ring, rms, machine_seed)
-    machine = Machine(ring, [*small, *causes], engine=engine, radiation=radiation, noise=noise)
+    made_of = errors(
+        ring, causes, background, seed, machine_seed, radiation=radiation, engine=engine
+    )
+    machine = Machine(ring, made_of.every(), engine=engine, radiation=radiation, noise=noise)
     drawn = draw_shots(
         ring, shots, amplitude, sigma=launch_sigma, kicks=kicks, settings=settings, seed=seed
     )
-    return Simulation(machine, drawn, tuple(causes), rms, turns, seed, machine_seed, radiation)
+    return Simulation(machine=machine, shots=drawn, turns=turns, **vars(made_of))

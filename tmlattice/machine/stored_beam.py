@@ -9,29 +9,20 @@ the ring's RF. Readings have the monitors' errors, and noise.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.rf import rf_of
-from tmlattice.effects import (
-    Cause,
-    Monitors,
-    Settings,
-    background_rms,
-    check,
-    monitors_with,
-)
+from tmlattice.effects import Cause, Settings, monitors_with
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Ring
-from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.at_stored import Beam, tunes_of, turns_of
-from tmlattice.machine.machine import true_causes
+from tmlattice.machine.machine import StoredSimulation, errors, rms_of, stated_noise
 from tmlattice.machine.response import NOISE, energies, rf_step_of, spread_of
-from tmlattice.machine.shots import draw_background, draw_shots, stream
+from tmlattice.machine.shots import draw_shots, each_setting, stream
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
 
 Array = NDArray[np.float64]
@@ -43,85 +34,33 @@ TUNE_NOISE = (2e-5, 0.05)
 """rms of a tune, and of a chromaticity."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class StoredSimulation:
-    """A simulated measurement of a stored beam and its inputs.
-
-    Attributes:
-        measured: of the simulated kind.
-        ring: the design.
-        causes: errors, without the background.
-        background: rms by effect.
-        seed, machine_seed: of the noise, of the background.
-        more: further inputs: kicks, particles, ...
-    """
-
-    measured: TurnByTurn | ClosedOrbit | Dispersion | TuneReading
-    ring: Ring
-    causes: tuple[Cause, ...]
-    background: Mapping[str, float]
-    seed: int
-    machine_seed: int
-    more: Mapping[str, Any] = field(default_factory=dict)
-
-    def truth(self) -> dict[str, Any]:
-        """Return the true state, for `write_truth`."""
-        return {
-            "effects": true_causes(self.ring, self.causes),
-            "launches": np.zeros((0, 5)),
-            "background": {
-                **self.background,
-                "engine": "at",
-                "machine_seed": self.machine_seed,
-                **self.more,
-            },
-            "seed": self.seed,
-        }
-
-
-@dataclass(frozen=True)
 class _Machine:
-    """The ring with all its errors."""
+    """The ring with all its errors, of the arguments that all simulations have."""
 
-    engine: AtEngine
-    every: list[Cause]
-    monitors: Monitors
-    made_of: dict[str, Any]
-
-    def read(self, beam: Array) -> Array:
-        """Return the monitors' readings of the beam, [..., monitor, 2], without noise."""
-        return self.monitors.read(beam)
-
-    def fields(self) -> dict[str, Any]:
-        """Return the records' fields of the ring."""
-        ring = self.engine.ring
+    def __init__(
+        self,
+        ring: Ring,
+        causes: Sequence[Cause],
+        background: Mapping[str, float | None] | None,
+        seed: int,
+        machine_seed: int | None,
+        radiation: bool = False,
+    ) -> None:
+        self.made_of = errors(ring, causes, background, seed, machine_seed)
+        self.every = self.made_of.every()
+        scale = float(radiation)
+        self.engine = AtEngine(ring, self.every, radiation_bends=scale, radiation_wigglers=scale)
+        self.monitors = monitors_with(ring, self.every)
         names = tuple(monitor.name for monitor in ring.monitors)
-        return {"monitors": names, "lattice": ring.name, "energy": ring.energy}
+        self.fields: dict[str, Any] = {
+            "monitors": names, "lattice": ring.name, "energy": ring.energy
+        }  # fmt: skip
 
-
-def _machine(
-    ring: Ring,
-    causes: Sequence[Cause],
-    background: Mapping[str, float | None] | None,
-    seed: int,
-    machine_seed: int | None,
-    radiation: bool = False,
-) -> _Machine:
-    rms = background_rms(background or {})
-    machine_seed = seed if machine_seed is None else machine_seed
-    every = [*draw_background(ring, rms, machine_seed), *causes]
-    check(ring, every)
-    need_monitors(ring)
-    scale = float(radiation)
-    engine = AtEngine(ring, every, radiation_bends=scale, radiation_wigglers=scale)
-    made_of = {
-        "ring": ring,
-        "causes": tuple(causes),
-        "background": rms,
-        "seed": seed,
-        "machine_seed": machine_seed,
-    }
-    return _Machine(engine, every, monitors_with(ring, every), made_of)
+    def simulation(self, measured: Any, **more: Any) -> StoredSimulation:
+        """Return the measurement with its inputs."""
+        return StoredSimulation(
+            **{**vars(self.made_of), "more": {"engine": "at", **more}}, measured=measured
+        )
 
 
 def simulate_turns(
@@ -169,7 +108,7 @@ def simulate_turns(
         UnstableRingError: no closed orbit, or no stable motion.
         MeasurementError: too few or too many turns.
     """
-    machine = _machine(ring, causes, background, seed, machine_seed, radiation)
+    machine = _Machine(ring, causes, background, seed, machine_seed, radiation)
     own = spread_of(machine.every)
     if own and particles == 1:
         raise TmlatticeError(
@@ -180,7 +119,7 @@ def simulate_turns(
     else:
         kicked = np.tile([0.0, kick[0], 0.0, kick[1]], (shots, 1))
     beam = Beam(particles, (emittance[0], emittance[1]), float(np.hypot(spread, own)))
-    each = _settings(settings, shots)
+    each = each_setting(settings, shots)
     monitors, further = machine.monitors, turns + machine.monitors.ahead
     readings = np.stack(
         [
@@ -192,19 +131,17 @@ def simulate_turns(
     )
     # before its kick the beam is on the closed orbit
     orbit = _orbits(machine, each)[:, None] if (monitors.late < 0).any() else np.nan
-    readings = machine.read(monitors.counted(readings, turns, orbit))
-    frozen = machine.monitors.frozen
-    sigma, known = _noise(noise, len(ring.monitors))
+    readings = monitors.read(monitors.counted(readings, turns, orbit))
+    sigma = rms_of(noise)
     for i, reading in enumerate(readings):
         reading += sigma * stream(seed, "turns", i).standard_normal(reading.shape)  # noqa: PLW2901
-    readings[:, :, frozen] = readings[0, 0, frozen]
+    readings[:, :, monitors.frozen] = readings[0, 0, monitors.frozen]
+    known = stated_noise(sigma, len(ring.monitors))
     measured = TurnByTurn(
-        readings=readings, noise=known, settings=each if settings else (), **machine.fields()
+        readings=readings, noise=known, settings=each if settings else (), **machine.fields
     )
-    more: dict[str, Any] = {"particles": particles, "radiation": radiation}
-    if particles > 1:
-        more |= {"emittance": list(beam.emittance), "spread": beam.spread}
-    return StoredSimulation(measured=measured, more=more, **machine.made_of)
+    many = {"emittance": list(beam.emittance), "spread": beam.spread} if particles > 1 else {}
+    return machine.simulation(measured, particles=particles, radiation=radiation, **many)
 
 
 def simulate_orbits(
@@ -227,17 +164,18 @@ def simulate_orbits(
 
     The other arguments and the errors are as in `simulate_turns`.
     """
-    machine = _machine(ring, causes, background, seed, machine_seed, radiation)
-    each = _settings(settings, shots)
-    orbit = machine.read(_orbits(machine, each))
-    sigma, known = _noise(noise, len(ring.monitors))
+    machine = _Machine(ring, causes, background, seed, machine_seed, radiation)
+    each = each_setting(settings, shots)
+    orbit = machine.monitors.read(_orbits(machine, each))
+    sigma = rms_of(noise)
     for i, reading in enumerate(orbit):
         reading += sigma * stream(seed, "orbit", i).standard_normal(reading.shape)  # noqa: PLW2901
     orbit[:, machine.monitors.frozen] = orbit[0, machine.monitors.frozen]
+    known = stated_noise(sigma, len(ring.monitors))
     measured = ClosedOrbit(
-        orbit=orbit, noise=known, settings=each if settings else (), **machine.fields()
+        orbit=orbit, noise=known, settings=each if settings else (), **machine.fields
     )
-    return StoredSimulation(measured=measured, more={"radiation": radiation}, **machine.made_of)
+    return machine.simulation(measured, radiation=radiation)
 
 
 def simulate_dispersion(
@@ -261,23 +199,24 @@ def simulate_dispersion(
 
     The other arguments and the errors are as in `simulate_turns`.
     """
-    machine = _machine(ring, causes, background, seed, machine_seed)
+    machine = _Machine(ring, causes, background, seed, machine_seed)
     rf = rf_of(ring)
     frequency = rf.frequency(ring)
     chosen = [rf_step_of(ring)] if steps is None else [float(step) for step in steps]
-    sigma, known = _noise(noise, len(ring.monitors))
+    sigma = rms_of(noise)
     made = []
     for i, step in enumerate(chosen):
         low = 0.0 if one_sided else -step / 2
-        down, up = machine.read(
+        down, up = machine.monitors.read(
             _orbits(machine, [_rf_setting(s / frequency) for s in (low, low + step)])
         )
         change = up - down
         change[machine.monitors.frozen] = 0.0
         change += sigma * stream(seed, "dispersion", i).standard_normal(change.shape)
         made.append(RfStep(frequency, rf.harmonic, step, change))
-    measured = Dispersion(steps=tuple(made), noise=known, **machine.fields())
-    return StoredSimulation(measured=measured, more={"one_sided": one_sided}, **machine.made_of)
+    known = stated_noise(sigma, len(ring.monitors))
+    measured = Dispersion(steps=tuple(made), noise=known, **machine.fields)
+    return machine.simulation(measured, one_sided=one_sided)
 
 
 def simulate_tunes(
@@ -301,24 +240,23 @@ def simulate_tunes(
 
     The other arguments and the errors are as in `simulate_turns`.
     """
-    machine = _machine(ring, causes, background, seed, machine_seed)
-    each = _settings(settings, shots)
+    machine = _Machine(ring, causes, background, seed, machine_seed)
+    each = each_setting(settings, shots)
     found = {key: tunes_of(machine.engine, s) for key, s in {repr(s): s for s in each}.items()}
     values = np.array([found[repr(s)] for s in each])  # [shot, tune or chromaticity, mode]
     for i, value in enumerate(values):
         value += np.reshape(noise, (2, 1)) * stream(seed, "tunes", i).standard_normal((2, 2))  # noqa: PLW2901
-    fields = machine.fields()
-    fields.pop("monitors")
-    errors = [np.full((shots, 2), rms) if rms > 0 else None for rms in noise]
+    sigma = [np.full((shots, 2), rms) if rms > 0 else None for rms in noise]
     measured = TuneReading(
         tune=values[:, 0] % 1,
-        tune_error=errors[0],
+        tune_error=sigma[0],
         chromaticity=values[:, 1] if chromaticity else None,
-        chromaticity_error=errors[1] if chromaticity else None,
+        chromaticity_error=sigma[1] if chromaticity else None,
         settings=each if settings else (),
-        **fields,
+        lattice=ring.name,
+        energy=ring.energy,
     )
-    return StoredSimulation(measured=measured, **machine.made_of)
+    return machine.simulation(measured)
 
 
 def _orbits(machine: _Machine, settings: Sequence[Settings]) -> Array:
@@ -346,17 +284,3 @@ def _with_frequency(settings: Settings, relative: float) -> Settings:
         if name.casefold() == "rf"
     )
     return changed | dict(_rf_setting(before + relative))
-
-
-def _settings(given: Sequence[Settings], shots: int) -> tuple[Settings, ...]:
-    if given and len(given) != shots:
-        raise TmlatticeError(f"{len(given)} settings do not fit {shots} shots; give one for each")
-    return tuple(given) or ({},) * shots
-
-
-def _noise(noise: Noise, monitors: int) -> tuple[Array, Array | None]:
-    """rms in (x, y), and the noise in the record."""
-    sigma = np.broadcast_to(np.asarray(noise, dtype=float), (2,))
-    if not ((sigma >= 0) & (sigma < np.inf)).all():
-        raise TmlatticeError(f"the noise is {noise} m; it is an rms, or two (x, y): zero or more")
-    return sigma, np.tile(sigma, (monitors, 1)) if (sigma > 0).all() else None
