@@ -14,7 +14,7 @@ from tmlattice.diagnosis.kinds import How
 from tmlattice.diagnosis.next_kind import KINDS, minutes_of, next_kind
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.report.next_shot import next_text
+from tmlattice.report.action_texts import next_text
 from tmlattice.report.text import to_do
 
 WEAK = Cause("quadrupole_gradient", "QD::3", -0.01)

@@ -1,6 +1,6 @@
 """Sentences and tables of a correction, for the terminal and the page."""
 
-from tmlattice.correction.result import Correction, Setting
+from tmlattice.correction.result import Correction
 from tmlattice.correction.targets import TARGETS
 from tmlattice.report.text import columns, wrapped
 
@@ -8,37 +8,25 @@ MOST = 20
 """Devices that are listed; the table has all."""
 
 
-def settings_head() -> list[str]:
-    """Head of the table of settings."""
-    return ["device", "present", "new", "change", "unit", "limits", "gain"]
-
-
-def setting_row(setting: Setting) -> list[str]:
-    """A row of the table of settings."""
-    knob = setting.knob
-    ends = ["" if abs(end) == float("inf") else f"{end:.6g}" for end in (knob.low, knob.high)]
-    limits = " to ".join(ends) if any(ends) else "-"
-    change = setting.new - knob.present
-    return [
-        knob.name, f"{knob.present:.6g}", f"{setting.new:.6g}", f"{change:+.3g}", knob.unit,
-        limits + (" (at its limit)" if setting.at_limit else ""),
-        f"{100 * setting.gain:.1f} %",
-    ]  # fmt: skip
-
-
 def setting_rows(correction: Correction) -> list[list[str]]:
-    """Rows of the table of settings, the first `MOST`."""
-    return [setting_row(setting) for setting in correction.settings[:MOST]]
-
-
-def expected_head() -> list[str]:
-    """Head of the table of targets."""
-    return ["rms", "", "now", "expected", "68 %", "not reachable", "not determined"]
+    """Head and rows of the table of settings, the first `MOST`."""
+    rows = [["device", "present", "new", "change", "unit", "limits", "gain"]]
+    for setting in correction.settings[:MOST]:
+        knob = setting.knob
+        ends = ["" if abs(end) == float("inf") else f"{end:.6g}" for end in (knob.low, knob.high)]
+        limits = " to ".join(ends) if any(ends) else "-"
+        rows.append([
+            knob.name, f"{knob.present:.6g}", f"{setting.new:.6g}",
+            f"{setting.new - knob.present:+.3g}", knob.unit,
+            limits + (" (at its limit)" if setting.at_limit else ""),
+            f"{100 * setting.gain:.1f} %",
+        ])  # fmt: skip
+    return rows
 
 
 def expected_rows(correction: Correction) -> list[list[str]]:
-    """Rows of the table of targets."""
-    rows = []
+    """Head and rows of the table of targets."""
+    rows = [["rms", "", "now", "expected", "68 %", "not reachable", "not determined"]]
     for name in correction.before:
         target = TARGETS[name]
         for plane in (0, 1):
@@ -62,16 +50,14 @@ def amount(name: str, value: float) -> str:
     return f"{value:.2g}"
 
 
-def gain_head(correction: Correction) -> list[str]:
-    """Head of the table of gains."""
-    return ["devices", *(TARGETS[name].words for name in correction.counted)]
-
-
 def gain_rows(correction: Correction) -> list[list[str]]:
-    """Rows of gains: number of devices, expected rms of each target in the worse plane."""
+    """Head and rows of gains: number of devices, expected rms of each target in the worse plane."""
     return [
-        [str(n), *(amount(name, max(rms[name])) for name in correction.counted)]
-        for n, rms in correction.gains
+        ["devices", *(TARGETS[name].words for name in correction.counted)],
+        *(
+            [str(n), *(amount(name, max(rms[name])) for name in correction.counted)]
+            for n, rms in correction.gains
+        ),
     ]
 
 
@@ -79,13 +65,13 @@ def correction_text(correction: Correction, width: int = 100) -> str:
     """The whole report as plain text."""
     lines = wrapped(correction.words, "", width)
     if correction.settings:
-        lines += ["", *columns([settings_head(), *setting_rows(correction)])]
+        lines += ["", *columns(setting_rows(correction))]
         if len(correction.settings) > MOST:
             lines += [f"and {len(correction.settings) - MOST} more (settings.csv)"]
-    lines += ["", *columns([expected_head(), *expected_rows(correction)])]
+    lines += ["", *columns(expected_rows(correction))]
     if correction.gains:
         lines += ["", "Expected rms with the first devices:"]
-        lines += columns([gain_head(correction), *gain_rows(correction)])
+        lines += columns(gain_rows(correction))
     for sentence in sentences(correction):
         lines += ["", *wrapped(sentence, "", width)]
     return "\n".join(lines)

@@ -8,14 +8,12 @@ from typing import NamedTuple
 
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
-from tmlattice.report.next_shot import next_text
+from tmlattice.report.action_texts import next_text
 from tmlattice.report.response_text import steps_text
 from tmlattice.report.tables import (
     LARGE_TITLE,
     large_text,
-    number_head,
     number_rows,
-    optics_head,
     optics_rows,
 )
 from tmlattice.report.text import (
@@ -25,7 +23,6 @@ from tmlattice.report.text import (
     columns,
     correlation_rows,
     finding_rows,
-    gap_head,
     gap_rows,
     noise_text,
     sensitivity_rows,
@@ -94,7 +91,7 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
         yield _Part(4, "suspects", lines)
     if diagnosis.correlations:
         lines = [*wrapped(CORRELATED, "", width)]
-        for one, other, correlation in correlation_rows(diagnosis):
+        for one, other, correlation in correlation_rows(diagnosis)[1:]:
             lines += wrapped(f"{one}; {other}: {correlation}", "   ", width)
         yield _Part(9, "correlations", lines)
     if more := next_text(diagnosis) or advice(diagnosis):
@@ -111,7 +108,7 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
         yield _Part(6, "distributed errors", lines)
     if diagnosis.steps:
         if optics := optics_rows(diagnosis):
-            yield _Part(5, "optics", columns([optics_head(diagnosis), *optics]))
+            yield _Part(5, "optics", columns(optics))
         paragraph: list[str] = []
         for line in [*steps_text(diagnosis, width), ""]:
             if line:
@@ -132,15 +129,11 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
 
 def _gap_table(diagnosis: Diagnosis) -> list[str]:
     before, after = tune_texts(diagnosis)
-    rows = [
-        gap_head(diagnosis),
-        *gap_rows(diagnosis),
-        ("fractional tunes Qx, Qy", before, after),
-    ]
+    rows = [*gap_rows(diagnosis), ("fractional tunes Qx, Qy", before, after)]
     noise = noise_text(diagnosis)
     lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows)
     numbers = number_rows(diagnosis)
     if numbers:
-        lines += ["", *columns([number_head(diagnosis), *numbers[:MOST]])]
-        lines += [f"and {len(numbers) - MOST} more"] if len(numbers) > MOST else []
+        lines += ["", *columns(numbers[: MOST + 1])]
+        lines += [f"and {len(numbers) - MOST - 1} more"] if len(numbers) > MOST + 1 else []
     return lines

@@ -20,9 +20,10 @@ PULLS = 4
 
 
 def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
-    """Rows of the table of steps: effect (in the first step the model), parameters, held-out rms in
-    µm."""
-    return [
+    """Head and rows of the table of steps: effect (in the first step the model), parameters,
+    held-out rms in µm."""
+    head = ("step", "parameters", "in-plane", "with jump", "coupling", "with roll", "RF", "chi2")
+    rows: list[tuple[str, ...]] = [
         (
             (model if step.effect == "design" else "") or step.effect,
             str(step.parameters),
@@ -35,14 +36,12 @@ def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
         )
         for step in steps
     ]
+    return [head, *rows]
 
 
 def three_digits(metres: float) -> str:
     """A length in µm with three digits; empty where nothing was read."""
     return f"{1e6 * metres:.3g}" if np.isfinite(metres) else ""
-
-
-HEAD = ("step", "parameters", "in-plane", "with jump", "coupling", "with roll", "RF", "chi2")
 
 
 HYPOTHESIS = (
@@ -52,9 +51,9 @@ HYPOTHESIS = (
 
 
 def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
-    """Rows of the table of hypotheses: amount and error (of several: rms, typical error), held-out
-    rms."""
-    return [
+    """Head and rows of the table of hypotheses: amount and error (of several: rms, typical error),
+    held-out rms."""
+    rows: list[tuple[str, ...]] = [
         (
             row.effect,
             str(row.parameters),
@@ -69,6 +68,7 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
         )
         for row in result.hypotheses or ()
     ]
+    return [HYPOTHESIS, *rows]
 
 
 def largest(result: Diagnosis, effect: str) -> list[str]:
@@ -263,10 +263,10 @@ def bad_monitors_text(result: Diagnosis) -> str:
 def steps_text(result: Diagnosis, width: int) -> list[str]:
     """The section of the plain text, as lines."""
     lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
-    lines += columns([HEAD, *step_rows(result.steps, result.ring.model)], right=True)
+    lines += columns(step_rows(result.steps, result.ring.model), right=True)
     if result.rejected_steps:
         lines += ["", REJECTED]
-        lines += columns([HEAD, *step_rows(result.rejected_steps)], right=True)
+        lines += columns(step_rows(result.rejected_steps), right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.common_factors is not None:
         lines += ["", "Common factors of the gradients:"]
@@ -294,7 +294,7 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
             "",
             "Missing effects: held-out rms in µm, each alone, and on top of those that improve:",
         ]
-        lines += columns([HYPOTHESIS, *hypothesis_rows(result)], right=True)
+        lines += columns(hypothesis_rows(result), right=True)
     for said in result.degenerate:
         lines += wrapped(f"Not determined by the data: {said}.", "", width)
     return lines

@@ -109,8 +109,8 @@ MOST = 8
 
 
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """The stored beam on energy, of the design and estimated: (quantity, design, estimated). The
-    closed orbit is listed where it was measured or is changed. Empty without errors of the ring."""
+    """Head and rows of the stored beam on energy: (quantity, design, estimated). The closed orbit
+    is listed where it was measured or is changed. Empty without errors of the ring."""
     effects = (find(cause.effect) for cause in diagnosis.causes)
     if not any(isinstance(own, RingEffect) and not own.acts_on_settings for own in effects):
         return []
@@ -129,6 +129,7 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
     tunes = pair(beams.design, 1, 5), pair(None if beams.found is None else beams.found.tunes, 1, 5)
     return [
+        ("stored beam on energy", diagnosis.ring.model, "estimated"),
         ("fractional tunes, x / y", *tunes),
         row("beta beating, rms [%]", "beta_beat_rms", 100, 2),
         row("beta beating, largest [%]", "beta_beat_max", 100, 2),
@@ -137,22 +138,10 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     ]
 
 
-def optics_head(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Head of `optics_rows`."""
-    return "stored beam on energy", diagnosis.ring.model, "estimated"
-
-
-def number_head(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Head of `number_rows`."""
-    return "tunes", "read", diagnosis.ring.model, "estimated"
-
-
 def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
-    """Tunes and chromaticities: (name, measured with its error, of the design, of the estimated
-    ring).
-
-    With the measurement and the shot where there are several.
-    """
+    """Head and rows of tunes and chromaticities: (name, measured with its error, of the design, of
+    the estimated ring), with the measurement and the shot where there are several. Empty where none
+    was read."""
     rows: list[tuple[str, ...]] = []
     with_numbers = [part for part in diagnosis.parts if part.numbers]
     for part in with_numbers:
@@ -168,7 +157,7 @@ def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
                 for value in (number.read, number.before, number.after, number.error)
             )
             rows.append((name, f"{read} ± {error}", *models))
-    return rows
+    return [("tunes", "read", diagnosis.ring.model, "estimated"), *rows] if rows else []
 
 
 LARGE = 3.0

@@ -17,6 +17,7 @@ from tmlattice.report.action_texts import (
     action_text,
     consequence_text,
     mechanism_text,
+    next_text,
     or_text,
     title,
 )
@@ -28,7 +29,6 @@ from tmlattice.report.amounts import (
     probability_text,
     words,
 )
-from tmlattice.report.next_shot import next_text
 from tmlattice.speaks import micrometres
 
 __all__ = ["amount_text", "least_text", "probability_text", "title", "words"]  # of its page too
@@ -240,7 +240,7 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 def gap_sentence(diagnosis: Diagnosis) -> str:
     """The rms residual before and after, on the validation set."""
     rows = gap_rows(diagnosis)
-    shown = rows if diagnosis.heldout is None else rows[-1:]
+    shown = rows[1:] if diagnosis.heldout is None else rows[-1:]
     return "; ".join(f"{name}: from {before} to {after}" for name, before, after in shown)
 
 
@@ -286,31 +286,25 @@ MOST = 6
 """Other recommended actions that a finding lists."""
 
 
-def gap_head(diagnosis: Diagnosis) -> tuple[str, str, str]:
-    """Head of `gap_rows`: what the model is."""
+def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Head and rows of the residuals of fitted and held-out readings, before and after: rms in µm
+    and chi-square per reading."""
     model, gap = diagnosis.ring.model, diagnosis.heldout
     if diagnosis.since_reference:
         model = "reference"
     elif gap is not None and gap.baseline:
         model = f"{model} with distributed errors" if diagnosis.priors else "before"
-    return "readings less model, rms", model, "with the findings"
-
-
-def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """Residuals of fitted and held-out readings, before and after: rms in µm and chi-square per
-    reading."""
     what = "correctors" if diagnosis.by_steps else "readings" if diagnosis.parts else "shots"
     rows = [(f"{what} of the fit", diagnosis.fit_before, diagnosis.fit_after)]
     if len(diagnosis.parts) > 1:
         rows = [(part.label, part.before, part.after) for part in diagnosis.parts]
-    gap = diagnosis.heldout
     if gap is not None:
         rows.append(
             (f"held out ({heldout_text(diagnosis)})", gap.misfits[gap.baseline], gap.misfits[-1])
         )
     return [
-        (name, *(_misfit_text(m) for m in (before, after)))  # type: ignore[misc]
-        for name, before, after in rows
+        ("readings less model, rms", model, "with the findings"),
+        *((name, _misfit_text(before), _misfit_text(after)) for name, before, after in rows),
     ]
 
 
@@ -390,14 +384,17 @@ CORRELATED = "Correlated amounts: the data determine a combination of the two be
 
 
 def correlation_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """Strongly correlated amounts: (one, other, correlation)."""
+    """Head and rows of strongly correlated amounts: (one, other, correlation)."""
 
     def named(effect: str, element: str | None) -> str:
         return f"{words(effect)}, {labelled(element or 'the beam', diagnosis.devices)}"
 
     return [
-        (named(*pair.first), named(*pair.second), f"{pair.correlation:+.3f}")
-        for pair in diagnosis.correlations
+        ("one amount", "other amount", "correlation"),
+        *(
+            (named(*pair.first), named(*pair.second), f"{pair.correlation:+.3f}")
+            for pair in diagnosis.correlations
+        ),
     ]
 
 
