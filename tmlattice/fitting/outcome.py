@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.fitting.adam import FitResult
-from tmlattice.fitting.advice import advice
-from tmlattice.fitting.method_fit import MethodFit, errors, pair, trusted
+from tmlattice.fitting.method_fit import MethodFit, advice, errors, pair, trusted
 from tmlattice.late import Method
 from tmlattice.lattice import Ring
 from tmlattice.speaks import Speaks, last_part
@@ -65,7 +64,7 @@ class TuneFit(Speaks):
     noise_estimated: bool = False
 
     plot = Method(
-        "tmlattice.plots.orbit",
+        "tmlattice.plots.tune_fit",
         "plot_orbit_fit",
         "Draw the readings and each method's residual: a matplotlib Figure.",
     )

@@ -62,20 +62,14 @@ class LayerEffects:
     D2: Array = field(repr=False)
 
 
-def layer_effects(
-    ring: Ring, dimension: int = 4, effects: Sequence[str] | None = None
-) -> LayerEffects:
-    """Return directions of all effects that act through one layer and change no read-out.
+def layer_effects(ring: Ring, dimension: int = 4) -> LayerEffects:
+    """Return directions of all usual effects that act through one layer and change no read-out.
 
     Args:
         ring: the design.
         dimension: of the network, 4 or 6.
-        effects: names; else all usual ones.
-
-    Raises:
-        UnknownNameError: an effect that does not exist.
     """
-    chosen = [name for name in names(effects) if isinstance(CATALOGUE[name], RingEffect)]
+    chosen = [name for name in names() if isinstance(CATALOGUE[name], RingEffect)]
     if dimension == 4:
         chosen = [name for name in chosen if not CATALOGUE[name].energy]
     asked = [(name, place) for name in chosen for place in CATALOGUE[name].places(ring)]

@@ -1,11 +1,15 @@
 """Figures. Every function takes `ax` (or makes one) and returns it; labels carry units."""
 
-from tmlattice.plots.history import plot_loss
 from tmlattice.plots.optics import plot_betas, plot_phase_space
-from tmlattice.plots.orbit import plot_orbit, plot_orbit_fit
-from tmlattice.plots.spectrum import plot_spectrum, plot_tune_fit_spectrum
 from tmlattice.plots.strip import lattice_strip
 from tmlattice.plots.study import plot_study
+from tmlattice.plots.tune_fit import (
+    plot_loss,
+    plot_orbit,
+    plot_orbit_fit,
+    plot_spectrum,
+    plot_tune_fit_spectrum,
+)
 from tmlattice.plots.weights import plot_weights
 
 __all__ = [

@@ -1,0 +1,178 @@
+"""Figures of a tune fit: the readings along the ring, the loss, the spectra."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from tmlattice.harmonics import levelled, normalised
+from tmlattice.optics import Optics, one_turn_optics
+from tmlattice.plots.strip import METHOD_COLOURS, lattice_strip
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tmlattice.fitting import FitResult, TuneFit
+
+
+def plot_orbit(
+    s: ArrayLike, position: ArrayLike, ax: Axes | None = None, label: str = "", style: str = "-"
+) -> Axes:
+    """Position of the beam at the monitors.
+
+    Args:
+        s: [monitor], m.
+        position: one plane, [monitor], m.
+        ax: where to draw; else a new one.
+        label, style: of the line.
+    """
+    if ax is None:
+        _, ax = plt.subplots()
+    ax.plot(np.asarray(s), 1e3 * np.asarray(position), style, label=label, linewidth=0.9, ms=2.5)
+    ax.set_ylabel("position [mm]")
+    return ax
+
+
+def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
+    """What the monitors read, the design's orbit and each method's, their residuals, the lattice.
+
+    Args:
+        outcome: of `tune_fit`.
+        figure: an empty one; else a new one.
+    """
+    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
+    noise = "" if outcome.noise is None else f", noise {1e6 * outcome.noise:.1f} µm"
+    magnet = None if outcome.magnet is None else outcome.ring[outcome.magnet]
+    grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
+    for plane, name in enumerate("xy"):
+        orbit, residual = grid[2 * plane], grid[2 * plane + 1]
+        measured = outcome.measured[:, plane]
+        plot_orbit(outcome.s, measured, orbit, "read by the monitors", "k.")
+        plot_orbit(outcome.s, outcome.before[:, plane], orbit, "design network", "C0-")
+        fitted = [m for m in reversed(outcome.methods) if m.fit is not None]  # the first on top
+        for method in fitted:
+            plot_orbit(outcome.s, method.after[:, plane], orbit, method.method)
+            orbit.lines[-1].set_color(METHOD_COLOURS.get(method.method, "C4"))
+        orbit.set_ylabel(f"{name} [mm]")
+        rms = []
+        models = [("before", outcome.before, "C0")]
+        models += [(m.method, m.after, METHOD_COLOURS.get(m.method, "C4")) for m in fitted]
+        for what, model, colour in models:
+            left = measured - model[:, plane]
+            if np.isfinite(left).any():
+                rms.append(f"{what} {1e6 * np.sqrt(np.nanmean(left**2)):.1f} µm")
+            residual.plot(outcome.s, 1e3 * left, color=colour, linewidth=0.8)
+        residual.set_ylabel(f"residual {name} [mm]")
+        residual.annotate(
+            f"rms {', '.join(rms) or '-'}{noise}",
+            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
+        )  # fmt: skip
+        low, high = residual.get_ylim()
+        residual.set_ylim(low, high + 0.25 * (high - low))  # space for the text
+        for ax in (orbit, residual):
+            if magnet is not None:
+                ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
+            ax.grid(alpha=0.25)
+    grid[0].legend(loc="upper right", ncols=5, fontsize="small", framealpha=0.9)
+    if magnet is None or outcome.change is None:
+        grid[0].set_title(f"First turn of {outcome.source or 'a measurement'}")
+    else:
+        grid[0].set_title(
+            f"First turn with {outcome.magnet} changed by {100 * outcome.change:+g} % "
+            f"(dotted, s = {magnet.s:.1f} m)"
+        )
+    lattice_strip(outcome.ring, grid[4])
+    return figure
+
+
+def plot_loss(
+    fit: "FitResult",
+    ax: Axes | None = None,
+    floor: float | None = None,
+    others: Mapping[str, float] | None = None,
+) -> Axes:
+    """Loss and weighted penalty of every epoch.
+
+    Args:
+        fit: of `fine_tune`.
+        ax: where to draw; else a new one.
+        floor: the loss that noise alone would leave, m^2.
+        others: the loss of other methods, m^2, by name.
+    """
+    if ax is None:
+        _, ax = plt.subplots()
+    ax.semilogy(fit.loss, color="C3", label="loss (sum of squared residuals)")
+    rate = fit.options["regularization_rate"]
+    penalty = rate * np.asarray(fit.penalty)
+    if (penalty > 0).any():
+        label = f"{rate:g} x {fit.options['regularization']} penalty"
+        ax.semilogy(np.where(penalty > 0, penalty, np.nan), color="C2", label=label)
+    if floor:
+        ax.axhline(floor, color="k", linestyle="--", linewidth=0.9, label="noise alone")
+    for name, loss in (others or {}).items():
+        ax.axhline(loss, color=METHOD_COLOURS.get(name, "0.3"), linewidth=0.9, label=name)
+    ax.axvline(fit.best_epoch, color="0.6", linestyle=":", label="weights kept from here")
+    ax.set_xlabel("epoch")
+    ax.set_ylabel("loss [m²]")
+    ax.grid(alpha=0.25)
+    ax.legend(fontsize="small")
+    return ax
+
+
+def plot_spectrum(
+    states: "NDArray[np.float64]",
+    plane: int,
+    ax: Axes | None = None,
+    optics: Optics | None = None,
+    colour: str = "C0",
+) -> Axes:
+    """Amplitude of the lines of one trajectory in one plane, against the fractional tune.
+
+    Args:
+        states: at the start of each turn, [turns, n].
+        plane: 0 for x, 1 for y.
+        ax: where to draw; else a new one.
+        optics: for the normalisation, which separates Q from 1 - Q.
+        colour: of the line.
+    """
+    if ax is None:
+        _, ax = plt.subplots()
+    z = levelled(normalised(states, optics)[:, plane])
+    turns = len(z)
+    padded = 8 * turns
+    spectrum = np.abs(np.fft.fft(z * np.hanning(turns), padded)) / turns * 2
+    ax.semilogy(np.arange(padded) / padded, spectrum / spectrum.max(), color=colour, linewidth=0.8)
+    ax.set_ylim(1e-6, 3)
+    ax.set_xlim(0, 1)
+    ax.set_ylabel(f"{'xy'[plane]}: amplitude [of the strongest line]")
+    ax.set_xlabel("fractional tune")
+    ax.grid(alpha=0.25)
+    return ax
+
+
+def plot_tune_fit_spectrum(outcome: "TuneFit", axes: "tuple[Axes, Axes]") -> None:
+    """The spectra of each method's network, tracked, with the design's and the true tunes."""
+    tunes: list[tuple[Any, str, str, str]] = [
+        (outcome.design_tunes, "design", "C0", ":"),
+        (outcome.true_tunes, "true", "k", "--"),
+    ]
+    for method in reversed(outcome.methods):  # the first on top
+        colour = METHOD_COLOURS.get(method.method, "C4")
+        tunes.append((method.tunes, method.method, colour, "-"))
+        if method.signal is not None and method.fit is not None:
+            optics = one_turn_optics(method.fit.network)
+            for plane, ax in enumerate(axes):
+                plot_spectrum(method.signal[0], plane, ax, optics, colour)
+    for plane, ax in enumerate(axes):
+        for tune, name, colour, style in tunes:
+            if tune is not None:
+                label = f"{name} {tune[plane]:.5f}"
+                ax.axvline(
+                    tune[plane], color=colour, linestyle=style, linewidth=1.1, label=label,
+                    zorder=4 if name == "true" else 3,
+                )  # fmt: skip
+        ax.legend(loc="upper right", fontsize="small")
