@@ -145,6 +145,10 @@ def make(
     if kinds:
         public["kinds"] = list(kinds)
     _begin(folder, public, seed)
+    asked = CaseSettings(
+        tier, lattice, ring, seed, kinds, tuple(chosen) if effects else None, shots, signal, amount,
+        rms, told,
+    )  # fmt: skip
     unreachable: Counter[str] = Counter()
     there = set(case_names(folder))
     for number in tqdm(range(cases), unit="case", disable=None if progress else True):
@@ -152,16 +156,9 @@ def make(
         if name in there:
             continue
         if kinds:
-            asked = CaseSettings(
-                tier, lattice, ring, seed, kinds, tuple(chosen) if effects else None, shots, signal,
-                amount, rms, told,
-            )  # fmt: skip
             case, truth, lost = kinds_case(asked, number, name)
         else:
-            drawn = CaseDraw(
-                ring, lattice, tier, seed, number, reference, shots, chosen, amount, signal, rms,
-                told,
-            )  # fmt: skip
+            drawn = CaseDraw(asked, number, reference)
             case, truth = drawn.make(name)
             if learnt:
                 case = _learnt_before(case, drawn, correctors)
@@ -200,7 +197,7 @@ def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Cas
     if correctors is not None:
         own["correctors"] = evenly(drawn.ring, correctors)
     try:
-        response = measure("orbit_response", drawn.ring, (), 1.0, drawn.fit_shots, **own)
+        response = measure("orbit_response", drawn.ring, (), 1.0, drawn.asked.shots, **own)
     except UnstableRingError:
         return case
     return replace(case, parts={**case.parts, LEARNT: response})
@@ -261,42 +258,30 @@ def _seed(folder: Path) -> int | None:
 
 
 class CaseDraw:
-    """One case, drawn from its own random numbers."""
+    """One case, drawn from its own random numbers.
 
-    def __init__(
-        self,
-        ring: Ring,
-        lattice: str,
-        tier: str,
-        seed: int,
-        number: int,
-        reference: bool = False,
-        shots: int = 4,
-        effects: Sequence[str] | None = None,
-        amount: float | None = None,
-        signal: tuple[float, float] = SIGNAL,
-        background: Mapping[str, float] | None = None,
-        told: bool = False,
-    ) -> None:
-        self.ring, self.lattice, self.tier = ring, lattice, tier
-        self.effects = names(effects)
-        self.fit_shots = shots
-        self.number, self.set_seed = number, seed
-        random = stream(seed, "challenge", tier, number)
+    Args:
+        asked: settings of the challenge.
+        number: of the case.
+        reference: with a measurement from before the fault.
+    """
+
+    def __init__(self, asked: CaseSettings, number: int, reference: bool = False) -> None:
+        self.asked, self.ring, self.number = asked, asked.ring, number
+        self.effects = names(asked.effects)
+        self.random = random = stream(asked.seed, "challenge", asked.tier, number)
         self.seed = int(random.integers(2**31))
-        self.random = random
         self.amplitude = float(random.uniform(*AMPLITUDE))
         self.noise = float(np.exp(random.uniform(*np.log(NOISE))))
-        correctors = [e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")]
+        correctors = [e.name for e in self.ring.elements if e.kind in ("hcorrector", "vcorrector")]
         size = min(SET_CORRECTORS, len(correctors))
         self.set = [str(c) for c in random.choice(correctors, size, replace=False)]
-        self.shots = self._draw_shots(shots + HELD_OUT, self.seed)
-        before = self._draw_shots(shots, self.seed + 1)
+        self.shots = self._draw_shots(asked.shots + HELD_OUT, self.seed)
+        before = self._draw_shots(asked.shots, self.seed + 1)
         self.before = before if reference else None
-        self.background = dict(background or {})
-        self.told = told
-        self.small = draw_background(ring, self.background, self.seed)
-        self.draw = Draw(random, signal, amount)
+        self.background = dict(asked.background)
+        self.small = draw_background(self.ring, self.background, self.seed)
+        self.draw = Draw(random, asked.signal, asked.amount)
 
     def _draw_shots(self, count: int, seed: int) -> Shots:
         settings: list[Settings] = []
@@ -309,7 +294,7 @@ class CaseDraw:
     def make(self, name: str) -> tuple[Case, Truth]:
         """Return its public and its secret part."""
         healthy = clean_readings(Machine(self.ring, self.small), self.shots)
-        fit = slice(0, self.fit_shots)
+        fit = slice(0, self.asked.shots)
         launches = _five(self.shots)[fit]
         settings = self.shots.settings[fit]
         before = 0
@@ -318,21 +303,21 @@ class CaseDraw:
             settings = (*self.before.settings, *settings)
             before = len(self.before)
         options: dict[str, Any] = {}
-        if self.background and self.told:
+        if self.background and self.asked.told:
             options["background"] = self.background
         causes: list[Cause] = []
         unknown: dict[str, Any] | None = None
         clean, sizes = healthy, []
-        if self.tier != "E":
+        if self.asked.tier != "E":
             ruler = Ruler(self.ring, launches, settings, self.noise, self.background, before)
-            kind = self._unknown_kind() if self.tier == "D" else None
+            kind = self._unknown_kind() if self.asked.tier == "D" else None
             if kind in LARGEST:
                 clean, unknown = self._unknown(str(kind), healthy, ruler)
             else:
                 if kind is not None:
                     unknown = {"kind": "taken_out"}
                     options["effects"] = [n for n in names() if n != kind]
-                count = 1 if self.tier != "C" else int(self.random.integers(2, 4))
+                count = 1 if self.asked.tier != "C" else int(self.random.integers(2, 4))
                 while len(causes) < count:
                     cause = self._cause(ruler, self.effects if kind is None else [kind])
                     if all((c.effect, c.element) != (cause.effect, cause.element) for c in causes):
@@ -345,12 +330,12 @@ class CaseDraw:
             total = 0.0
         case = self._case(name, clean, causes, options)
         clean = self._frozen(clean, case, causes)
-        parts = {"fit": clean[fit], "heldout": clean[self.fit_shots :], "before": healthy[fit]}
-        true = {"fit": _five(self.shots)[fit], "heldout": _five(self.shots)[self.fit_shots :]}
+        parts = {"fit": clean[fit], "heldout": clean[self.asked.shots :], "before": healthy[fit]}
+        true = {"fit": _five(self.shots)[fit], "heldout": _five(self.shots)[self.asked.shots :]}
         if self.before is not None:
             true["reference"] = _five(self.before)
         truth = Truth(
-            name, self.tier, tuple(causes), unknown, tuple(sizes), total, self.background,
+            name, self.asked.tier, tuple(causes), unknown, tuple(sizes), total, self.background,
             self.amplitude, self.noise, self.seed, true, parts,
         )  # fmt: skip
         return case, truth
@@ -368,11 +353,11 @@ class CaseDraw:
         kinds = list(LARGEST)
         which = self.number // 2
         pool = kinds if self.number % 2 == 0 else taken
-        turn = stream(self.set_seed, "kinds", which // len(pool)).permutation(len(pool))
+        turn = stream(self.asked.seed, "kinds", which // len(pool)).permutation(len(pool))
         return pool[int(turn[which % len(pool)])]
 
     def _unknown(self, kind: str, healthy: Array, ruler: Ruler) -> tuple[Array, dict[str, Any]]:
-        fit = slice(0, self.fit_shots)
+        fit = slice(0, self.asked.shots)
         for _ in range(100):
             fault = Unknown(self.ring, kind, self.shots, healthy, self.random)
             amount = LARGEST[kind]
@@ -398,7 +383,7 @@ class CaseDraw:
     def _size(self, ruler: Ruler, change: Array, causes: Sequence[Cause]) -> float:
         if not all(find(cause.effect).modelled for cause in causes):
             return float("nan")
-        return ruler.size(change[: self.fit_shots])
+        return ruler.size(change[: self.asked.shots])
 
     # --- what is written ------------------------------------------------------------------------
     def _case(
@@ -416,12 +401,12 @@ class CaseDraw:
             noise = stream(self.seed, "reference noise").standard_normal(quiet.shape)
             reference = self._measurement(self.before, quiet + self.noise * noise)
         parts: dict[str, AnyMeasurement] = {
-            "fit": first.select(shots[: self.fit_shots]),
-            "heldout": first.select(shots[self.fit_shots :]),
+            "fit": first.select(shots[: self.asked.shots]),
+            "heldout": first.select(shots[self.asked.shots :]),
         }
         if reference is not None:
             parts["reference"] = reference
-        return Case(name, self.lattice, parts, options)
+        return Case(name, self.asked.lattice, parts, options)
 
     def _measurement(self, shots: Shots, readings: Array) -> Measurement:
         monitors = tuple(monitor.name for monitor in self.ring.monitors)

@@ -41,12 +41,9 @@ class Oracle:
     Args:
         case, truth: both parts of it.
         given: known causes.
-        seed: of the simulated null.
     """
 
-    def __init__(
-        self, case: Case, truth: Truth, given: Sequence[Cause] = (), seed: int = 0
-    ) -> None:
+    def __init__(self, case: Case, truth: Truth, given: Sequence[Cause] = ()) -> None:
         ring = ring_of(case.lattice)
         data = of_measurement(ring, case.fit)
         launches = truth.launches["fit"]
@@ -85,7 +82,7 @@ class Oracle:
         self.norm = np.einsum("hr,hr->h", self.rows, self.rows)
         self.cap = np.array([find(n).largest ** find(n).power for n, _ in self.hypotheses])
         self.discrete = np.array([find(n).discrete for n, _ in self.hypotheses])
-        self.threshold = self._threshold(seed)
+        self.threshold = self._threshold()
 
     def residual(self, readings: Array) -> Array:
         """Return whitened rows of the fit's readings, with those of a reference unchanged."""
@@ -135,9 +132,9 @@ class Oracle:
             rows[start : start + CHUNK] = self.projection.out(self.whitening.signature(change))
         return rows
 
-    def _threshold(self, seed: int) -> float:
+    def _threshold(self) -> float:
         """Statistic that noise reaches in 0.5 % of data sets, from its simulated tail."""
-        draws = np.random.default_rng([seed, 7]).standard_normal((DRAWS, self.whitening.rows))
+        draws = np.random.default_rng([0, 7]).standard_normal((DRAWS, self.whitening.rows))
         inner = self.rows @ self.projection.out(draws).T  # [hypothesis, draw]
         largest = _best(inner.T, self.norm, self.cap, self.discrete)[0].max(axis=1)
         return free_threshold(DEFAULT.false_alarm, 1, effective_number(largest, 1))
