@@ -25,7 +25,7 @@ from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.metric import Metric
 from tmlattice.inference.whitening import Projection
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe import response_metric
+from tmlattice.observe import response_problem
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
@@ -66,7 +66,7 @@ def same(one, other, tolerance):
 
 
 def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
-    monkeypatch.setattr(response_metric, "MAX_NUMBERS", PIECE)
+    monkeypatch.setattr(response_problem, "MAX_NUMBERS", PIECE)
     point = response.at((Cause("monitor_roll", "end_1", 0.02),), response.first)
     some = [*everywhere[::3], ("energy_spread", None), ("skew_gradient", "QF::5")]
     metric = response.metric(point)
@@ -80,7 +80,7 @@ def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
 
 
 def test_sums_give_the_posterior_of_all_signatures(response, everywhere, monkeypatch):
-    monkeypatch.setattr(response_metric, "MAX_NUMBERS", PIECE)
+    monkeypatch.setattr(response_problem, "MAX_NUMBERS", PIECE)
     usual = DistributedErrors.usual(everywhere, USUAL)
     direct = fit_distributed_errors(response, usual, response.first)
     sums_at = posterior(response, usual)

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +74,7 @@ def run(
     public = read_set(folder)
     described = check_lattice(folder / "challenge.json", public["lattice"], lattice)
     check_contents(folder, public)
-
-    def load(name: str) -> Any:
-        return lambda: trusted_case(folder, name, lattice)
-
-    cases = {name: load(name) for name in case_names(folder)}
+    cases = {name: partial(trusted_case, folder, name, lattice) for name in case_names(folder)}
     marks = {name: made_by(folder, name, described) for name in cases}
     return run_batch(
         diagnose_case,

@@ -145,14 +145,11 @@ def _others(
     def load(name: str) -> Callable[[], tuple[Case, Truth]]:
         return lambda: (trusted_case(folder, name, lattice), truths[name])
 
-    def load_case(name: str) -> Callable[[], Case]:
-        return lambda: trusted_case(folder, name, lattice)
-
     ideal, plain_ones = (evaluate_kinds, plain_kinds) if of_kinds else (evaluate, baselines)
     evaluated = run_batch(ideal, {n: load(n) for n in truths}, folder / "oracle", **where)
     if described["tier"] == "E":  # they always find something
         return evaluated, {}
-    cases = {n: load_case(n) for n in truths}
+    cases = {n: partial(trusted_case, folder, n, lattice) for n in truths}
     return evaluated, run_batch(plain_ones, cases, folder / "baselines", **where)
 
 

@@ -71,8 +71,8 @@ def fine_tune(
         measurement: launches and readings; a path or a DataFrame is taken too.
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
-            (`fitting.many.fit_map`); "sparse", as few changed magnets as the evidence asks for
-            (`fitting.few.fit_sparse`); "told", the same that knows which magnets may have changed
+            (`fitting.map_fit.fit_map`); "sparse", the set of changed magnets with the largest
+            marginal likelihood (`fitting.sparse.fit_sparse`); "told", the same for given magnets
             (`candidates=`): nothing else can be better. All but the first state the error of their
             tunes.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n], m and

@@ -164,7 +164,11 @@ def _without_large(path: str, readings: Array, names: Sequence[str]) -> list[str
             "(`unit` in [data] of tmlattice.toml)"
         )
     readings[large] = np.nan
-    of = [name for name, some in zip(names, large.any(axis=(0, 1, 3)), strict=True) if some]
+    of = [
+        name
+        for name, some in zip(names, np.any(large, axis=(0, 1, 3)).tolist(), strict=True)
+        if some
+    ]
     return [f"rejected readings, above {LARGEST_READING} m: {count}, of {counted(of)}"]
 
 
