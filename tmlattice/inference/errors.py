@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from tmlattice.inference.normal import ROUNDING, Normal, Slopes, shared_by, times_precision
 from tmlattice.inference.priors import Group
@@ -410,6 +410,7 @@ class _Scales:
         absent: NDArray[np.bool_],
     ) -> None:  # fmt: skip
         self.information, self.score, self.group = information, score, group
+        self.known: dict[bytes, float] = {}
         self.now = np.where(absent, -np.inf, 0.0)
         self.choices, self.chances = [], []
         self.pairs = list(combinations(np.flatnonzero(absent).tolist(), 2))
@@ -425,18 +426,24 @@ class _Scales:
             self.choices.append(factors)
             self.chances.append(np.log(chances))
 
-    def _root(self, sizes: Array) -> tuple[Array, Array]:
-        """Prior rms of the members, and the root of their posterior precision in these units."""
-        scale = np.exp(sizes)[self.group]
-        inside = scale[:, None] * self.information * scale
-        inside[np.diag_indices(len(inside))] += 1
-        return scale, np.asarray(np.linalg.cholesky(inside))
+    def _inside(self, sizes: Array) -> tuple[Array, Array]:
+        """Prior rms of the members, and their posterior precision in these units."""
+        scale = np.exp(sizes)[..., self.group]
+        inside = scale[..., :, None] * self.information * scale[..., None, :]
+        return scale, inside + np.eye(len(self.group))
 
-    def log_evidence(self, sizes: Array) -> float:
-        """Log marginal likelihood with all members integrated out."""
-        scale, root = self._root(sizes)
-        pull = solve_triangular(root, scale * self.score, lower=True, check_finite=False)
-        return float(0.5 * pull @ pull - np.log(np.diag(root)).sum())
+    def log_evidence(self, sizes: Array) -> Array:
+        """Log marginal likelihoods with all members integrated out, [set], of sets of scales,
+        [set, group]; a chain comes back to the same ones, which are computed once."""
+        keys = [own.tobytes() for own in sizes]
+        new = [i for i, key in enumerate(keys) if key not in self.known]
+        if new:
+            scale, inside = self._inside(sizes[new])
+            pull = scale * self.score
+            square = np.sum(pull * np.linalg.solve(inside, pull[..., None])[..., 0], axis=-1)
+            found = 0.5 * (square - np.linalg.slogdet(inside)[1])
+            self.known.update(zip([keys[i] for i in new], found.tolist(), strict=True))
+        return np.array([self.known[key] for key in keys])
 
     def _chance(self, sizes: Array) -> float:
         """Log probability of scales; -inf outside their support."""
@@ -446,13 +453,12 @@ class _Scales:
             if not len(at):
                 return -np.inf
             chance += float(chances[at[0]])
-        return chance + self.log_evidence(sizes)
+        return chance + float(self.log_evidence(sizes[None])[0])
 
     def amounts(self, sizes: Array) -> tuple[Array, Array]:
         """Most probable amounts, and their covariance."""
-        scale, root = self._root(sizes)
-        half = solve_triangular(root, np.diag(scale), lower=True, check_finite=False)
-        covariance = half.T @ half
+        scale, inside = self._inside(sizes)
+        covariance = scale[:, None] * np.linalg.inv(inside) * scale
         return covariance @ self.score, covariance
 
     def more(self) -> Array:
@@ -466,7 +472,7 @@ class _Scales:
             for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
                 tried = np.repeat(here[None], len(choices), axis=0)
                 tried[:, i] = choices
-                values = chances + [self.log_evidence(one) for one in tried]
+                values = chances + self.log_evidence(tried)
                 weights = np.exp(values - values.max())
                 here = tried[random.choice(len(tried), p=weights / weights.sum())]
             for a, b in self.pairs:  # swap two groups that compensate each other
