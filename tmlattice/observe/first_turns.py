@@ -21,7 +21,7 @@ from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.validation import Half, HeldOut, cross_predicted
 from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening
 from tmlattice.observe.data import Data
-from tmlattice.observe.metric import TurnMetric, metric
+from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
 
 Array = NDArray[np.float64]
@@ -131,17 +131,18 @@ class FirstTurns(Problem):
     def metric(self, point: Point) -> TurnMetric:
         """Return products of signatures along these trajectories."""
         assert point.projection is not None
-        return metric(
-            self.model, point.view, point.nuisances, self.whitening, point.projection,
-            self.data.active,
-        )  # fmt: skip
+        return self._metric(point, self.whitening, point.projection)
 
     def metric_among(self, point: Point, root: Root, projection: Projection) -> TurnMetric:
         """Return products from sums over the readings behind each monitor, see `DenseMetric`."""
-        whitening = self.whitening.correlated(root.matrix)
-        return metric(
-            self.model, point.view, point.nuisances, whitening, projection, self.data.active
-        )
+        return self._metric(point, self.whitening.correlated(root.matrix), projection)
+
+    def _metric(self, point: Point, whitening: Whitening, projection: Projection) -> TurnMetric:
+        """The quickest products for this noise."""
+        model, active = self.model, self.data.active
+        kind: type[TurnMetric] = DenseMetric if model.turns == 1 else TurnMetric
+        kind = kind if whitening.dense else IndependentMetric
+        return kind(model, point.view, point.nuisances, whitening, projection, active)
 
     @property
     def alone(self) -> bool:

@@ -301,18 +301,3 @@ class DenseMetric(TurnMetric):
             gram[k, 0] = flat @ self._grams[m] @ flat.T
             inner[k, 0] = flat @ sums[:, m].ravel()
         return gram, inner
-
-
-def metric(
-    model: Model,
-    paths: Paths,
-    launches: Array,
-    whitening: Whitening,
-    projection: Projection,
-    active: NDArray[np.bool_],
-) -> TurnMetric:
-    """The quickest metric for this noise: see `TurnMetric` for the arguments."""
-    if not whitening.dense:
-        return IndependentMetric(model, paths, launches, whitening, projection, active)
-    kind = DenseMetric if model.turns == 1 else TurnMetric
-    return kind(model, paths, launches, whitening, projection, active)

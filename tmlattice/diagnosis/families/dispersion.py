@@ -71,12 +71,7 @@ def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
 class _PatternFamily(Family):
     """Amplitudes of patterns of kicks, which the data do not separate into single ones."""
 
-    per = "ring"
-
-    @property
-    def largest(self) -> float:
-        """Zero: patterns have no members that could be faulty."""
-        return 0.0
+    per, single = "ring", False
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData

@@ -31,6 +31,7 @@ class Family(ABC):
         trust: step bound of a number in one round, rms.
         gross: limit above which a column's number starts from its own estimate; otherwise the
             column would have no weight until the rounds reach that value.
+        single: whether one member may be faulty; not a pattern, or a type with one design.
         rms, tails, most: prior of a single number: rms, degrees of freedom, largest rms.
     """
 
@@ -41,6 +42,7 @@ class Family(ABC):
     variable: ClassVar[str]
     trust: ClassVar[float]
     gross: ClassVar[float] = np.inf
+    single: ClassVar[bool] = True
     rms: ClassVar[float]
     tails: ClassVar[float] = np.inf
     most: ClassVar[float] = np.inf
@@ -53,7 +55,7 @@ class Family(ABC):
     @property
     def largest(self) -> float:
         """The largest fault of one member, in the unit of the numbers; 0: no single faults."""
-        return find(self.effects[0]).largest
+        return find(self.effects[0]).largest if self.single else 0.0
 
     @abstractmethod
     def size(self, data: ResponseData) -> int:

@@ -227,12 +227,7 @@ class EdgeFocusing(_Thin):
 
     name, effect = "edge_focusing", "vertical_focusing"
     effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
-    block, variable, trust = 0, "edge", 3e-3
-
-    @property
-    def largest(self) -> float:
-        """Zero: bends of a type have the same edges, none can be faulty alone."""
-        return 0.0
+    block, variable, trust, single = 0, "edge", 3e-3, False
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return magnets(ring, ("bend",))
