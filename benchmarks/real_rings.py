@@ -44,7 +44,6 @@ from tmlattice.errors import TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.plots.response import plot_gradients, plot_left
-from tmlattice.report.page import shrink
 
 MICRO = 1e6
 SCATTER = ("quadrupole_gradient", "bend_gradient", "vertical_focusing", "energy_offset",
@@ -223,7 +222,6 @@ def picture(result, path):
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=80)
     plt.close(figure)
-    shrink(path, path.stem)
 
 
 def _step(step):

@@ -248,7 +248,7 @@ def test_a_step_that_went_wrong_in_the_reference_is_no_change(small_ring, before
     result = diagnose(small_ring, after, reference=replace(before, response=orbits))
     assert {own.element for own in result.findings} == {"qf", "QD::5"}
     (text,) = [text for text in result.warnings if text.startswith("of the reference: ")]
-    assert "v6 (+2.8 µrad in y, as from v10)" in text  # 0.3 of its 10
+    assert "v6 (+2.8 µrad in y, as behind v10)" in text  # 0.3 of its 10
 
 
 def test_what_changed_is_found_beside_two_exchanged_correctors(small_ring, before, after):

@@ -144,8 +144,8 @@ def test_magnets_own_amount_is_told_where_the_thin_one_is_likelier(small_ring):
     assert recommended_action.cause == causes[1]
     assert recommended_action.strength.after == pytest.approx(0.9 * small_ring["QD::5"].k1)
     thin = Finding(
-        "gradient_absolute", "QD::5", None, 0.036, None, "1/m", 1.0, None, None, (), (), 1.0,
-        (recommended_action,),
+        effect="gradient_absolute", element="QD::5", s=None, amount=0.036, unit="1/m",
+        detection=None, where=None, near=(), recommended_actions=(recommended_action,),
     )  # fmt: skip
     assert faults_of([thin], causes[:1]) == (causes[1],)
 
