@@ -28,7 +28,7 @@ from real_rings import imported, sources
 
 import tmlattice
 from tmlattice import Cause, read_measurement
-from tmlattice.diagnosis.families.dispersion import errors_beside, fitted_orbit_kicks
+from tmlattice.diagnosis.families.dispersion import fitted_orbit_kicks
 from tmlattice.diagnosis.response import procedure
 from tmlattice.effects import apply
 from tmlattice.errors import TmlatticeError
@@ -106,13 +106,27 @@ def causes_of(changes):
     ]
 
 
+def with_dispersion(data, dispersion):
+    """The design with a diagnosis's additional dispersion, for other correctors and BPMs."""
+    none = Errors.none(data)
+    if not dispersion:
+        return none
+    ring, nothing = data.ring, (0.0, 0.0)
+    monitors, correctors = (
+        np.array([dispersion.get(ring[name].name, nothing) for name in names])
+        for names in (data.measured.monitors, data.measured.correctors)
+    )
+    own = correctors[np.arange(len(correctors)), data.plane[:-1]]
+    return replace(none, dispersion=monitors * data.energy_of_rf, at_correctors=own)
+
+
 def first_day(ring, measured):
     """What was measured by what resembles its model, what the model has, and the orbits of that."""
     found = tmlattice.diagnose(ring, measured)
     # a spread would take three times the orbits, and changes theirs by next to nothing
     causes = [own for own in found.causes if own.effect != "energy_spread" and own.amount]
     data = response_data(ring, measured)
-    fitted = Predicted(data, errors_beside(data, found.dispersion).with_causes(data, causes))
+    fitted = Predicted(data, with_dispersion(data, found.dispersion).with_causes(data, causes))
     known = DistributedErrors(causes, fitted_orbit_kicks(fitted))
     model = simulated(ring, known, measured)
     read, told, kicks = as_kicked(measured, model)
