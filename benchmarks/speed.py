@@ -123,10 +123,11 @@ def main():
             (f"symplectic layers, one turn of {particles}", times[0], "truncated", times[1])
         )
 
-    print(f"{'':42}{'ms':>10}   {'':26}{'ms':>9}{'ratio':>9}")
+    print("| what | ms | compared with | ms | ratio |\n|---|---|---|---|---|")
     for name, slow, other, fast in rows:
         ratio = f"{slow / fast:.{1 if slow < 10 * fast else 0}f}"
-        print(f"{name:42}{1e3 * slow:10.2f}   {other:26}{1e3 * fast:9.3f}{ratio:>9}")
+        print(f"| {name} | {1e3 * slow:.2f} | {other} | {1e3 * fast:.3f} | {ratio} |")
+    print()
     print(f"maps of the whole ring: {median_time(lambda: ring_maps(ring), 5):.3f} s")
     measurement = tmlattice.Measurement(launch.numpy(), target.numpy()[:, None], network.monitors)
     fit = tmlattice.fine_tune(network, measurement, launch_sigma=0.0, patience=None, progress=False)

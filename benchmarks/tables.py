@@ -77,9 +77,9 @@ def filled(text):
             if stored["source"].endswith(".jsonl"):
                 source = f"[{','.join(source.splitlines())}]"
             rows = SOURCES[stored["source"]](json.loads(source))
-        head, *others = rows
-        table = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *others)]
-        return "\n".join([place[1], *table, place[3]])
+        head, *others = ["| " + " | ".join(row) + " |" for row in rows]
+        line = "|---" * (head.count(" | ") + 1) + "|"
+        return "\n".join([place[1], head, line, *others, place[3]])
 
     return PLACE.sub(made, text)
 
