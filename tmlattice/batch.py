@@ -23,7 +23,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.errors import TmlatticeError, missing_package
 from tmlattice.files import OutputError, output_file, write_json
-from tmlattice.input_files import json_of
+from tmlattice.input_files import content_of, json_of
 from tmlattice.workers import Caught, Processes, caught, heard
 
 if TYPE_CHECKING:
@@ -243,13 +243,16 @@ def _results(
 
 
 def fingerprint(*parts: object) -> str:
-    """Of everything that a result depends on: values by their repr, files by their content."""
+    """Of everything that a result depends on: values by their repr, regular files by their
+    content."""
     digest = hashlib.sha256()
     for part in parts:
-        try:
-            content = part.read_bytes() if isinstance(part, Path) else repr(part).encode()
-        except OSError:
-            content = b"absent"
+        content = repr(part).encode()
+        if isinstance(part, Path):
+            try:
+                content = content_of(part, TmlatticeError)
+            except TmlatticeError:
+                content = b"absent"
         digest.update(b"%d:" % len(content) + content)
     return digest.hexdigest()[:32]
 

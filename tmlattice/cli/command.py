@@ -1,6 +1,7 @@
 """The group of commands, and how any of them ends: a result, or one sentence and a code."""
 
 import codecs
+import csv
 import difflib
 import io
 import os
@@ -156,6 +157,8 @@ def main() -> NoReturn:
         _fail(error.format_message(), BAD_INPUT)
     except TmlatticeError as error:
         _fail(str(error), BAD_INPUT)
+    except csv.Error as error:
+        _fail(f"a table cannot be read as CSV ({error}); write it again", BAD_INPUT)
     except MemoryError:
         _fail("there is not enough memory for this; give less of it", BAD_INPUT)
     except (

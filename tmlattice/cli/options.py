@@ -306,11 +306,11 @@ def _identities(path: Path) -> set[Any]:
     """What a path is known by, so that links are seen through: nothing of a device."""
     try:
         status = path.stat() if path.exists() else None
-    except (OSError, ValueError):
+        names: set[Any] = {os.path.realpath(path)}
+    except (OSError, ValueError):  # such as a NUL byte
         return set()
     if status is not None and not stat.S_ISREG(status.st_mode):
         return set()
-    names: set[Any] = {os.path.realpath(path)}
     return names if status is None else names | {(status.st_dev, status.st_ino)}
 
 

@@ -153,14 +153,21 @@ def _csv(path: Path) -> list[Column]:
     above = [line.lstrip("# \t") for i, line in numbered if i < lines[0][0]]
     separator = max(";\t,", key=lines[0][1].count)
     blanks = separator not in lines[0][1]
-    cut = (lambda line: line.split()) if blanks else (
-        lambda line: next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-    )  # fmt: skip
-    rows = [(i, [field.strip() for field in cut(line)]) for i, line in lines]
+
+    def cut(line: str) -> list[str]:
+        if blanks:
+            return line.split()
+        try:
+            fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        except csv.Error as error:
+            raise MeasurementError(f"{path}: no table that is read ({error})") from error
+        return [field.strip() for field in fields]
+
+    rows = [(i, cut(line)) for i, line in lines]
     header = rows.pop(0)[1]
     if above and any(_is_number(field) for field in header):
         rows.insert(0, (lines[0][0], header))
-        header = [field.strip() for field in cut(above[-1])]
+        header = cut(above[-1])
     for line, row in rows:
         if len(row) != len(header):
             raise MeasurementError(

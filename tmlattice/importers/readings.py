@@ -158,7 +158,7 @@ def _without_large(path: str, readings: Array, names: Sequence[str]) -> list[str
     count = int(large.sum())
     if not count:
         return []
-    if 2 * count > np.isfinite(readings).sum():
+    if 2 * count >= np.isfinite(readings).sum():
         raise MeasurementError(
             f"{path}: most readings are above {LARGEST_READING} m; state the unit of the file "
             "(`unit` in [data] of tmlattice.toml)"
