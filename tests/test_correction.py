@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tmlattice import correct, diagnose, write_measurement
+from tmlattice import correct, diagnose, simulate, write_measurement
 from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
 from tmlattice.correction.applied import applied, read_settings
@@ -25,6 +25,7 @@ from tmlattice.lattice import save_ring, write_ring
 from tmlattice.lattice.at_file import quiet_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
+from tmlattice.machine.shots import draw_background
 from tmlattice.observe.calibration import write_calibration
 
 NO_ORBIT = ("beta_beating", "phase_advance", "dispersion", "tunes")
@@ -174,6 +175,21 @@ def test_intervals_hold_what_they_state(small_ring, quadrupoles):
     assert (np.array(data) > np.array(reach)).all()
 
 
+def test_first_turns_alone_are_corrected(small_ring):
+    """Without an orbit response: the estimate has an uncertainty, and supplies are set."""
+    causes = [Cause("family_gradient", "QD", 0.01), Cause("family_gradient", "QF", -0.008)]
+    data = simulate(small_ring, causes, shots=12, seed=3, background={"quadrupole_gradient": 1e-3})
+    found = correct(diagnose(small_ring, data.measurement()), targets=["tunes"])
+    machine = apply(small_ring, [*causes, *draw_background(
+        small_ring, {"quadrupole_gradient": 1e-3}, 3)])  # fmt: skip
+    goal = optics(small_ring)[2]
+    before, after = (np.abs(optics(r)[2] - goal) for r in (machine, set_to(machine, found)))
+    assert (after < 0.2 * before).all()
+    for (_, low, high), true in zip(found.after["tunes"], after, strict=True):
+        assert high > low
+        assert true < 3 * high
+
+
 def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupoles):
     """No error is known, all are possible: nothing is gained, and nothing is set."""
     found = correct(
@@ -188,6 +204,22 @@ def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupol
     small = posterior(quadrupoles, 5e-3, 1e-4 * rng.standard_normal(len(quadrupoles)))
     hardly = correct(estimate_with(small_ring, small_ring, small), targets=["beta_beating"])
     assert not hardly.settings or hardly.gain > hardly.gain_error
+
+
+def test_a_dispersion_that_the_errors_make_is_counted_once(small_ring):
+    """A rolled bend in the posterior, and its dispersion in the calibration."""
+    bend = next(e.name for e in small_ring.elements if e.kind == "bend")
+    known = replace(
+        posterior([], 1.0), hypotheses=(("dipole_roll", bend),), amounts=np.array([1e-3]),
+        rms=np.array([1e-4]), seen=np.ones((1, 1)), share=np.array([0.9999]),
+    )  # fmt: skip
+    rolled = optics(apply(small_ring, [Cause("dipole_roll", bend, 1e-3)]))[1]
+    names = [monitor.name for monitor in small_ring.monitors]
+    beyond = dict(zip(names, (rolled - optics(small_ring)[1]).tolist(), strict=True))
+    estimate = estimate_with(small_ring, small_ring, known).with_beam(beyond)
+    found = correct(estimate, knobs=["supplies"], targets=NO_ORBIT)
+    size = np.sqrt(np.mean(rolled[:, 1] ** 2))
+    assert found.before["dispersion"][1][0] == pytest.approx(size, rel=0.05)
 
 
 def test_few_knobs_where_few_are_enough(small_ring, wrong):

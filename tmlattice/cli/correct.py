@@ -112,7 +112,7 @@ def correct(
             console().print(f"written: {example_file}")
             return
         tell("estimated ring")
-        estimate, said = read_estimate(path, settings, open_ring(str(path)))
+        estimate, warnings = read_estimate(path, settings, open_ring(str(path)))
         wanted = open_ring(goal) if goal else None
         options: dict[str, Any] = {"targets": dict(targets)} if targets else {}
         found = run(estimate, goal=wanted, knobs=devices, progress=tell, **options)
@@ -121,7 +121,7 @@ def correct(
         write(found.as_json())
     screen = console()
     screen.print(correction_text(found, min(screen.width, 120)), soft_wrap=True)
-    for sentence in said:
+    for sentence in warnings:
         screen.print(f"\nNote: {sentence}.", soft_wrap=True)
     written = [f"{out}/: report.html, settings.csv, ..."] if out else []
     written += [str(json_file)] if json_file else []

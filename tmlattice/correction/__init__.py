@@ -92,7 +92,7 @@ def correct(
     progress("correction")
     problem = drawn(estimate, devices, compared, DRAWS, seed)
     try:
-        begin = problem.at(np.zeros(len(devices)))
+        begin = problem.begin
     except UnstableRingError as error:
         raise UnstableRingError(f"the estimated ring stores no beam: {error}") from error
     if not begin.slopes.any():
@@ -135,14 +135,14 @@ def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
     whole = optimised(problem, begin, every)
     order = by_gain(whole)
     counts = [n for n in COUNTS if n < len(order)] + [len(order)]
-    number, _ = fewest(whole, order, counts)
-    chosen = np.array(order[:number], dtype=np.int64)
-    goal, _ = whole.step(chosen)
-    start = problem.better(goal, begin.square) or begin
-    end = optimised(problem, start, chosen)
-    if end.square > (1 + 2 * MAX_EXCESS) * whole.square:  # not as linear as that
-        end, number = whole, len(order)
-    return rounded(problem, end), order[:number]
+    number = fewest(whole, order, counts)
+    if number < len(order):
+        chosen = np.array(order[:number], dtype=np.int64)
+        goal, _ = whole.step(chosen)
+        end = optimised(problem, problem.better(goal, begin.square) or begin, chosen)
+        if end.square <= (1 + 2 * MAX_EXCESS) * whole.square:
+            return rounded(problem, end), order[:number]
+    return rounded(problem, whole), order  # or not as linear as that
 
 
 def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:

@@ -155,11 +155,11 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
             "the diagnosis started from"
         )
     with_beam, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
-    said: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     if not with_beam.is_file():
-        said = (f"'{with_beam.name}' is missing: the estimated ring is taken as certain",)
-    found = estimate_with(ring, settings, read_known(with_beam, ring) if not said else None)
+        warnings = (f"'{with_beam.name}' is missing: the estimated ring is taken as certain",)
+    found = estimate_with(ring, settings, read_known(with_beam, ring) if not warnings else None)
     if calibration.is_file():
         energy = read_energy(calibration, ring)
         found = found.with_beam(read_dispersion(calibration, ring), *energy)
-    return found, said
+    return found, warnings

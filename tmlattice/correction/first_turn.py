@@ -37,6 +37,8 @@ class Trajectory:
         self._model = Model(ring, [{}], TURNS)
         paths = self._model.paths(np.zeros((1, 5)))
         beam = paths.beam[0]
+        there = paths.states[0, self._model.where][:, [0, 2]]  # by maps that always have a value
+        beam = np.where(np.isfinite(beam), beam, there)
         self._alive = np.cumsum(~(np.abs(beam) < LOST).all(axis=1)) == 0
         if not self._alive.all():  # the maps behind have overflown
             behind = int(self._model.where[int(np.argmin(self._alive))]) + 1

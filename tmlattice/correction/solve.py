@@ -67,13 +67,14 @@ class Problem:
     energies: Array
 
     @cached_property
-    def begin(self) -> Shown:
-        """Return orbit and optics of the estimated ring.
+    def begin(self) -> "Point":
+        """Return the estimated ring.
 
         Raises:
             UnstableRingError: no stored beam.
         """
-        return self.targets.begin(self.estimate.ring, self.estimate.energy)
+        shown = self.targets.begin(self.estimate.ring, self.estimate.energy)
+        return Point(self, np.zeros(len(self.knobs)), shown)
 
     @cached_property
     def sigma(self) -> Array:
@@ -84,7 +85,7 @@ class Problem:
     def sizes(self) -> Array:
         """Norm of the rows' derivatives by each knob in the estimated ring, [knob]; 1 if it has no
         effect."""
-        size = np.linalg.norm(Point(self, np.zeros(len(self.knobs)), self.begin).slopes, axis=0)
+        size = np.linalg.norm(self.begin.slopes, axis=0)
         return np.asarray(np.where(size > 0, size, 1.0))
 
     @cached_property
@@ -100,8 +101,9 @@ class Problem:
         """
         causes = [c for k, a in zip(self.knobs, amounts.tolist(), strict=True) for c in k.causes(a)]
         shift = sum(a for k, a in zip(self.knobs, amounts, strict=True) if k.kind == "rf")
-        ring = self.estimate.ring
-        shown = self.begin.moved(apply(ring, causes), shift) if causes or shift else self.begin
+        if not causes and not shift:
+            return self.begin
+        shown = self.begin.shown.moved(apply(self.estimate.ring, causes), shift)
         return Point(self, amounts, shown)
 
     def better(self, amounts: Array, least: float) -> "Point | None":
@@ -271,12 +273,10 @@ def by_gain(point: Point) -> list[int]:
     return order
 
 
-def fewest(point: Point, order: Sequence[int], counts: Sequence[int]) -> tuple[int, Array]:
-    """Return the number of first knobs that reach nearly the gain of all, and the linearised
-    expected square of each number, [count]."""
+def fewest(point: Point, order: Sequence[int], counts: Sequence[int]) -> int:
+    """Return the number of first knobs that reach nearly the gain of all, to first order."""
     squares = np.array([point.step(np.array(order[:n], dtype=np.int64))[1] for n in counts])
-    enough = np.flatnonzero(squares <= (1 + MAX_EXCESS) * squares.min())
-    return counts[int(enough[0])], squares
+    return counts[int(np.argmax(squares <= (1 + MAX_EXCESS) * squares.min()))]
 
 
 def rounded(problem: Problem, point: Point) -> Point:

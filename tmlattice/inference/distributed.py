@@ -585,7 +585,9 @@ def posterior(
         spread = spread[np.ix_(visible, visible)]
         pull = known.correlated(known.rms * (sums.inner + sums.gram @ beyond))
         most_probable = np.zeros(len(pull))
-        factor = cho_factor(spread + np.eye(len(visible)), overwrite_a=True, check_finite=False)
+        rounding = len(visible) * np.finfo(float).eps * np.diag(spread).max(initial=0.0)
+        ridge = (1 + rounding) * np.eye(len(visible))
+        factor = cho_factor(spread + ridge, overwrite_a=True, check_finite=False)
         most_probable[visible] = cho_solve(factor, pull[visible], check_finite=False)
         amounts = known.amounts_at(most_probable)
     return Posterior(known, amounts, visible, spread, errors)
