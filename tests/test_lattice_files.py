@@ -13,6 +13,7 @@ import pytest
 from at_ring import at_lattice
 
 from tmlattice import load_ring, ring_maps
+from tmlattice.beam.chain import Chain
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import ring_from_at
@@ -323,6 +324,127 @@ def test_files_with_no_ring_end_in_one_sentence(tmp_path):
         load_ring(write(tmp_path, "e.mat", "no matlab"))
     with pytest.raises(LatticeError, match="no lattice file that can be read"):
         load_ring(write(tmp_path, "f.xyz", ""))
+
+
+FOREIGN = {
+    "a command file of elegant: give": "&run_setup\n lattice = ring.lte &end\n",
+    "a table of SDDS": "SDDS1\n&column name=s, type=double &end\n",
+    "a lattice of Bmad": "parameter[e_tot] = 3e9\nq: quadrupole, l = 0.4\n",
+    "a lattice of SAD": "FFS;\nQUAD QF = (L=.4 K1=.44);\nLINE RING=(QF);\n",
+    "a lattice of Tracy": "{ring}\ndefine lattice;\nqf: quadrupole, l=0.4, k=1.1;\n",
+    "a lattice of OPA": "energy = 2.4;\nb: bending, l=1, t=22.5;\nring: b, b;\n",
+    "a lattice of MAD-8": "TITLE\n A\nBEAM, ENERGY=3\nQ: QUADRUPOLE, L=1, &\n K1=1\nR: LINE=(Q)\n",
+}
+
+
+@pytest.mark.parametrize("suffix", [".madx", ".lte", ".lat"])
+@pytest.mark.parametrize("what", FOREIGN)
+def test_formats_that_are_not_read_are_named(tmp_path, what, suffix):
+    with pytest.raises(LatticeError, match=what):
+        load_ring(write(tmp_path, f"ring{suffix}", FOREIGN[what]), energy=3.0)
+
+
+M_FILE = """function ring = fodo()
+%FODO  as atwritem writes it (2003)
+ring = {...
+atringparam('fodo', 3e9, 8);...
+atquadrupole('QF', 0.4, 1.1, 'StrMPoleSymplectic4Pass', ...
+   'PolynomB', [0, 1.1, 0], 'MaxOrder', 2);... % strong (1.1)
+atdrift('D1', 0.5);
+atsbend('BB', 1.0, pi/8, 0.0, 'BndMPoleSymplectic4Pass');...
+%atdrift('D1', 0.5);...
+atdrift('D1', 0.5);...
+atquadrupole('QD', 0.4, -1.15, 'StrMPoleSymplectic4Pass');...
+atdrift('D1', 0.5);...
+};
+end
+"""
+
+
+def test_function_of_matlab_is_one_list_of_elements_or_refused(tmp_path):
+    ring = load_ring(write(tmp_path, "fodo.m", M_FILE))
+    assert ring.length == pytest.approx(8 * 3.3)
+    assert ring.counts()["quadrupole"] == 16
+    assert (ring["qf::0"].k1, ring["bb::0"].angle) == (1.1, np.pi / 8)
+    code = M_FILE.replace("};\n", "};\nring{2}.Length = 0.5;\n")
+    for text in (code, "QF = quadrupole('QF', 0.4, 1.1, 'QuadLinearPass');\nbuildlat([QF]);\n"):
+        with pytest.raises(LatticeError, match="MATLAB code and not one list of AT's elements"):
+            load_ring(write(tmp_path, "fodo.m", text))
+    with pytest.raises(LatticeError, match="leaves an element out: Line 2: Unknown class"):
+        load_ring(
+            write(tmp_path, "fodo.m", M_FILE.replace("atdrift('D1', 0.5);\na", "atway('D');\na"))
+        )
+
+
+def fodo(**changed):
+    """A ring of AT with other elements."""
+    own = {
+        "q": at.Quadrupole("q", 0.4, 1.1, NumIntSteps=40),
+        "d": at.Drift("d", 0.5),
+        "b": at.Dipole("b", 1.0, np.pi / 8, 0.0),
+        "f": at.Quadrupole("f", 0.4, -1.15, NumIntSteps=40),
+        "m": at.Marker("m"),
+        **changed,
+    }
+    return at.Lattice([own[key] for key in "qmdbdfmdb"], energy=3e9, periodicity=8)
+
+
+QUADRUPOLE = {"PassMethod": "StrMPoleSymplectic4Pass", "PolynomA": [0.0, 0.0],
+              "PolynomB": [0.0, 0.3], "MaxOrder": 1, "NumIntSteps": 10}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*beyond its first-order matrix")
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"m": at.Drift("m", 0.2, **QUADRUPOLE)},
+        {"m": at.Monitor("m", Length=0.2, **QUADRUPOLE)},
+        {"m": at.Corrector("m", 0.2, [1e-5, 2e-5], **QUADRUPOLE)},
+        {"m": at.Corrector("m", 0.2, [1e-4, 2e-4], PassMethod="DriftPass")},
+        {"m": at.Quadrupole("m", 0.2, 0.3, PassMethod="SolenoidLinearPass")},
+    ],
+)
+def test_pass_method_and_not_the_class_says_what_at_tracks(changed):
+    lattice = fodo(**changed)
+    ring = ring_from_at(lattice, "x")
+    matrix = np.linalg.matrix_power(lattice.find_m44()[0], 8)
+    mine, other = (np.sort(np.angle(np.linalg.eigvals(m))) for m in (ring_matrix(ring), matrix))
+    np.testing.assert_allclose(mine, other, rtol=0, atol=2e-4)  # AT's integration
+    orbit = Chain.from_ring(ring).closed_orbit(np.zeros(4))[0][0]
+    np.testing.assert_allclose(orbit, lattice.find_orbit4()[0][:4], rtol=0.01, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"m": at.Monitor("m", Length=0.2)}, "AT's IdentityPass skips the length"),
+        ({"q": at.Quadrupole("q", 0.4, 1.1, NumIntSteps=1)}, "integration in a few steps"),
+        ({"m": at.Quadrupole("m", 0.2, 0.3, PassMethod="IdentityPass")}, "is IdentityPass"),
+        ({"b": at.Dipole("b", 1.0, np.pi / 8, 0.0, PassMethod="StrMPoleSymplectic4Pass")},
+         "tracks bends straight ahead"),
+    ],
+)  # fmt: skip
+def test_what_at_tracks_otherwise_is_warned_of(changed, message):
+    with pytest.warns(UserWarning, match=message):
+        ring_from_at(fodo(**changed), "x")
+
+
+def test_energy_of_a_lattice_of_at_without_one_is_given(tmp_path):
+    from scipy.io import savemat
+
+    ring = np.empty((2, 1), object)
+    ring[0, 0] = {"FamName": "q", "PassMethod": "QuadLinearPass", "Length": 0.4, "K": 1.1}
+    ring[1, 0] = {"FamName": "d", "PassMethod": "DriftPass", "Length": 0.5}
+    savemat(tmp_path / "old.mat", {"THERING": ring})
+    with pytest.raises(LatticeError, match="states no beam energy; give energy="):
+        load_ring(tmp_path / "old.mat")
+    assert load_ring(tmp_path / "old.mat", energy=2.5).energy == 2.5
+
+
+def test_change_of_the_reference_momentum_is_refused():
+    change = at.Element("up", PassMethod="ChangePRefPass", FieldScaling=1.01)
+    with pytest.raises(LatticeError, match="'up' changes the reference momentum"):
+        ring_from_at(fodo(m=change), "x")
 
 
 @pytest.fixture(scope="module")

@@ -195,6 +195,37 @@ def test_damaged_files_end_in_one_sentence(tmp_path, text, message):
         load_ring(write(tmp_path, text))
 
 
+OCELOT_RING = """from ocelot import *
+q = Quadrupole(l=0.4, k1=1.1); f = Quadrupole(l=0.4, k1=-1.15); d = Drift(l=0.5)
+x = {x}
+ring = 8 * [q, d, SBend(l=1, angle=0.39), d, f, x]
+energy = 3.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("x", "message"),
+    [
+        (
+            "Cavity(l=0.1, v=1e-3, freq=5e8, vx_up=1e-3, eid='rf')",
+            "vx_up of the Cavity 'rf' is not",
+        ),
+        ("Matrix(l=0.1, delta_e=0.01, eid='m')", "delta_e of the Matrix 'm' is not modelled"),
+        ("d; q.dtilt = 0.05; q.id = 'q1'", "dtilt of the Quadrupole 'q1' is not modelled"),
+    ],
+)
+def test_attributes_of_ocelot_that_act_and_are_not_modelled_are_refused(tmp_path, x, message):
+    with pytest.raises(LatticeError, match=message):
+        load_ring(write(tmp_path, OCELOT_RING.replace("{x}", x)))
+
+
+def test_deflecting_cavity_is_warned_of(tmp_path):
+    with pytest.warns(UserWarning, match="'crab': what the voltage does in a TDCavity is left out"):
+        load_ring(
+            write(tmp_path, OCELOT_RING.replace("{x}", "TDCavity(l=0.1, v=1e-3, eid='crab')"))
+        )
+
+
 def test_unknown_names_offer_the_nearest(small_ring, tmp_path):
     with pytest.raises(UnknownNameError, match=r"no element 'qd:12'; did you mean .*QD::12"):
         small_ring["qd:12"]

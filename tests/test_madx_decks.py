@@ -84,6 +84,8 @@ REFUSED = {
         "EXTRACT is not from a marker to a marker",
     ),
     "call": (PLAIN + "call;", "it calls"),
+    "one of a list": (PLAIN + "sf->knl[1] = 0.03;", "one number of a list is not set so"),
+    "undefined in a sequence": (with_element("qx, at=4.95;"), "no element or command 'qx' is"),
     "nested branches": (
         PLAIN + "if (1 == 1) { if (1 == 2) { qf, k1=2; } } else { frobnicate; } wrong;",
         "no element or command 'wrong'",
@@ -125,6 +127,15 @@ WARNED = {
         r"left out.*DX of the QUADRUPOLE \(as in a LINE\) of qf \(1\)",
     ),
     "no value": (PLAIN + "qf, tilt;", "TILT of 'qf' has no value: 0, as in MAD-X"),
+    "radiation": (PLAIN.replace("energy=3", "energy=3, radiate"), "RADIATE of BEAM: orbits and"),
+    "not defined": (PLAIN + "qx, k1=3; qy->k1 = 2;", r"qx, qy \(2\) are not defined: skipped"),
+    "length of a sequence": (PLAIN + "ring, l=43;", "L of the sequence 'ring' stays as defined"),
+    # its faces stay parallel here, as in Xsuite
+    "rectangular bend of bv": (
+        PLAIN.replace("energy=3", "energy=3, bv=-1").replace("bb: sbend", "bb: rbend"),
+        r"MAD-X's TWISS gives half the angle in faces \(BV=-1\) of bb \(1\)",
+    ),
+    "exciter": (with_element("h: hkicker, sinkick=1, at=4.95;"), r"SINKICK of h \(1\)"),
     "later length": (PLAIN + "qf, l=0.5;", r"left out.*the later L or ANGLE .* of qf \(1\)"),
 }
 

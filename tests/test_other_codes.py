@@ -179,6 +179,15 @@ def test_header_that_states_other_figures_is_a_contradiction(madx, tmp_path):
             load_ring(wrong)
 
 
+def test_figures_that_other_models_and_cavities_change_are_no_contradiction(madx, tmp_path):
+    """PTC may leave out products of curvature and gradient; with RF on MAD-X's ALFA is another."""
+    right = stated(madx)
+    path = table(madx, tmp_path, **{**right, "DQ2": right["DQ2"] + 6.0})
+    path.write_text('@ NAME %s "PTC_TWISS"\n' + path.read_text())
+    load_ring(path)
+    load_ring(table(madx, tmp_path, **{**right, "ALFA": 0.97 * right["ALFA"]}))
+
+
 DECKS = json.loads((Path(__file__).parent / "lattices" / "madx_decks.json").read_text())["decks"]
 
 

@@ -17,6 +17,7 @@ from tmlattice.importers import Options, bring_in
 from tmlattice.importers.readings import place_of
 from tmlattice.importers.told import Told
 from tmlattice.machine_file import load_machine_file
+from tmlattice.measurement.lost_beam import beam_lost
 
 
 @pytest.fixture(scope="module")
@@ -241,6 +242,95 @@ def test_a_table_that_says_too_little_is_a_sentence(small_ring, tmp_path, text, 
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(MeasurementError, match=words):
         bring_in([tmp_path / "a.csv"], Options(ring=small_ring))
+
+
+def long(data, header="shot,BPM,x [mm],y [mm]", separator=",", above="", edit=lambda k, text: text):
+    """A row a monitor; `edit` takes the number of a reading and its text."""
+    lines = [header]
+    for k, (shot, i) in enumerate(np.ndindex(data.readings[:, 0, :, 0].shape)):
+        x, y = (edit(k, repr(float(1e3 * v))) for v in data.readings[shot, 0, i])
+        lines.append(separator.join([str(shot), data.monitors[i], x, y]))
+    return above + "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "above", "separator"),
+    [
+        ("shot,BPM,x/mm,y/mm", "", ","),
+        ("shot;BPM;x, mm;y, mm", "", ";"),
+        ("shot,BPM,X_mean [mm],Y_mean [mm]", "", ","),
+        ("shot,BPM,x pos [millimetres],y pos [millimetres]", "", ","),
+        ("shot,BPM,xco [mm],yco [mm]", "% of 3 May, written by MATLAB\n", ","),
+        ("shot,BPM,x [mm],y [mm]", "Orbit of 3 May, 12:00\n", ","),
+        ("shot,BPM,x [mm],y [mm]", "Device: BPM\nDate: 2024-05-03\n\n", ","),
+        ("shot,BPM,x,y\n-,-,mm,mm", "", ","),
+        ("shot  BPM  x [mm]  y [mm]", "", "  "),
+        ("* SHOT BPM X_MM Y_MM\n$ %d %s %le %le", '@ DATE %s "2024"\n', " "),
+    ],
+)
+def test_headers_of_control_systems(small_ring, data, tmp_path, header, above, separator):
+    path = tmp_path / "a.csv"
+    path.write_text(long(data, header, separator, above))
+    same(bring_in([path], Options(ring=small_ring)), data)
+
+
+def test_numbers_and_words_that_stand_for_no_reading_are_missing(small_ring, data, tmp_path):
+    words = {7: "N/A", 20: "--", 33: "-999", 41: "-999", 50: "-999"}
+    path = tmp_path / "a.csv"
+    path.write_text(long(data, edit=lambda *own: words.get(*own)))
+    brought = bring_in([path], Options(ring=small_ring))
+    assert any("6 readings are 999, far above all others" in said for said in brought.assumed)
+    expected = data.readings.copy()
+    expected.reshape(-1, 2)[list(words)] = np.nan
+    own = brought.measurement.select(monitors=data.monitors)
+    np.testing.assert_allclose(own.readings, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_a_constant_behind_a_lost_beam_is_left_to_the_check_of_lost_beams(
+    small_ring, data, tmp_path
+):
+    ordered = data.in_order_of([m.name for m in small_ring.monitors])
+    count = len(ordered.monitors)
+    text = long(ordered, edit=lambda k, text: "12.5" if k % count >= count // 2 else text)
+    (tmp_path / "a.csv").write_text(text)
+    own = bring_in([tmp_path / "a.csv"], Options(ring=small_ring)).measurement
+    assert (own.readings[:, 0, -1] == 0.0125).all()
+    assert beam_lost(own).first.tolist() == 3 * [count // 2]
+
+
+def test_columns_that_are_not_read_are_named(small_ring, data, tmp_path):
+    rows = long(data).splitlines()
+    rows = [f"{rows[0]},status,Σ", *(f"{row},BAD,1000" for row in rows[1:])]
+    (tmp_path / "a.csv").write_text("\n".join(rows), encoding="utf-8")
+    assumed = same(bring_in([tmp_path / "a.csv"], Options(ring=small_ring)), data).assumed
+    assert any("columns that are not read: 'status'" in said for said in assumed)
+    assert any("sum signals are those of a beam" in said for said in assumed)
+
+
+@pytest.mark.parametrize("form", ["arrays", "structure", "array of structures", "a row a monitor"])
+def test_readings_of_matlab(small_ring, data, tmp_path, form):
+    from scipy.io import savemat
+
+    x, y = (1e3 * data.readings[:, 0, :, i] for i in range(2))
+    names = np.array(data.monitors, object)
+    content = {
+        "arrays": {"x": x, "y": y, "names": names},
+        "structure": {"bpm": {"x": x, "y": y, "name": names, "units": "mm"}},
+        "array of structures": {"bpm": np.array(
+            list(zip(names, x.T, y.T, strict=True)),
+            dtype=[("Name", object), ("X", object), ("Y", object)])},
+        "a row a monitor": {"x": x.T, "y": y.T, "names": names},
+    }  # fmt: skip
+    savemat(tmp_path / "a.mat", content[form])
+    same(bring_in([tmp_path / "a.mat"], Options(ring=small_ring)), data)
+
+
+def test_columns_of_sdds_are_refused_in_a_sentence(small_ring, tmp_path):
+    (tmp_path / "a.sdds").write_text(
+        "SDDS1\n&column name=x, type=double, &end\n&data mode=ascii, &end\n1\n0.1\n"
+    )
+    with pytest.raises(MeasurementError, match=r"columns such as 'x' of SDDS .* write them as CSV"):
+        bring_in([tmp_path / "a.sdds"], Options(ring=small_ring))
 
 
 def test_many_turns_are_those_of_a_stored_beam(small_ring, tmp_path, rng):

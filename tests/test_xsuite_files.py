@@ -181,6 +181,17 @@ def test_old_words_of_fields(tmp_path):
     edge = line["elements"]["e"]
     edge["_h"] = edge.pop("k")
     same(load(line, tmp_path), "dipole_edge")
+    curvature, gap, angle = edge["_h"], edge.pop("hgap"), edge.pop("e1")
+    fringe = 2 * gap * edge.pop("fint") * curvature * (1 + np.sin(angle) ** 2) / np.cos(angle)
+    edge |= {"_h": 0.0, "_r21": curvature * np.tan(angle)}
+    edge |= {"_r43": -curvature * np.tan(angle - fringe)}  # alone in the first files
+    same(load(line, tmp_path), "dipole_edge")
+    line = line_of(DECKS["quadrupole_tilt"])
+    turn = line["elements"]["qf"].pop("rot_s_rad")
+    line["elements"]["qf"] |= {"_sin_rot_s": np.sin(turn), "_cos_rot_s": np.cos(turn)}
+    same(load(line, tmp_path), "quadrupole_tilt")
+    line["elements"]["qd"] |= {"_sin_rot_s": -999.0, "_cos_rot_s": -999.0}  # it has none
+    same(load(line, tmp_path), "quadrupole_tilt")
 
 
 def test_field_of_a_bend_that_is_off(tmp_path):

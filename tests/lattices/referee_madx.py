@@ -334,6 +334,29 @@ DECKS = {
               "endedit;\n", extra="tk: hkicker, kick=1e-5, at=5.1;"),
     "seqedit reflect": deck(extra="q3: quadrupole, l=0.1, k1=0.5, at=5.0;",
         after="seqedit, sequence=ring;\nflatten;\nreflect;\nendedit;\n"),
+    # what a later session found misread
+    "constant twice": deck(before="const kk = 1.12; kk = 1.2; qf, k1=kk;\n"),
+    "whole number": deck(before="int n = 2.7; qf, k1=1+n/20;\n"),
+    "if with an arrow": deck(before="k=2; if (k*2 == 4 && qf->l < 1) { qf, k1=1.14; }\n"),
+    "if without a comparison": deck(before="k=1; if (k) { qf, k1=1.14; } else { qf, k1=1.12; }\n"),
+    "set sequence": deck(after="two: sequence, l=10; qf, at=5; endsequence;\n"
+                               "use, sequence=ring; use, sequence=two; set, sequence=ring;\n"),
+    "not defined": deck(after="q.not.there, aperture={0.1,0.1}; q.no.more->k1 = 3;\n"),
+    "sequence's length later": deck(after="ring->l = 43;\n"),
+    "dipedge he": deck(extra="de: dipedge, at=4.95, h=0.4, e1=0.1, he=0.3, hgap=0.02, fint=0.5;"),
+    "bv srotation": deck(beam="beam, particle=electron, energy=3, bv=-1;\n",
+        extra="q3: quadrupole, l=0.1, k1=0.3, at=4.8; sr: srotation, at=5.0, angle=0.02;"),
+    "seqedit install after flatten": deck(before="q3: quadrupole, l=0.2, k1=0.5;\n",
+        after="seqedit, sequence=ring; flatten; install, element=q3, at=5.0; endedit;\n"),
+    **{f"seqedit move {how} of {refer}": BEAM + ELEMENTS
+       + f"ring: sequence, l=41.6, refer={refer};\n"
+       + "".join(
+           f"qf, at={5.2 * k + 0.3 + 0.2 * to:.1f}; bb, at={5.2 * k + 1.5 + 0.5 * to:.1f};"
+           f" qd, at={5.2 * k + 2.9 + 0.2 * to:.1f}; bb, at={5.2 * k + 4.2 + 0.5 * to:.1f};\n"
+           for k in range(8))
+       + f"endsequence;\nseqedit, sequence=ring; move, element=qd, {how}; endedit;\n"
+       for refer, to in (("entry", -1), ("exit", 1))
+       for how in ("by=-0.1", "to=2.95", "to=1.45, from=bb")},
 }  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from tmlattice.importers.columns import (
     SHEETS,
     as_frame,
     label,
+    of_matlab,
     read_columns,
     text_of,
 )
@@ -243,6 +244,9 @@ def _bring(
                 responses[0], beside, content, path, options.iteration, options.keep_bad,
                 options.energy,
             )  # fmt: skip
+    if len(rest) == len(files) == 1 and (ring := _ring(options)) is not None:
+        told = with_unit(options.told, options.unit, options.noise)
+        return bring_readings(label(files[0]), of_matlab(*rest[0]), ring, told)
     shown = ", ".join(f"'{path}'" for path in files)
     raise MeasurementError(
         f"{shown}: no measurement that is known; give a MATLAB LOCO file (with LocoMeasData), or "

@@ -6,7 +6,8 @@
 
 import csv
 import re
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,10 @@ from tmlattice.lattice.mat_file import read_apart
 CSV, HDF5, SDDS = (".csv", ".tsv", ".txt", ".dat"), (".h5", ".hdf5", ".hdf"), (".sdds",)
 
 _BRACKETS = re.compile(r"^\s*(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
-_TAIL = re.compile(r"^\s*(?P<name>.*?)[\s_](?P<unit>mm|um|µm|nm)\s*$", re.IGNORECASE)
+_TAIL = re.compile(r"^\s*(?P<name>.*?)[\s_/,]+(?P<unit>mm|um|µm|nm)\s*$", re.IGNORECASE)
+_COMMENT = "#%!@$"
+"""What lines begin with that hold no readings: of scripts, MATLAB, MAD-X and its tables."""
+_UNITS = {"mm", "um", "µm", "nm", "m", "", "-"}
 
 _POSITION = re.compile(r"(?:^|[^a-z])(?:x|y|hor\w*|ver\w*)(?:[^a-z]|$)", re.IGNORECASE)
 """Of names of readings: a plane as a word."""
@@ -137,26 +141,27 @@ def _of_frame(table: Any) -> list[Column]:
 
 
 def named(text: str) -> tuple[str, str]:
-    """Name and unit of a header: `x [mm]`, `x (mm)`, `bpm1_x_mm`, `x mm`."""
+    """Name and unit of a header: `x [mm]`, `x (mm)`, `bpm1_x_mm`, `x mm`, `x/mm`."""
     match = _BRACKETS.match(text) or _TAIL.match(text)
     return (match["name"].strip(), match["unit"].strip()) if match else (text.strip(), "")
 
 
 def _csv(path: Path) -> list[Column]:
-    """Comma, semicolon, tab or blanks; lines that begin with # are passed over, but for the last
-    one above the numbers where there is no other header."""
+    """Comma, semicolon, tab or blanks; comments are passed over, but for the last one above the
+    numbers where there is no other header, and lines before the table; a row of units may follow
+    the header."""
     text = text_of(path)
     numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
-    lines = [(i, line) for i, line in numbered if not line.lstrip().startswith("#")]
+    lines = [(i, line) for i, line in numbered if line.lstrip()[0] not in _COMMENT]
     if not lines:
         raise MeasurementError(f"{path}: the file is empty; write its header first")
-    above = [line.lstrip("# \t") for i, line in numbered if i < lines[0][0]]
-    separator = max(";\t,", key=lines[0][1].count)
-    blanks = separator not in lines[0][1]
+    last = lines[-1][1]
+    separator = max(";\t,", key=last.count)
+    blanks = separator not in last
 
     def cut(line: str) -> list[str]:
         if blanks:
-            return line.split()
+            return re.sub(r"\s+([\[(])", r"\1", line.lstrip("* ")).split()
         try:
             fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
         except csv.Error as error:
@@ -164,10 +169,19 @@ def _csv(path: Path) -> list[Column]:
         return [field.strip() for field in fields]
 
     rows = [(i, cut(line)) for i, line in lines]
-    header = rows.pop(0)[1]
+    usual = Counter(len(row) for _, row in rows).most_common(1)[0][0]
+    start = next(k for k, (_, row) in enumerate(rows) if len(row) == usual)
+    if len(rows) > start + 1 and not any(map(_is_number, rows[start][1])):
+        rows = rows[start:]  # below a title, or lines about the file
+    first, header = rows.pop(0)
+    above = [line.lstrip(f"{_COMMENT}* \t") for i, line in numbered if i < first]
     if above and any(_is_number(field) for field in header):
-        rows.insert(0, (lines[0][0], header))
+        rows.insert(0, (first, header))
         header = cut(above[-1])
+    elif rows and {field.strip("[]()").lower() for field in rows[0][1]} <= _UNITS:
+        units = [field.strip("[]()-") for field in rows.pop(0)[1]]
+        header = [f"{name} [{unit}]" if unit else name
+                  for name, unit in zip(header, units, strict=False)]  # fmt: skip
     for line, row in rows:
         if len(row) != len(header):
             raise MeasurementError(
@@ -195,6 +209,23 @@ def _hdf5(path: Path) -> list[Column]:
         if not isinstance(unit, str):
             raise MeasurementError(f"'{path}': the unit of '{name}' is no text")
     return _apart(path, {name: (value, units[name]) for name, value in content.items()})
+
+
+def of_matlab(path: Path, content: Mapping[str, Any]) -> list[Column]:
+    """Columns of a MATLAB file's variables, its structures taken apart: see `_hdf5`."""
+    arrays: dict[str, tuple[Any, str]] = {}
+
+    def take(name: str, value: Any) -> None:
+        if isinstance(value, list) and value and all(isinstance(v, dict) for v in value):
+            value = {key: [own.get(key) for own in value] for key in value[0]}
+        if isinstance(value, dict):
+            for key, own in value.items():
+                take(f"{name}/{key}" if name else key, own)
+        elif isinstance(value, list | np.ndarray):
+            arrays[name] = np.asarray(value), ""
+
+    take("", dict(content))
+    return _apart(path, arrays)
 
 
 def _sdds(path: Path) -> list[Column]:
@@ -231,6 +262,9 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
             plain, own = named(name)
             flat.append((plain, unit or own, array))
             continue
+        counts = {len(list_) for list_ in texts.values()}
+        if array.shape[1] not in counts and array.shape[0] in counts:
+            array = array.T  # a row a monitor
         fits = [list_ for list_ in texts.values() if len(list_) == array.shape[1]]
         if not fits:
             raise MeasurementError(

@@ -41,12 +41,20 @@ MONITORS = ("monitor", "bpm", "device", "name", "element", "pv", "channel")
 VALUES = ("value", "val", "reading", "position")
 PLANES = ("plane", "axis")
 _PLANE = re.compile(
-    r"(?:pos|position|orbit)?(?P<p>x|y|h|v|hor|ver|horizontal|vertical)(?:pos|position|mean|avg)?",
+    r"(?:pos|position|orbit)?(?P<p>x|y|h|v|hor|ver|horizontal|vertical)(?:pos|position|mean|avg|co)?",
     re.IGNORECASE,
 )
 SUM = 2
 """Stands for the sum signal, where 0 and 1 are planes."""
-_SUM = re.compile(r"(?:bpm)?(?:sum|intensity|charge)(?:signal)?", re.IGNORECASE)
+_SUM = re.compile(r"(?:bpm)?(?:sum|intensity|charge|Σ)(?:signal|adc|raw)?", re.IGNORECASE)
+_MISSING = frozenset({
+    "", "nan", "na", "n/a", "null", "none", "-", "--", "---", "*", "?", "invalid", "disconnected",
+    "error", "bad", "off", "timeout",
+})  # fmt: skip
+FILLED = 3
+"""Times that one number is read, at least, which is larger by as much than all that differ, from
+which it stands for no reading."""
+_PREFIX = {"milli": "m", "micro": "u", "nano": "n"}
 _TOKEN = re.compile(r"[A-Za-z0-9]+")
 
 
@@ -97,13 +105,15 @@ def bring_readings(
     for place in places:
         monitor.setdefault(place.device, finder.find(place.device))
     scale = np.ones(len(values))
+    fill = _fill(values[position])
     scale[position], of_unit, guessed = _scale(
-        values[position], [u for u, p in zip(units, position, strict=True) if p], told
-    )
+        np.where(np.abs(values) == fill, np.nan, values)[position],
+        [u for u, p in zip(units, position, strict=True) if p], told,
+    )  # fmt: skip
     both = np.full((len(set(shots)), max(turns) + 1, len(names), 3), np.nan)
     order = {shot: i for i, shot in enumerate(dict.fromkeys(shots))}
-    taken = np.zeros(both.shape, dtype=bool)
-    for shot, turn, place, value in zip(shots, turns, places, values * scale, strict=True):
+    taken, filled = np.zeros((2, *both.shape), dtype=bool)
+    for shot, turn, place, value, factor in zip(shots, turns, places, values, scale, strict=True):
         at = monitor.get(place.device)
         if at is None:
             continue
@@ -114,8 +124,10 @@ def bring_readings(
                 "'turn' that separates them"
             )
         taken[where] = True
-        both[where] = value
+        both[where] = value * factor
+        filled[where] = abs(value) == fill
     readings, silent = both[..., :SUM], no_beam(both[..., SUM])
+    missing = _scattered(readings, filled[..., :SUM], fill)
     before = np.isfinite(readings).any(axis=3)
     readings[silent] = np.nan
     said_of_large = _without_large(path, readings, names)
@@ -145,7 +157,10 @@ def bring_readings(
     if isinstance(data, TurnByTurn):
         beam = f"{readings.shape[1]} turns are those of a stored beam that was kicked before"
     sums = about_sums(both[..., SUM], silent, before, names)
-    said = [of_unit, beam, of_noise, *finder.said, *sums, *said_of_large]
+    said = [
+        of_unit, beam, of_noise, *finder.said, *sums, *missing, *said_of_large,
+        *_unused(columns, told),
+    ]  # fmt: skip
     if bad:
         said.append(f"bad monitors, left out as stated: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
@@ -170,6 +185,37 @@ def _without_large(path: str, readings: Array, names: Sequence[str]) -> list[str
         if some
     ]
     return [f"rejected readings, above {LARGEST_READING} m: {count}, of {counted(of)}"]
+
+
+def _fill(values: Array) -> float | None:
+    """A number that is read again and again and is far above all others, without its sign."""
+    own, counts = np.unique(np.abs(values[np.isfinite(values)]), return_counts=True)
+    single = own[counts < FILLED]
+    often = len(single) > 0 and counts[-1] >= FILLED and own[-1] > FILLED * single[-1]
+    return float(own[-1]) if often else None
+
+
+def _scattered(readings: Array, filled: NDArray[np.bool_], fill: float | None) -> list[str]:
+    """Take that number for no reading where others follow it in its shot: else the beam was lost
+    there. A sentence about it."""
+    own = filled.any(axis=3).reshape(len(filled), -1)
+    other = np.isfinite(readings).any(axis=3).reshape(len(filled), -1) & ~own
+    behind = [o.any() and t[o.argmax() :].any() for o, t in zip(own, other, strict=True)]
+    if not any(behind):
+        return []
+    readings[filled] = np.nan
+    return [f"{filled.sum()} readings are {fill:g}, far above all others: taken as missing"]
+
+
+def _unused(columns: Sequence[Column], told: Told) -> list[str]:
+    """A sentence about columns that are not read."""
+    known = {*SHOTS, *TURNS, *MONITORS, *VALUES, *PLANES, *map(str.casefold, told.columns.values())}
+    names = [
+        c.name for c in columns
+        if c.name and c.name.casefold().replace(" ", "_") not in known
+        and _plane(c.name) is None and place_of(c.name, told) is None
+    ]  # fmt: skip
+    return [f"columns that are not read: {counted(names)}"] if names else []
 
 
 Found = tuple[list[str], list[int], list[Place], Array, list[str]]
@@ -267,7 +313,7 @@ def numbers_of(path: str, column: Column) -> list[float]:
 
 
 def _number(path: str, row: int, name: str, text: str) -> float:
-    if text.casefold() in ("", "nan", "na", "null", "none", "-", "invalid", "disconnected"):
+    if text.casefold() in _MISSING:
         return float("nan")
     try:
         return float(text)
@@ -315,9 +361,10 @@ def _turns(path: str, columns: Sequence[Column], told: Told) -> list[int] | None
 
 
 def _plane(text: str) -> int | None:
-    if _SUM.fullmatch(text.strip()):
+    text = re.sub(r"[\W_]", "", text)
+    if _SUM.fullmatch(text):
         return SUM
-    match = _PLANE.fullmatch(text.strip())
+    match = _PLANE.fullmatch(text)
     return None if match is None else int(match["p"][0].casefold() in "yv")
 
 
@@ -438,11 +485,13 @@ def _unique(key: Callable[[str], str], names: Sequence[str]) -> dict[str, int]:
 def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str, str | None]:
     """Metres per unit of each number, a sentence about it, and a unit that is a guess."""
     known = {"µm": "um", "μm": "um", "micron": "um", "metre": "m", "meter": "m"}
-    plain = [known.get(unit.strip().casefold(), unit.strip().casefold()) for unit in units]
+    words = [re.sub("metre|meter$", "m", unit.strip().casefold().rstrip("s")) for unit in units]
+    words = [re.sub("^(?:milli|micro|nano)(?=m)", lambda k: _PREFIX[k[0]], w) for w in words]
+    plain = [known.get(word, word) for word in words]
     strange = [unit for unit in plain if unit and unit not in METRES]
     if strange:
         raise MeasurementError(
-            f"no unit '{strange[0]}' of a reading; there are {', '.join(METRES)}"
+            f"no unit '{strange[0]}' of a reading; there are {', '.join(METRES)}: give them in one"
         )
     silent = np.array([not unit for unit in plain])
     scale = np.array([METRES[unit] if unit else 1.0 for unit in plain])

@@ -50,10 +50,10 @@ def check_methods(elements: Iterable[Any]) -> None:
 
 
 class Tracker:
-    """A child process that computes first-order matrices; it is started by the first element.
+    """A child process that computes first-order maps; it is started by the first element.
 
     >>> with Tracker(3e9) as tracker:
-    ...     matrix = tracker.matrix(element)                # [6, 6], AT's coordinates
+    ...     matrix, kick = tracker.map(element)             # [6, 6], [6], AT's coordinates
     """
 
     def __init__(self, energy: float) -> None:
@@ -73,16 +73,18 @@ class Tracker:
             self._child.kill()
             self._child.communicate()
 
-    def matrix(self, element: Any) -> NDArray[np.float64]:
-        """The 6 x 6 matrix of an AT element, in AT's coordinates, (.., delta, ct).
+    def map(self, element: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The matrix of an AT element, [6, 6], and what it adds to a particle on the axis, [6], in
+        AT's coordinates, (.., delta, ct).
 
         Raises:
             LatticeError: AT cannot track it, dies over it, or does not come back.
         """
         check_methods([element])
         said = self._asked(pickle.dumps((element, self._energy)))
-        if len(said) == 36 * 8:
-            return np.frombuffer(said, "<f8").reshape(6, 6)
+        if len(said) == 42 * 8:
+            numbers = np.frombuffer(said, "<f8").reshape(7, 6)
+            return numbers[:6], numbers[6]
         why = said.decode("utf-8", "replace") or "its tracking does not come back"
         raise LatticeError(
             f"AT cannot track the element '{element.FamName!s:.40}' ({why:.200}); correct it"
@@ -127,10 +129,11 @@ os.dup2(2, 1)  # what AT prints is no answer
 warnings.simplefilter("ignore")
 while len(head := source.read(8)) == 8:
     try:
-        import at
+        import at, numpy as np
         element, energy = pickle.loads(source.read(struct.unpack("<q", head)[0]))
-        matrix = at.find_elem_m66(element, energy=energy, particle=at.Particle("relativistic"))
-        said = matrix.astype("<f8").tobytes()
+        beam = {"energy": energy, "particle": at.Particle("relativistic")}
+        kick = element.track(np.zeros(6), **beam).reshape(1, 6)
+        said = np.vstack([at.find_elem_m66(element, **beam), kick]).astype("<f8").tobytes()
     except Exception as error:
         said = " ".join(f"{type(error).__name__}: {error}".split())[:200].encode()
     sink.write(struct.pack("<q", len(said)) + said)

@@ -24,15 +24,18 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, plain
+from tmlattice.input_files import content_of
 from tmlattice.lattice.at_child import Tracker, check_methods
-from tmlattice.lattice.at_fields import bend, straight, thin, with_coils
+from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
+from tmlattice.lattice.madx_language import split
 from tmlattice.lattice.mat_file import check_mat
 from tmlattice.lattice.parts import assembled
 from tmlattice.lattice.places import Place, corrector, corrector_pair, rotation
@@ -47,6 +50,9 @@ ACTS = frozenset({
     "CRABCAVITY", "ELSEPARATOR", "RFMULTIPOLE", "SOLENOID",
 })  # fmt: skip
 """MAD-X's classes that AT's reader of MAD-X makes a drift of, although they act."""
+
+COARSE = 1e-3
+"""|k1| l^2 / steps^4 of a magnet above which AT's integrator is wrong by 3e-5 of a tune."""
 
 _VERTICAL = re.compile(r"^(f?v|c[hy]?v|pcv|pkv|c_?y|ky)|vcor|vkick|vcm|_v(_|\d|$)", re.IGNORECASE)
 _HORIZONTAL = re.compile(r"^(f?h|c[vx]?h|pch|pkh|c_?x|kx)|hcor|hkick|hcm|_h(_|\d|$)", re.IGNORECASE)
@@ -69,27 +75,65 @@ def read_at(
     """
     import at
 
-    options = {"use": sequence} if sequence else {}
+    options: dict[str, Any] = {"use": sequence} if sequence else {}
+    if energy is not None:
+        options["energy"] = 1e9 * energy
     if path.suffix.lower() == ".mat":
         check_mat(path)
     try:
-        with quiet_at(), nothing_run():
-            lattice = at.load_lattice(str(path), **options)
+        with quiet_at() as told, nothing_run(), TemporaryDirectory() as folder:
+            source = path
+            if path.suffix.lower() == ".m":
+                source = Path(folder) / path.name
+                source.write_text(_list_of_m(path))
+            lattice = at.load_lattice(str(source), **options)
+            for said in (str(warning.message) for warning in told):
+                if "skipped" in said or "Unknown class" in said:
+                    raise LatticeError(f"AT's reader leaves an element out: {said}")
     except Exception as error:  # each of AT's readers fails in its own way
         said = plain(str(error), 300) or type(error).__name__
+        if "energy is not defined" in said:
+            raise LatticeError(f"'{path}' states no beam energy; give energy= (GeV)") from error
+        advice = "save it with AT's save_lattice, or name its variable with sequence="
+        if isinstance(error, LatticeError):
+            advice = "correct it"
         raise LatticeError(
-            f"'{path}' cannot be read as an AT lattice ({said}); save it with AT's "
-            "save_lattice, or name its variable with sequence="
+            f"'{path}' cannot be read as an AT lattice ({said}); {advice}"
         ) from error
     return ring_from_at(lattice, name, energy)
 
 
+def _list_of_m(path: Path) -> str:
+    """The list of elements of a MATLAB function, one a line, as AT's reader needs it.
+
+    Raises:
+        LatticeError: the function does anything else, which would have to be run.
+    """
+    lines = content_of(path, LatticeError).decode("utf-8-sig", "replace").splitlines()
+    bare = "\n".join(re.sub(r"^((?:[^'%]|'[^']*')*)%.*", r"\1", line) for line in lines)
+    bare = re.sub(r"\.\.\.[^\n]*\n", " ", f"{bare}\n")
+    match = re.fullmatch(
+        r"\s*function\s+\w+\s*=\s*\w+\s*(?:\(\s*\))?\s*\w+\s*=\s*\{(.*?)[\n;]\s*\}\s*;?(.*)",
+        bare, re.DOTALL,
+    )  # fmt: skip
+    items = [] if match is None else [i for i in split(match[1].replace("\n", ";"), ";") if i]
+    end = r"function v=(False|True)\(\)|v=(false|true);|\bend\b|\breturn\b;?"
+    code = match is None or re.sub(end, "", match[2]).strip()
+    if code or not all(re.fullmatch(r"at\w+\(.*\)", item) for item in items):
+        raise LatticeError(
+            "it is MATLAB code and not one list of AT's elements, and is not run; write the ring "
+            "with AT's atwritem, or save it as .mat"
+        )
+    rows = [re.sub(r"\[[^\[\]]*\]", lambda m: m[0].replace(",", " "), item) for item in items]
+    return "\n".join(["function ring = x()", "ring = {...", *(f"{r};..." for r in rows), "};", ""])
+
+
 @contextmanager
-def quiet_at() -> Iterator[None]:
+def quiet_at() -> Iterator[list[warnings.WarningMessage]]:
     """What AT warns of stays in the log: it is about AT's tracking, or about words of a file."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        yield
+        yield told
     for warning in told:
         log.info("AT: %s", warning.message)
 
@@ -186,7 +230,7 @@ def _places(
 
     mad = str(getattr(element, "MADType", "")).upper()
     mad = mad or str(getattr(element, "origin", "")).upper()
-    if isinstance(element, at.Corrector):
+    if isinstance(element, at.Corrector) and not _acts(element):
         return _correctors(element, family, mad)
     kind, source = _convert(element, family, mad, energy, left_out, tracker)
     if kind == "bend":
@@ -210,11 +254,19 @@ def _convert(
         return "cavity", ocelot.Cavity(l=length, v=1e-9 * voltage, freq=frequency, eid=family)
     if mad == "INSTRUMENT" and isinstance(element, at.Monitor):  # AT's MAD-X reader has it so
         return "marker", ocelot.Marker(eid=family)
-    if isinstance(element, at.Monitor) or mad in ("MONITOR", "HMONITOR", "VMONITOR"):
+    acts, method = _acts(element), element.PassMethod
+    if length and method == "IdentityPass":
+        left_out["that AT's IdentityPass skips the length of an element"] += 1
+    steps = float(np.ravel(getattr(element, "NumIntSteps", 10.0))[0])
+    gradient = abs(strengths_of(element)[1]) if acts else 0.0
+    if "Symplectic4" in method and gradient * length**2 > COARSE * max(steps, 1.0) ** 4:
+        left_out["the error of AT's integration in a few steps"] += 1
+    if not acts and (isinstance(element, at.Monitor) or mad in ("MONITOR", "HMONITOR", "VMONITOR")):
         return "monitor", ocelot.Monitor(l=length, eid=family)
     if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
         return "monitor", ocelot.Monitor(l=length, eid=family)  # lattices from before the class
-    if isinstance(element, at.Drift | at.Marker | at.Aperture) or _passive(element, left_out):
+    way = isinstance(element, at.Drift | at.Marker | at.Aperture)
+    if (way and not acts) or _passive(element, left_out):
         if mad in ACTS:
             left_out[f"what {mad.lower()} does"] += 1
         if length:
@@ -227,13 +279,19 @@ def _convert(
         return _matrix(matrix, family, length, energy)
     if isinstance(element, at.ThinMultipole) and not isinstance(element, at.Multipole):
         return thin(element, family, mad, roll, left_out)
-    if getattr(element, "BendingAngle", 0.0) or (
-        isinstance(element, at.Dipole) and not element.PassMethod.startswith("Str")
-    ):
-        return bend(element, family, length, roll, left_out)
-    if isinstance(element, at.Multipole):
+    angle, ahead = getattr(element, "BendingAngle", 0.0), method.startswith("Str")
+    if angle or (isinstance(element, at.Dipole) and not ahead):
+        if method.startswith(_FIELDS):
+            if ahead:
+                left_out["that AT tracks bends straight ahead by a pass method Str..."] += 1
+            return bend(element, family, length, roll, left_out)
+    elif (acts or isinstance(element, at.Multipole)) and method.startswith(_FIELDS):
         return straight(element, family, length, mad, roll, left_out)
-    kind, source = _matrix(tracker.matrix(element), family, length, energy)
+    matrix, kick = tracker.map(element)
+    if method == "ChangePRefPass" and kick[4]:
+        raise LatticeError(f"'{family}' changes the reference momentum ({method}); take it out")
+    across = kick * [1, 1, 1, 1, 0, 0]
+    kind, source = _matrix(matrix, family, length, energy, across if across.any() else None)
     name = type(element).__name__
     name = element.PassMethod.removesuffix("Pass") if name == "Element" else name
     left_out[f"what {name} has beyond its first-order matrix"] += 1
@@ -242,13 +300,26 @@ def _convert(
     return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source
 
 
+_FIELDS = ("Str", "Bnd", "Bend", "Quad", "Exact", "ThinMPole", "VariableThin")
+"""What the pass methods begin with that take an element's fields."""
+
+
+def _fields(element: Any) -> bool:
+    names = ("PolynomA", "PolynomB", "BendingAngle")
+    return any(np.any(getattr(element, name, 0.0)) for name in names)
+
+
+def _acts(element: Any) -> bool:
+    """Whether AT tracks fields of an element, whatever its class."""
+    return element.PassMethod.startswith(_FIELDS) and _fields(element)
+
+
 def _passive(element: Any, left_out: Counter[str]) -> bool:
     """Whether AT passes it as if nothing were there, whatever its fields: a magnet that was
     switched off by its pass method; and noise of the radiation, which moves no orbit."""
     method = element.PassMethod
-    fields = ("PolynomA", "PolynomB", "BendingAngle")
-    if method == "DriftPass" and any(np.any(getattr(element, name, 0.0)) for name in fields):
-        left_out["fields of magnets whose pass method is DriftPass"] += 1
+    if method in ("DriftPass", "IdentityPass") and _fields(element):
+        left_out[f"fields of magnets whose pass method is {method}"] += 1
     return method == "DriftPass" or "Identity" in method or "QuantDiff" in method
 
 
@@ -256,7 +327,8 @@ def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     """One corrector where something states its plane, else one of each plane."""
     kicks = np.zeros(2)
     given = np.asarray(element.KickAngle, dtype=float).ravel()[:2]
-    kicks[: len(given)] = given
+    if element.PassMethod.startswith(("Corrector", *_FIELDS)):  # else it is switched off
+        kicks[: len(given)] = given
     x, y = kicks.tolist()
     names = (str(element.FamName), family)
     horizontal = mad == "HKICKER" or any(_HORIZONTAL.search(name) for name in names)

@@ -325,6 +325,8 @@ def sdds(path: str) -> dict[str, tuple[Any, str]]:
     import sdds as package
 
     content = package.read(path)
+    if unread := [name for name in content.definitions if content.values.get(name) is None]:
+        raise RefusedError(f"columns such as '{unread[0]}' of SDDS are not read; write them as CSV")
     return {
         name: (content.values[name], str(getattr(definition, "units", None) or ""))
         for name, definition in content.definitions.items()

@@ -1,6 +1,7 @@
 """One function for all lattices: files by their suffix, other packages' objects by their class."""
 
 import os
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -131,11 +132,17 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
     if suffix == ".lte":
         from tmlattice.lattice.elegant_file import read_elegant
 
-        return read_elegant(path, name, sequence, energy)
+        try:
+            return read_elegant(path, name, sequence, energy)
+        except LatticeError as error:
+            raise _foreign(path, name) or error from error
     if suffix in MADX_SUFFIXES:
         from tmlattice.lattice.madx_file import read_madx
 
-        return read_madx(path, name, sequence, energy)
+        try:
+            return read_madx(path, name, sequence, energy)
+        except LatticeError as error:
+            raise _foreign(path, name) or error from error
     if suffix in TFS_SUFFIXES:
         from tmlattice.lattice.tfs_file import read_tfs
 
@@ -143,6 +150,31 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
     from tmlattice.lattice.at_file import read_at
 
     return read_at(path, name, sequence, energy)
+
+
+_FOREIGN = {
+    "a command file of elegant: give the lattice (.lte) that it names":
+        r"^\s*&(run_setup|run_control|twiss_output)\b",
+    "a table of SDDS and no lattice: give the lattice (.lte)": r"\ASDDS\d",
+    "a lattice of Bmad": r"^\s*(parameter|beginning|particle_start)\s*\[",
+    "a lattice of SAD": r"^\s*FFS\b|^\s*(DRIFT|BEND|QUAD|SEXT|MARK|LINE)\s+\w+\s*=\s*\(",
+    "a lattice of Tracy": r"^\s*define\s+lattice\b",
+    "a lattice of OPA": r"\A\s*\{[^}]*\.opa\}|:\s*bending\b",
+    "a lattice of MAD-8 (no ';' ends its statements)":
+        r"\A(?=[^;]*^\s*(beam|title)\b)[^;]*:\s*(line|quadrupole|sbend|rbend)\b[^;]*\Z",
+}  # fmt: skip
+"""Formats that are not read, by what their files hold."""
+
+
+def _foreign(path: Path, name: str) -> LatticeError | None:
+    """The error that names the format of a file that is not read; None: it is none of these."""
+    with path.open("rb") as file:
+        text = re.sub(r"!.*", "", file.read(100_000).decode("latin-1"))
+    for what, pattern in _FOREIGN.items():
+        if re.search(pattern, text, re.IGNORECASE | re.MULTILINE):
+            advice = "" if ": give" in what else ", which is not read: convert it to MAD-X or AT"
+            return LatticeError(f"'{name}' is {what}{advice}")
+    return None
 
 
 def _find(name: str) -> Path:
@@ -153,7 +185,7 @@ def _find(name: str) -> Path:
     if path.suffix.lower() in SUFFIXES and path.is_file():
         return path
     if path.is_file():
-        raise LatticeError(
+        raise _foreign(path, name) or LatticeError(
             f"'{name}' is no lattice file that can be read; give OCELOT code (.py), AT (.mat, .m, "
             f".repr, .json), MAD-X (.seq, .madx; a TWISS table: .tfs), elegant (.lte), Xsuite "
             f"(.json), the package's own JSON or a built-in name ({', '.join(builtin)})"

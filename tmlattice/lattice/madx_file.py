@@ -182,11 +182,14 @@ def read_madx(
         raise LatticeError(f"'{path}' has no BEAM with an energy; give energy= (GeV)")
     try:
         parts = reader.parts(use)
-        if reader.undefined:
-            names = sorted(reader.undefined)
-            reader.warnings.append(
-                f"{first_of(names)} ({len(names)}) have no value: taken for 0, as by MAD-X"
-            )
+        for found, what in (
+            (reader.undefined, "have no value: taken for 0, as by MAD-X"),
+            (reader.skipped, "are not defined: skipped, as by MAD-X"),
+        ):
+            if found:
+                reader.warnings.append(f"{first_of(sorted(found))} ({len(found)}) {what}")
+        if beam.given.get("radiate"):
+            reader.warnings.append("RADIATE of BEAM: orbits and optics are those without radiation")
         energy = beam.energy if energy is None else energy
         if reader.warnings:
             warnings.warn(f"'{path}': {'; '.join(reader.warnings)}", stacklevel=4)
@@ -318,6 +321,7 @@ class _Reader:
 
     def __init__(self, energy: float | None = None) -> None:
         self.variables: dict[str, float | Evaluate] = dict(CONSTANTS)
+        self._constants = set(CONSTANTS)
         self.elements: dict[str, _Definition] = {}
         self.sequences: dict[str, _Sequence] = {}
         self.lines: dict[str, Items] = {}
@@ -326,6 +330,7 @@ class _Reader:
         self.order: list[str] = []
         self.used = ""
         self.undefined: set[str] = set()
+        self.skipped: set[str] = set()
         self.warnings: list[str] = []
         self.report = Report()
         self.rbarc = self.thin_focusing = True
@@ -398,7 +403,7 @@ class _Reader:
         self._files.append(path)
         try:
             content = content_of(path, LatticeError)
-            self._read_text(content.decode("utf-8", errors="replace"))
+            self._read_text(content.decode("utf-8-sig", errors="replace"))
         except _Stop as stop:
             if stop.everything:
                 raise
@@ -438,10 +443,14 @@ class _Reader:
             self.macros[match[1].lower()] = (names, match[3])
             return None
         match = re.fullmatch(
-            r"(?:(?:real|int)\s+)?(?:const\s+)?([\w.$%]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
+            r"(?:(real|int)\s+)?(const\s+)?([\w.$%]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
         )
         if match:
-            return self._assign(match[1].lower(), Given(match[3], match[2] == ":="))
+            name, given = match[3].lower(), Given(match[5], match[4] == ":=")
+            self._assign(name, given, whole=str(match[1]).lower() == "int")
+            if match[2]:
+                self._constants.add(name)
+            return None
         match = re.fullmatch(r"([\w.$%\"']+)\s*->\s*([\w.]+)\s*(:?=)\s*(.*)", text, re.DOTALL)
         if match:
             # worked out at once even after `:=`, as MAD-X does
@@ -455,12 +464,12 @@ class _Reader:
             return self._define(unquoted(match[1]).lower(), match[3], statement)
         return self._command(text)
 
-    def _assign(self, name: str, given: Given) -> None:
-        text = given.text.strip()
-        if name in CONSTANTS:
-            return  # MAD-X keeps its own
-        evaluate = compiled(unquoted(text))
-        self.variables[name] = evaluate if given.deferred else evaluate(self)
+    def _assign(self, name: str, given: Given, whole: bool) -> None:
+        if name in self._constants:
+            return  # MAD-X keeps them
+        evaluate = compiled(unquoted(given.text.strip()))
+        value = evaluate if given.deferred else evaluate(self)
+        self.variables[name] = math.trunc(value) if whole and not callable(value) else value
 
     def _block(self, text: str, word: str) -> None:
         head, _, body = text.partition("{")
@@ -547,12 +556,10 @@ class _Reader:
         if owner in self.elements:
             self._update(self.elements[owner], given)
         elif owner in self.sequences:
-            if set(given) - {"l", "refer", "refpos"} - NO_EFFECT:
-                raise LatticeError(f"{first_of(sorted(given))} of a sequence cannot be changed")
-            if "l" in given:
-                self.sequences[owner].length = self._evaluate(given["l"])
-            if "refer" in given:
-                self.sequences[owner].refer = _refer(given["refer"])
+            names = ", ".join(sorted(given)).upper()
+            self.warnings.append(f"{names} of the sequence '{owner}' stays as defined, as in MAD-X")
+        elif given and given.keys() <= _ATTRIBUTES:
+            self.skipped.add(owner)
         else:
             raise LatticeError(f"no element or command '{plain(owner, 60)}' is known")
 
@@ -570,6 +577,10 @@ class _Reader:
             raise LatticeError("no element or command begins so")
         word = unquoted(match[0]).lower()
         rest = text[match.end() :].lstrip(" ,")
+        if rest.startswith("->"):
+            raise LatticeError("one number of a list is not set so; give the whole list")
+        if word == "set" and (match := re.search(r"\bsequence\s*=\s*([^,]+)", rest, re.I)):
+            self.used = unquoted(match[1]).lower()
         if word in NO_STATEMENT or word.startswith("ptc_"):
             return None
         if word in NOT_RUN:
@@ -626,7 +637,7 @@ class _Reader:
             if self._open is not None and word in self.elements and not given:
                 raise LatticeError(f"'{plain(word, 60)}' has no AT in its sequence")
             return None
-        raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
+        return self._set(word, given)
 
     def _call(self, given: dict[str, Given]) -> None:
         called = unquoted(given["file"].text if "file" in given else next(iter(given), ""))
@@ -724,7 +735,7 @@ class _Reader:
 
     def slots(self, sequence: _Sequence, nested: bool = False) -> list[_Slot]:
         """Its elements and sequences with the positions of their centres, in their order."""
-        reference = {"entry": 0.5, "exit": -0.5}.get(sequence.refer, 0.0)
+        reference = _REFERENCE.get(sequence.refer, 0.0)
         nodes: dict[tuple[str, int], _Node] = {}
         for node in sequence.nodes:
             nodes.setdefault((node.name, node.count), node)
@@ -886,7 +897,7 @@ class _Reader:
                 own, parents = dict(old.values), (parent, *old.parents)
                 new = replace(old, name=name, values=own, where="INSTALL", parents=parents)
             self.elements.setdefault(name, new)
-        reference = {"entry": 0.5, "exit": -0.5}.get(self._edited.refer, 0.0)
+        reference = _REFERENCE.get(self._edited.refer, 0.0)
         length = self._length(name)
         at = float(compiled(given["at"].text)(self)) + self._offset(name, reference)
         origins = [0.0]
@@ -914,29 +925,25 @@ class _Reader:
         ])  # fmt: skip
 
     def _move(self, given: dict[str, Given]) -> None:
+        """MAD-X counts from where REFER has an element, also with BY."""
         assert self._edited is not None
         slots = self.slots(self._edited)
         moved = {id(slot) for slot in self._found(given, slots)}
-        if "to" in given:
-            to = float(compiled(given["to"].text)(self))
-            if "from" in given:
-                to += self._targets({"element": Given(given["from"].text)}, slots)[0].centre
-
-            def centre(slot: _Slot) -> float:
-                return to
-        else:
-            by = float(compiled(given["by"].text)(self))
-
-            def centre(slot: _Slot) -> float:
-                return slot.centre + by
-
-        self._put([replace(s, centre=centre(s)) if id(s) in moved else s for s in slots])
+        way = float(compiled(given["to" if "to" in given else "by"].text)(self))
+        if "to" in given and "from" in given:
+            way += self._targets({"element": Given(given["from"].text)}, slots)[0].centre
+        share = _REFERENCE.get(self._edited.refer, 0.0)
+        self._put([
+            replace(s, centre=way + self._offset(s.name, share) + ("by" in given) * s.centre)
+            if id(s) in moved else s for s in slots
+        ])  # fmt: skip
 
     def _flatten(self, given: dict[str, Given]) -> None:
         assert self._edited is not None
         own = {node.name for node in self._edited.nodes}
         flat = self._flat(self._edited)
         self._unfound = {slot.name for slot in flat} - own
+        self._edited.refer = "centre"
         self._put(flat)
 
     def _cycle(self, given: dict[str, Given]) -> None:
@@ -1020,7 +1027,7 @@ class _Reader:
         self, definition: _Definition, length: float, beam: Beam, circumference: float
     ) -> Part:
         """An element's attributes as numbers; rectangular bends as sector bends."""
-        keyword = definition.keyword
+        keyword, half = definition.keyword, 0.0
         own = {k: self._value(definition, k) for k in definition.values if k not in WORDS}
         own["l"] = length
         match keyword:
@@ -1041,8 +1048,11 @@ class _Reader:
                 where = "a LINE" if attribute in SHIFTS else "MAD-X's TWISS"
                 what = f"{attribute.upper()} of the {keyword.upper()} (as in {where})"
                 self.report.left_out(what, definition.name)
-        if float(beam.given.get("bv", 1.0)) == -1:
+        if float(beam.given.get("bv", 1.0)) == -1 and keyword != "srotation":
             own = _reversed_fields(own)
+            if definition.keyword == "rbend" and half:
+                what = "the other sign that MAD-X's TWISS gives half the angle in faces (BV=-1)"
+                self.report.left_out(what, definition.name)
         return Part(definition.name, keyword, own, definition.where)
 
 
@@ -1051,8 +1061,11 @@ _NOT_IN_TWISS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("quadrupole", "sextupole", "octupole", "solenoid"), ("knl", "ksl")),
 }
 """What MAD-X's TWISS leaves out of thick magnets: it is for PTC and MAKETHIN."""
+_REFERENCE = {"entry": 0.5, "exit": -0.5}
+"""From the point that REFER names to the centre, in lengths of the element."""
 _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
 _ENTRY = re.compile(r"rm([1-6])([1-6])")
+_ATTRIBUTES = (WORDS | NO_EFFECT).union(*MODELLED.values()) - {"at", "from"}
 _ODD = ("angle", "k0", "k1", "k2", "k3", "k0s", "k1s", "k2s", "k3s", "ks", "ksi", "hkick", "vkick",
         "kick", "knl", "ksl", "e1", "e2", "h")  # fmt: skip
 

@@ -222,9 +222,9 @@ def holds(condition: str, names: Names) -> bool:
 
 
 def _comparison(text: str, names: Names) -> bool:
-    match = re.fullmatch(r"(.*?)(<>|<=|>=|==|<|>)(.*)", text, re.DOTALL)
+    match = re.fullmatch(r"(.*?)(<>|<=|>=|==|<|(?<!-)>)(.*)", text, re.DOTALL)
     if match is None:
-        return bool(compiled(text)(names))
+        return False  # MAD-X takes a condition without a comparison for false
     left, right = compiled(match[1])(names), compiled(match[3])(names)
     return {
         "<": left < right, ">": left > right, "<=": left <= right, ">=": left >= right,

@@ -155,6 +155,12 @@ def _mend(source: Any) -> Any:
     orbit."""
     from tmlattice.lattice.ocelot import elements
 
+    cls = type(source).__name__
+    for name in _NOT_MODELLED:
+        if getattr(source, name, 0.0):
+            raise LatticeError(f"{name} of the {cls} '{source.id}' is not modelled; set it to 0")
+    if cls == "TDCavity" and source.v:
+        warnings.warn(f"'{source.id}': what the voltage does in a {cls} is left out", stacklevel=2)
     if _displaced(source):
         source = copied(source)
         source.dx = source.dy = 0.0
@@ -201,6 +207,11 @@ def _displaced(source: Any) -> bool:
     return bool(source.dx or source.dy) and type(source).__name__ in _WITH_OFFSET
 
 
+_NOT_MODELLED = (
+    "dtilt", "delta_e", "vx_up", "vy_up", "vxx_up", "vxy_up", "vx_down", "vy_down", "vxx_down",
+    "vxy_down",
+)  # fmt: skip
+"""Attributes that change the orbit or the optics: also coupler kicks of a cavity."""
 _WITH_OFFSET = ("Quadrupole", "Sextupole", "Octupole", "SBend", "RBend", "Bend", "Solenoid")
 
 

@@ -107,7 +107,8 @@ NO_EFFECT = frozenset({
     "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq", "entrance",
 })  # fmt: skip
 """Attributes without effect on the optics, of any keyword."""
-NONLINEAR = frozenset({"k4", "k4s", "k5", "k5s", "k6", "k7", "k8", "pnl", "psl", "rad", "tm"})
+NONLINEAR = frozenset({"k4", "k4s", "k5", "k5s", "k6", "k7", "k8", "pnl", "psl", "rad", "tm",
+                       "he", "sinkick", "sinpeak", "sintune", "sinphase"})  # fmt: skip
 """Attributes that act beyond the linear optics: named in a warning."""
 
 

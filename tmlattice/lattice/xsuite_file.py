@@ -537,6 +537,7 @@ class _Reader:
                 raise LatticeError(
                     f"{fields.named} is turned by its {key}, which is not modelled; set it to 0"
                 )
+        sin, cos = fields.number("sin_rot_s", -999.0), fields.number("cos_rot_s", -999.0)
         if fields.number("delta_taper"):
             self.report.left_out("delta_taper", fields.name)
         moved = {
@@ -544,6 +545,8 @@ class _Reader:
             "ds": fields.number("shift_s"), "tilt": fields.number("rot_s_rad"),
             "dpsi": fields.number("rot_s_rad_no_frame"),
         }  # fmt: skip
+        if max(abs(sin), abs(cos)) <= 1.0 and not moved["tilt"]:  # in early files; -999: none
+            moved["tilt"] = math.atan2(sin, cos)
         anchor = fields.number("rot_shift_anchor")
         if anchor and fields.cls in BENDS:  # along the axes there, which are turned
             bend = _Bend(fields, self)
@@ -757,7 +760,8 @@ class _Reader:
         return [Part(name, "solenoid", {"l": length, "ks": mean}, where)]
 
     def _dipole_edge(self, fields: _Fields, name: str, where: str) -> list[Part]:
-        fields.used |= {"r21", "r43", "side"}
+        fields.used.add("side")
+        old = fields.number("r21"), fields.number("r43")
         tilt = self._alignment(fields).pop("tilt")
         if any(fields.acts(key) for key in ("shift_x", "shift_y")):
             raise LatticeError(f"{fields.named} is displaced, which is not modelled; set it to 0")
@@ -767,7 +771,7 @@ class _Reader:
             return [_passive(name, 0.0)]
         edge = (k, fields.number("e1"), fields.number("e1_fd"), fields.number("hgap"),
                 fields.number("fint"))  # fmt: skip
-        return _edge(name, where, edge, tilt)
+        return _edge(name, where, edge, tilt, None if k else old)
 
     def _map(self, fields: _Fields, name: str, where: str) -> list[Part]:
         self._alignment(fields)
@@ -954,14 +958,17 @@ def _way_of(fields: _Fields) -> float:
     return length
 
 
-def _edge(name: str, where: str, edge: tuple[float, ...], tilt: float) -> list[Part]:
-    """A face of a bend: field (1/m), angle, feed-down angle (rad), half gap (m), integral."""
+def _edge(
+    name: str, where: str, edge: tuple[float, ...], tilt: float, focus: Any = None
+) -> list[Part]:
+    """A face of a bend: field (1/m), angle, feed-down angle (rad), half gap (m), integral; of early
+    files its `focus` alone: R21 and R43, 1/m."""
     field, e1, down, gap, integral = edge
-    if not down:
+    if not down and not focus:
         values: dict[str, Any] = {"h": field, "e1": e1, "hgap": gap, "fint": integral}
         return [Part(name, "dipedge", {**values, "tilt": tilt}, where)]
     matrix = np.eye(6)
-    matrix[1, 0], matrix[3, 2] = edge_focusing(field, e1, gap, integral, down)
+    matrix[1, 0], matrix[3, 2] = focus or edge_focusing(field, e1, gap, integral, down)
     return [Part(name, "matrix", {"rmat": matrix, "tilt": tilt}, where)]
 
 
