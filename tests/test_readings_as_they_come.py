@@ -277,7 +277,7 @@ def test_headers_of_control_systems(small_ring, data, tmp_path, header, above, s
 def test_numbers_and_words_that_stand_for_no_reading_are_missing(small_ring, data, tmp_path):
     words = {7: "N/A", 20: "--", 33: "-999", 41: "-999", 50: "-999"}
     path = tmp_path / "a.csv"
-    path.write_text(long(data, edit=lambda *own: words.get(*own)))
+    path.write_text(long(data, edit=words.get))
     brought = bring_in([path], Options(ring=small_ring))
     assert any("6 readings are 999, far above all others" in said for said in brought.assumed)
     expected = data.readings.copy()

@@ -156,11 +156,14 @@ def _csv(path: Path) -> list[Column]:
     if not lines:
         raise MeasurementError(f"{path}: the file is empty; write its header first")
     last = lines[-1][1]
-    separator = max(";\t,", key=last.count)
-    blanks = separator not in last
-    cut = (lambda line: re.sub(r"\s+([\[(])", r"\1", line.lstrip("* ")).split()) if blanks else (
-        lambda line: next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-    )  # fmt: skip
+    separator = next((sign for sign in ";\t," if sign in last), " ")
+    blanks = separator == " "
+
+    def cut(line: str) -> list[str]:
+        if blanks:
+            return re.sub(r"\s+([\[(])", r"\1", line.lstrip("* ")).split()
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+
     rows = [(i, [field.strip() for field in cut(line)]) for i, line in lines]
     usual = Counter(len(row) for _, row in rows).most_common(1)[0][0]
     start = next(k for k, (_, row) in enumerate(rows) if len(row) == usual)

@@ -197,8 +197,8 @@ def nothing_run() -> Iterator[None]:
     make = json.element_from_dict
     numbers = {cls.__name__: cls for cls in (np.float64, np.float32, np.int64, np.int32, np.uint8)}
     functions = {**elements, **numbers, "Particle": at.Particle, "array": np.array}
-    numbers = {"pi": math.pi, "nan": math.nan, "NaN": math.nan, "inf": math.inf, "Inf": math.inf}
-    names = {**functions, **numbers}
+    known = {"pi": math.pi, "nan": math.nan, "NaN": math.nan, "inf": math.inf, "Inf": math.inf}
+    names = {**functions, **known}
     arithmetic = Arithmetic(functions.values())
 
     def value(text: str, *_: Any) -> Any:
