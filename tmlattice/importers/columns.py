@@ -156,8 +156,8 @@ def _csv(path: Path) -> list[Column]:
     if not lines:
         raise MeasurementError(f"{path}: the file is empty; write its header first")
     last = lines[-1][1]
-    separator = max(";\t,", key=last.count)
-    blanks = separator not in last
+    separator = next((sign for sign in ";\t," if sign in last), " ")
+    blanks = separator == " "
 
     def cut(line: str) -> list[str]:
         if blanks:

@@ -19,6 +19,7 @@ import numpy as np
 from tmlattice.errors import LatticeError, plain
 from tmlattice.input_files import content_of
 from tmlattice.lattice.lines import DEEPEST, Items, chosen, inner_names, items_of, laid_out
+from tmlattice.lattice.madx_language import split
 from tmlattice.lattice.parts import Part, Report, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
@@ -765,21 +766,7 @@ def _uncommented(line: str) -> str:
 
 def _split(text: str) -> list[str]:
     """Items between commas outside brackets and quotation marks."""
-    items, depth, quoted, begin = list[str](), 0, False, 0
-    for k, sign in enumerate(text):
-        quoted ^= sign == '"'
-        if quoted:
-            continue
-        depth += {"(": 1, ")": -1}.get(sign, 0)
-        if depth < 0:
-            raise LatticeError("a bracket is closed that was not opened")
-        if sign == "," and not depth:
-            items.append(text[begin:k].strip())
-            begin = k + 1
-    if depth or quoted:
-        raise LatticeError("a bracket or a quotation mark is left open; close it")
-    items.append(text[begin:].strip())
-    return [item for item in items if item]
+    return [item for item in split(text) if item]
 
 
 def _bare(text: str) -> str:

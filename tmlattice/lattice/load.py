@@ -107,7 +107,10 @@ def _checked(where: Path, read: Callable[[], Ring]) -> tuple[Ring, bool]:
     """A ring that was read and checked, and whether there were warnings."""
     with warnings.catch_warnings(record=True) as caught, reading(where):
         warnings.simplefilter("always")
-        ring = read()
+        try:
+            ring = read()
+        except LatticeError as error:
+            raise _foreign(where) or error from error
         check_ring(ring)
     for w in caught:
         warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
@@ -132,17 +135,11 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
     if suffix == ".lte":
         from tmlattice.lattice.elegant_file import read_elegant
 
-        try:
-            return read_elegant(path, name, sequence, energy)
-        except LatticeError as error:
-            raise _foreign(path, name) or error from error
+        return read_elegant(path, name, sequence, energy)
     if suffix in MADX_SUFFIXES:
         from tmlattice.lattice.madx_file import read_madx
 
-        try:
-            return read_madx(path, name, sequence, energy)
-        except LatticeError as error:
-            raise _foreign(path, name) or error from error
+        return read_madx(path, name, sequence, energy)
     if suffix in TFS_SUFFIXES:
         from tmlattice.lattice.tfs_file import read_tfs
 
@@ -166,14 +163,16 @@ _FOREIGN = {
 """Formats that are not read, by what their files hold."""
 
 
-def _foreign(path: Path, name: str) -> LatticeError | None:
+def _foreign(path: Path) -> LatticeError | None:
     """The error that names the format of a file that is not read; None: it is none of these."""
+    if not path.is_file():
+        return None
     with path.open("rb") as file:
         text = re.sub(r"!.*", "", file.read(100_000).decode("latin-1"))
     for what, pattern in _FOREIGN.items():
         if re.search(pattern, text, re.IGNORECASE | re.MULTILINE):
             advice = "" if ": give" in what else ", which is not read: convert it to MAD-X or AT"
-            return LatticeError(f"'{name}' is {what}{advice}")
+            return LatticeError(f"'{path}' is {what}{advice}")
     return None
 
 
@@ -185,7 +184,7 @@ def _find(name: str) -> Path:
     if path.suffix.lower() in SUFFIXES and path.is_file():
         return path
     if path.is_file():
-        raise _foreign(path, name) or LatticeError(
+        raise _foreign(path) or LatticeError(
             f"'{name}' is no lattice file that can be read; give OCELOT code (.py), AT (.mat, .m, "
             f".repr, .json), MAD-X (.seq, .madx; a TWISS table: .tfs), elegant (.lte), Xsuite "
             f"(.json), the package's own JSON or a built-in name ({', '.join(builtin)})"

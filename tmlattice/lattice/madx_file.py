@@ -797,6 +797,11 @@ class _Reader:
         self._unfound = set()
         self._put(self.slots(self._edited))
 
+    def _opened(self) -> tuple[_Sequence, list[_Slot]]:
+        """The sequence that is edited, and its elements."""
+        assert self._edited is not None
+        return self._edited, self.slots(self._edited)
+
     def _put(self, slots: Sequence[_Slot]) -> None:
         assert self._edited is not None
         ordered = sorted(slots, key=lambda slot: slot.centre)
@@ -884,85 +889,70 @@ class _Reader:
         return found
 
     def _install(self, given: dict[str, Given]) -> None:
-        assert self._edited is not None
-        slots = self.slots(self._edited)
+        edited, slots = self._opened()
         name = unquoted(given["element"].text).lower()
-        if "class" in given:
-            parent = unquoted(given["class"].text).lower()
-            if parent not in self.elements and parent not in KEYWORDS:
-                raise LatticeError(f"no element class '{plain(parent, 60)}' is known")
-            old = self.elements.get(parent)
-            new = _Definition(name, parent, {}, "INSTALL")
-            if old is not None:
-                own, parents = dict(old.values), (parent, *old.parents)
-                new = replace(old, name=name, values=own, where="INSTALL", parents=parents)
-            self.elements.setdefault(name, new)
-        reference = _REFERENCE.get(self._edited.refer, 0.0)
+        if "class" in given and name not in self.elements:
+            self._define(name, given["class"].text, Statement("", 0))
+        reference = _REFERENCE.get(edited.refer, 0.0)
         length = self._length(name)
         at = float(compiled(given["at"].text)(self)) + self._offset(name, reference)
         origins = [0.0]
         if "from" in given:
             origin = {"element": Given(given["from"].text)}
             origins = [slot.centre for slot in self._targets(origin, slots)]
-        count = self._edited.counted
+        count = edited.counted
         self._put([*slots, *(_Slot(name, at + s, length, count(name)) for s in origins)])
 
     def _remove(self, given: dict[str, Given]) -> None:
-        assert self._edited is not None
-        slots = self.slots(self._edited)
+        _, slots = self._opened()
         gone = {id(slot) for slot in self._found(given, slots)}
         self._put([slot for slot in slots if id(slot) not in gone])
 
     def _replace(self, given: dict[str, Given]) -> None:
-        assert self._edited is not None
-        slots = self.slots(self._edited)
+        edited, slots = self._opened()
         new = unquoted(given["by"].text).lower()
         old = {id(slot) for slot in self._targets(given, slots)}
         length = self._length(new)
         self._put([
-            replace(s, name=new, length=length, count=self._edited.counted(new))
+            replace(s, name=new, length=length, count=edited.counted(new))
             if id(s) in old else s for s in slots
         ])  # fmt: skip
 
     def _move(self, given: dict[str, Given]) -> None:
         """MAD-X counts from where REFER has an element, also with BY."""
-        assert self._edited is not None
-        slots = self.slots(self._edited)
+        edited, slots = self._opened()
         moved = {id(slot) for slot in self._found(given, slots)}
         way = float(compiled(given["to" if "to" in given else "by"].text)(self))
         if "to" in given and "from" in given:
             way += self._targets({"element": Given(given["from"].text)}, slots)[0].centre
-        share = _REFERENCE.get(self._edited.refer, 0.0)
+        share = _REFERENCE.get(edited.refer, 0.0)
         self._put([
             replace(s, centre=way + self._offset(s.name, share) + ("by" in given) * s.centre)
             if id(s) in moved else s for s in slots
         ])  # fmt: skip
 
     def _flatten(self, given: dict[str, Given]) -> None:
-        assert self._edited is not None
-        own = {node.name for node in self._edited.nodes}
-        flat = self._flat(self._edited)
-        self._unfound = {slot.name for slot in flat} - own
-        self._edited.refer = "centre"
+        edited, slots = self._opened()
+        flat = self._flat(edited)
+        self._unfound = {slot.name for slot in flat} - {slot.name for slot in slots}
+        edited.refer = "centre"
         self._put(flat)
 
     def _cycle(self, given: dict[str, Given]) -> None:
-        assert self._edited is not None
-        slots = self.slots(self._edited)
+        edited, slots = self._opened()
         named = {"element": given.get("start", Given(""))}
         first = self._targets(named, slots)[0]
         if first.length:
             raise LatticeError(f"CYCLE starts at '{first.name}', which has a length; take a marker")
-        length, zero = self._length(self._edited.name), first.centre
+        length, zero = self._length(edited.name), first.centre
         before = slots.index(first)
         self._put([replace(s, centre=s.centre - zero + (length if k < before else 0.0))
                    for k, s in enumerate(slots)])  # fmt: skip
 
     def _reflect(self, given: dict[str, Given]) -> None:
-        assert self._edited is not None
-        length = self._length(self._edited.name)
-        turned = [replace(s, centre=length - s.centre) for s in self.slots(self._edited)]
-        self._put(turned[::-1])
+        edited, slots = self._opened()
+        length = self._length(edited.name)
+        self._put([replace(s, centre=length - s.centre) for s in slots[::-1]])
 
     # --- the ring -------------------------------------------------------------------------------
     def chosen(self, path: Path, wanted: str | None) -> str:
