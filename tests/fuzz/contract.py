@@ -207,6 +207,9 @@ def forked(command, **options):
     has its libraries already."""
     from tmlattice.lattice import binary_files
 
+    if "input" not in options:  # another library's
+        with subprocess.Popen(command, **options) as other:
+            return subprocess.CompletedProcess(command, other.wait())
     with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as answer:
         given.write(options["input"])
         given.seek(0)

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+import zlib
 from pathlib import Path
 
 import at
@@ -15,7 +16,7 @@ from command import tmlattice
 sys.path.insert(0, str(Path(__file__).parent))
 from inputs import ring, write_all
 
-from tmlattice import diagnose, load_ring, read_measurement
+from tmlattice import batch, diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.families.fields import VerticalFocusing
 from tmlattice.diagnosis.families.steps import MonitorGain, Trial
 from tmlattice.diagnosis.response.stepwise import fit_steps
@@ -169,3 +170,110 @@ def test_names_steer_no_terminal(folder, place):
         own.write_text(own.read_text().replace('"qf"', json.dumps(f"q{evil}")))
         done = tmlattice("info", "own.json", cwd=folder)
     assert not {"\x1b", "\x07", "\u202e"} & set(done.stdout + done.stderr)
+
+
+@pytest.fixture(scope="module")
+def kept(whole, tmp_path_factory):
+    """A folder with a diagnosis in R, and its estimated ring."""
+    folder = tmp_path_factory.mktemp("kept") / "w"
+    shutil.copytree(whole, folder)
+    words = ("--out", "R", "--lattice-out", "found.json", "-q")
+    tmlattice(*TURNS, *words, cwd=folder, check=0)
+    return folder
+
+
+@pytest.mark.parametrize("key", ["lattice", "lattice_out"])
+@pytest.mark.parametrize("words", [("report", "R"), ("compare", "R", "R"), ("correct", "R")])
+def test_a_diagnosis_runs_no_code_that_it_names(kept, tmp_path, words, key):
+    folder = Path(shutil.copytree(kept, tmp_path / "w"))
+    (folder / "evil.py").write_text(f"open({str(folder / 'MARK')!r}, 'w')\n")
+    edited(folder / "R/diagnosis.json", lambda d: d["provenance"].update({key: "evil.py"}))
+    tmlattice(*words, cwd=folder)  # the lattice next to it is data
+    (folder / "R/diagnosis.lattice.json").unlink()
+    said = tmlattice(*words, cwd=folder)
+    if key == "lattice" or words[0] == "correct":
+        assert "evil.py' is Python code, which would be run" in told(said)
+    if words[0] == "correct" and key == "lattice":
+        tmlattice(*words, "--design", "ring.json", "-q", cwd=folder, check=0)
+    assert not (folder / "MARK").exists()
+
+
+@pytest.mark.parametrize("text", ["[]", "null", '{"provenance": null}', '{"provenance": [1]}'])
+def test_what_is_no_diagnosis_is_not_corrected(tmp_path, text):
+    (tmp_path / "diagnosis.json").write_text(text)
+    assert 'its "format" is null' in told(tmlattice("correct", ".", cwd=tmp_path))
+
+
+def test_a_report_shows_no_figure_of_another_diagnosis(kept, tmp_path):
+    """Nor is a pipe in place of one waited for, or another program's laid out in memory."""
+    folder = Path(shutil.copytree(kept, tmp_path / "w"))
+    tmlattice("report", "R", "-q", cwd=folder, check=0)
+    page = folder / "R/report.html"
+    assert "before any finding" in page.read_text()  # the scan, which no diagnosis.json holds
+    rows_of(folder / "turns/readings.csv", scaled(1.1))
+    tmlattice(*TURNS, "--json", "R/diagnosis.json", "-q", cwd=folder, check=0)
+    os.mkfifo(folder / "R/maps.png")
+    size = (200_000).to_bytes(4, "big")
+    head = b"IHDR" + size + size + b"\x08\x02\0\0\0"
+    chunk = b"\0\0\0\x0d" + head + zlib.crc32(head).to_bytes(4, "big")
+    (folder / "R/steps.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
+    tmlattice("report", "R", "-q", cwd=folder, check=0)
+    assert "before any finding" not in page.read_text()
+
+
+WIDE = (
+    "shot,m::0 x [mm],m::1 x [mm],m::2 x [mm],m::0 y [mm]\n0,0.1,{},0.3,0.1\n1,0.2,0.1,-0.1,0.2\n"
+)
+
+
+def test_a_reading_that_no_pipe_has_room_for_is_rejected_by_name(folder):
+    for value in ("-1e300", "1e9", "inf"):
+        (folder / "a.csv").write_text(WIDE.format(value))
+        done = tmlattice("diagnose", "ring.json", "a.csv", cwd=folder, check=0)
+        assert "rejected readings, above 0.2 m: 1, of 'm::1'" in done.stdout
+    (folder / "a.csv").write_text(WIDE.format("1").replace("0.", "900."))
+    assert "most readings are above 0.2 m" in told(tmlattice("check", "ring.json", "a.csv",
+                                                             cwd=folder))  # fmt: skip
+
+
+def test_a_field_that_csv_does_not_take_is_a_sentence(folder):
+    (folder / "a.csv").write_text(WIDE.format("9" * 200_000))
+    assert "a.csv: no table that is read (field larger" in told(
+        tmlattice("check", "ring.json", "a.csv", cwd=folder)
+    )
+    (folder / "k.csv").write_text("knob,present\nqf," + "9" * 200_000)
+    words = ("correct", "ring.json", "--design", "ring.json", "--knobs", "k.csv")
+    assert "field larger than field limit" in told(tmlattice(*words, cwd=folder))
+
+
+def test_a_path_of_supplies_that_no_file_has_is_a_sentence(folder):
+    (folder / "tmlattice.toml").write_text(
+        'supplies = "k\\u0000.csv"\n[lattice]\nfile = "ring.json"\n'
+    )
+    assert "k\\x00.csv'" in tmlattice("correct", "ring.json", cwd=folder, check=2).stderr
+
+
+@pytest.mark.parametrize("place", ["/dev/zero", "/proc/kmsg"])
+@pytest.mark.parametrize("sealed", [False, True])
+def test_a_table_that_never_ends_is_not_read(folder, place, sealed):
+    """By a batch neither, which would wait for it or fill the memory."""
+    table = folder / "turns/readings.csv"
+    table.unlink()
+    table.symlink_to(place)
+    if sealed:
+        edited(folder / "turns/measurement.json", lambda d: d.update(table_sha256="0" * 64))
+    assert "readings.csv" in told(tmlattice("check", "ring.json", "turns", cwd=folder))
+    files = batch.diagnose(
+        folder / "ring.json", [folder / "turns"], folder / "B", jobs=1, progress=False
+    )
+    assert "readings.csv" in json.loads(files["turns"].read_text())["error"]
+
+
+def test_deep_json_ends_in_its_own_sentence(folder):
+    for depth in (150, 960, 100_000):
+        edited(folder / "own.json", lambda d: d.update(extra=0))
+        text = (folder / "own.json").read_text()
+        deep = "[" * depth + "]" * depth
+        (folder / "own.json").write_text(text.replace('"extra": 0', f'"extra": {deep}'))
+        done = tmlattice("info", "own.json", cwd=folder, check=2)
+        assert len(done.stderr.splitlines()) == 1

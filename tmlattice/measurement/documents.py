@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import MeasurementError, UnknownNameError, plain
-from tmlattice.input_files import check_shape, json_of, schema_of, short
+from tmlattice.input_files import check_shape, content_of, json_of, schema_of, short
 
 NEAR = 0.8
 """Likeness of a key to a known one from which it is taken for a slip of the pen."""
@@ -94,12 +94,7 @@ def check_table(document: dict[str, Any], table: Path) -> None:
     if (stated := document.get("table_sha256")) is None:
         return
     digest = Digest()
-    try:
-        with table.open("rb") as file:
-            while part := file.read(1 << 20):
-                digest.add(part)
-    except OSError as error:
-        raise MeasurementError(f"cannot read '{table}': {error.strerror or error}") from error
+    digest.add(content_of(table, MeasurementError))
     if digest.told() != stated:
         raise MeasurementError(
             f"{table}: it is not the table that measurement.json was written with: cut off, "

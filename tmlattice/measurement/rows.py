@@ -106,13 +106,15 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
     columns: dict[str, list[Any]] = defaultdict(list)
     index: dict[str, dict[str, int]] = {}
     done = 0
-    check_regular(path, MeasurementError)
+    empty = f"{path}, line 1: the file is empty; write its header first"
+    if not check_regular(path, MeasurementError):  # nothing is waited for, as of /proc/kmsg
+        raise MeasurementError(empty)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, skipinitialspace=True)
             found = next((row for row in reader if row), None)
             if found is None:
-                raise MeasurementError(f"{path}, line 1: the file is empty; write its header first")
+                raise MeasurementError(empty)
             place = _columns(path, reader.line_num, found, header, optional)
             index = {name: {} for name in place if name in _NAMES}
             while rows := [row for row in islice(reader, _CHUNK) if row]:
