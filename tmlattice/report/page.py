@@ -79,7 +79,7 @@ def save(
         _no_formulas(figure)
         figure.savefig(path, dpi=DPI)
         plt.close(figure)
-        _shrink(path, caption, source)
+        shrink(path, caption, source)
         pictures.append(Picture(name, caption, path))
     return pictures
 
@@ -98,7 +98,7 @@ def _no_formulas(figure: "Figure") -> None:
             formatter.seq = [str(text).replace("$", r"\$") for text in formatter.seq]
 
 
-def _shrink(path: Path, caption: str, source: str) -> None:
+def shrink(path: Path, caption: str, source: str = "") -> None:
     """Write a PNG file with a palette, a third as large, with texts for a report that is rendered
     again; rare colours are kept."""
     from PIL import Image
