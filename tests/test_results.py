@@ -199,7 +199,9 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
         with pytest.raises(MeasurementError, match=r"diagnosis.json does not hold"):
             call()
     (tmp_path / "diagnosis.lattice.json").unlink()
-    with pytest.raises(MeasurementError, match="small_ring.py' is Python code, which would be run"):
+    with pytest.raises(
+        MeasurementError, match=r"small_ring\.py' is Python code, which would be run"
+    ):
         Diagnosis.load(tmp_path)
     path = tmp_path / "diagnosis.json"
     document = json.loads(path.read_text())
@@ -213,7 +215,7 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
     del document["gap"]["readings_noise"]
     path.write_text(json.dumps(document))
     with pytest.raises(MeasurementError, match="does not hold 'readings_noise'; diagnose again"):
-        Diagnosis.load(tmp_path)
+        Diagnosis.load(tmp_path, SMALL_RING())
 
 
 def SMALL_RING():
