@@ -327,6 +327,7 @@ def test_what_is_not_modelled_is_named(tmp_path, changes, message):
         ({"CH": "ZLONGIT, BROAD_BAND=1"}, "what ZLONGIT does of ch"),
         ({"CH": "RFDF, VOLTAGE=1E6"}, "what RFDF does of ch"),
         ({"BB": 'CSBEND, L=1, ANGLE="pi 8 /", K4=3'}, "K4 of bb"),
+        ({"CH": "EMATRIX, R11=1, R22=1, R33=1, R44=1, R55=1, R66=1, T211=0.3"}, "T211 of ch"),
         ({"QF": "KQUAD, L=0.4, K1=1.1, EDGE_MULTIPOLES=x.sdds"}, "EDGE_MULTIPOLES of qf"),
     ],
 )  # fmt: skip

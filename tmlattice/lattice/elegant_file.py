@@ -485,8 +485,9 @@ class _Reader:
         for key, value in element.values.items():
             if key in MODELLED[cls] or not value or value == _DEFAULTS.get(key):
                 continue
-            if key in NONLINEAR or (key == "K3" and cls in ("CSBEND", "CCBEND", "CSRCSBEND",
-                                                            "KSBEND")):  # fmt: skip
+            higher = cls == "EMATRIX" and key[0] in "TQU" and key[1:].isdigit()
+            bend = key == "K3" and cls in ("CSBEND", "CCBEND", "CSRCSBEND", "KSBEND")
+            if higher or bend or key in NONLINEAR:
                 self.report.left_out(key, name)
             elif key not in NO_EFFECT and not self._harmless(cls, key, value):
                 raise LatticeError(
