@@ -150,8 +150,8 @@ def test_sparse_reports_what_it_needs(small_ring, small_network):
     with pytest.raises(MeasurementError, match="noise"):
         fine_tune(small_network, silent, method="sparse")
     with pytest.raises(ValueError, match="candidates="):
-        fine_tune(small_network, measurement, method="told")
-    told = fine_tune(small_network, measurement, method="told", candidates=["QD::5"])
+        fine_tune(small_network, measurement, method="known")
+    told = fine_tune(small_network, measurement, method="known", candidates=["QD::5"])
     assert set(told.changes) == {"QD::5"}
     with pytest.raises(ValueError, match="magic"):
         fine_tune(small_network, measurement, method="magic")
@@ -173,7 +173,7 @@ def test_a_dozen_magnets_of_petra3_keep_their_rates(petra3):
 def test_told_states_the_cramer_rao_bound(small_ring, small_network):
     """What the readings hold of one known magnet, by differences of whole rings."""
     case = run_case(
-        small_ring, "QD::5", "told", change=-0.02, noise=1e-6, launch=(1e-4, 0.0, 1e-4, 0.0)
+        small_ring, "QD::5", "known", change=-0.02, noise=1e-6, launch=(1e-4, 0.0, 1e-4, 0.0)
     )
     step, ends = 1e-4, []
     for sign in (1, -1):

@@ -100,7 +100,11 @@ def test_a_challenge_whose_machine_was_learnt(tmp_path):
     (cause,) = read_truth(tmp_path, "0000").causes
     (found,) = diagnose_case(case)["findings"]
     assert (found["effect"], found["element"]) == (cause.effect, cause.element)
-    for wrong in ({"tier": "A"}, {"tier": "B", "reference": True}, {"tier": "B", "told": True}):
+    for wrong in (
+        {"tier": "A"},
+        {"tier": "B", "reference": True},
+        {"tier": "B", "known_rms": True},
+    ):
         with pytest.raises(TmlatticeError, match="leave --learnt out"):
             make(cases=1, folder=tmp_path / "other", learnt=True, progress=False, **wrong, **some)
 

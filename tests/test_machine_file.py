@@ -270,7 +270,7 @@ def test_the_comments_of_init_are_a_file_that_is_read(tmp_path, small_ring):
     (tmp_path / "all.toml").write_text(text)
     made = load_machine_file(tmp_path / "all.toml")
     assert made.options["energy"] == small_ring.energy
-    assert made.told.noise == pytest.approx(2e-5)
+    assert made.stated.noise == pytest.approx(2e-5)
     (knob,) = made.knobs(small_ring)
     assert knob.strength(knob.present) == pytest.approx(small_ring[knob.members[0]].k1, rel=1e-5)
 

@@ -15,7 +15,7 @@ from tmlattice import Cause, read_measurement, simulate
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.importers import Options, bring_in
 from tmlattice.importers.readings import place_of
-from tmlattice.importers.told import Told
+from tmlattice.importers.stated import Stated
 from tmlattice.machine_file import load_machine_file
 from tmlattice.measurement.lost_beam import beam_lost
 
@@ -63,11 +63,11 @@ def same(brought, data):
     ],
 )
 def test_a_row_a_shot_and_a_column_a_monitor_and_plane(
-    small_ring, data, tmp_path, header, scale, told
+    small_ring, data, tmp_path, header, scale, stated
 ):
     path = wide(tmp_path / "a.csv", data, header, scale)
     brought = same(bring_in([path], Options(ring=small_ring)), data)
-    assert any(told in sentence for sentence in brought.assumed), brought.assumed
+    assert any(stated in sentence for sentence in brought.assumed), brought.assumed
     assert brought.measurement.noise is None
     assert any("estimates it" in sentence for sentence in brought.assumed)
 
@@ -198,8 +198,8 @@ def test_a_machine_file_states_names_unit_noise_and_bad_bpms(small_ring, data, t
         f'[data]\nunit = "mm"\nnoise = "2 um"\nbad = ["{data.monitors[2]}", "P03"]\n'
         f"[channels]\n{names}\n"
     )
-    told = load_machine_file(tmp_path / "tmlattice.toml").told
-    brought = bring_in([path], Options(ring=small_ring, told=told))
+    stated = load_machine_file(tmp_path / "tmlattice.toml").stated
+    brought = bring_in([path], Options(ring=small_ring, stated=stated))
     own = brought.measurement
     left = [m for i, m in enumerate(data.monitors) if i not in (2, 3)]
     assert sorted(own.monitors) == sorted(left)
@@ -213,17 +213,17 @@ def test_a_machine_file_may_state_that_devices_are_in_beam_order(small_ring, dat
     ordered = data.in_order_of([m.name for m in small_ring.monitors])
     alias = {m: f"P{i:02d}" for i, m in enumerate(ordered.monitors)}
     path = wide(tmp_path / "a.csv", ordered, lambda m, p: f"{alias[m]}:{p} [mm]")
-    same(bring_in([path], Options(ring=small_ring, told=Told(in_order=True))), ordered)
+    same(bring_in([path], Options(ring=small_ring, stated=Stated(in_order=True))), ordered)
     fewer = ordered.select(monitors=ordered.monitors[1:])
     path = wide(tmp_path / "b.csv", fewer, lambda m, p: f"{alias[m]}:{p} [mm]")
     with pytest.raises(MeasurementError, match="not the same in order"):
-        bring_in([path], Options(ring=small_ring, told=Told(in_order=True)))
+        bring_in([path], Options(ring=small_ring, stated=Stated(in_order=True)))
 
 
 def test_a_channel_of_a_bpm_that_is_not_there(small_ring, data, tmp_path):
     path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m} {p}")
     with pytest.raises(UnknownNameError, match="no monitor 'end_99'; did you mean"):
-        bring_in([path], Options(ring=small_ring, told=Told(names={"a": "end_99"})))
+        bring_in([path], Options(ring=small_ring, stated=Stated(names={"a": "end_99"})))
 
 
 @pytest.mark.parametrize(

@@ -114,10 +114,10 @@ def test_a_residual_above_the_noise_is_reported(small_ring):
 def test_one_method_alone_takes_its_own_options(small_ring):
     """`told` knows which magnets may have changed, which no other method asks for."""
     outcome = tune_fit(
-        small_ring, "QD::5", -0.03, launch=(1e-4, 0, 1e-4, 0), noise=1e-6, methods=["told"],
+        small_ring, "QD::5", -0.03, launch=(1e-4, 0, 1e-4, 0), noise=1e-6, methods=["known"],
         candidates=["QD::5", "QD::6"], progress=False,
     )  # fmt: skip
-    assert [m.method for m in outcome.methods] == ["told"]
+    assert [m.method for m in outcome.methods] == ["known"]
     assert set(outcome.best.named) == {"QD::5"}
     assert outcome.fit.options["candidates"] == ["QD::5", "QD::6"]
     assert outcome.advice.startswith("Trust told")

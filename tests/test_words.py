@@ -4,6 +4,7 @@ To extend it: a pair in `WORDS` (a word that is looked for, whatever its case, a
 its place), or a glob in `TEXTS` with how its prose is taken from the file.
 """
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -70,7 +71,17 @@ def prose(text):
     return re.sub(r"\]\([^)]*\)", "]", text)
 
 
+def module(path):
+    """Docstrings and messages of a module: its texts of several words."""
+    texts = [
+        node.value for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value
+    ]  # fmt: skip
+    return re.sub(r"`[^`]*`", "`code`", "\n\n".join(texts))
+
+
 TEXTS = {
+    "tmlattice/**/*.py": module,
     "README.md": page, "CHANGELOG.md": page, "CONTRIBUTING.md": page, "docs/**/*.md": page,
     "notebooks/*.ipynb": notebook,
 }  # fmt: skip

@@ -16,7 +16,7 @@ from typing import Any
 
 from tmlattice.correction.knobs import Knob, knobs_of, read_knobs
 from tmlattice.errors import MachineFileError, plain
-from tmlattice.importers import Options, Told, bring_in
+from tmlattice.importers import Options, Stated, bring_in
 from tmlattice.importers.imported import Imported
 from tmlattice.input_files import check_no_code, check_shape, toml_of
 from tmlattice.lattice import Ring, builtin_lattices, load_ring
@@ -36,7 +36,7 @@ class MachineFile:
         lattice: a built-in name, or a path that is relative to the working directory as `path` is;
             None: the file names none.
         options: of `load_ring`, for this lattice: sequence, energy, particle, monitors, correctors.
-        told: stated for files of readings: unit, noise, names, bad monitors, conventions.
+        stated: for files of readings: unit, noise, names, bad monitors, conventions.
         supplies: path of a table of knobs, or its rows; None: the file states none.
         trusted: a lattice that is Python code may be run.
     """
@@ -44,7 +44,7 @@ class MachineFile:
     path: Path
     lattice: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
-    told: Told = field(default_factory=Told)
+    stated: Stated = field(default_factory=Stated)
     supplies: Path | tuple[Mapping[str, Any], ...] | None = None
     trusted: bool = True
 
@@ -107,7 +107,7 @@ class MachineFile:
 
     def bring_in(self, path: Path, ring: Ring) -> Imported:
         """The measurement of a file of another program, with what was assumed of it."""
-        return bring_in([path], Options(ring=ring, told=self.told))
+        return bring_in([path], Options(ring=ring, stated=self.stated))
 
     def knobs(self, ring: Ring) -> list[Knob] | None:
         """Power supplies for `correct`; None: the file states none.
@@ -152,7 +152,7 @@ def load_machine_file(path: str | PathLike[str] = NAME, trusted: bool = True) ->
         place,
         file,
         lattice,
-        Told(names=document.get("channels", {}), **data),
+        Stated(names=document.get("channels", {}), **data),
         tuple(supplies) if isinstance(supplies, list) else supplies,
         trusted,
     )

@@ -63,7 +63,7 @@ class CaseSettings:
         shots: of first turns, and kicks of a stored beam.
         signal, amount: see `Draw`.
         background: rms of distributed errors by effect.
-        told: whether the diagnosis is given these rms values.
+        known_rms: whether the diagnosis is given these rms values.
     """
 
     tier: str
@@ -76,7 +76,7 @@ class CaseSettings:
     signal: tuple[float, float]
     amount: float | None
     background: Mapping[str, float]
-    told: bool
+    known_rms: bool
 
 
 # --- the machine ----------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ def kinds_case(asked: CaseSettings, number: int, name: str) -> tuple[Case, Truth
                 own = Ruler(problem_of(ring, {kind: healthy[kind]}, {}, background))
                 alone[kind] = own.of(causes)
     parts = {**measured, **({BEFORE + kind: healthy[kind] for kind in kinds} if pair else {})}
-    options = {"background": background} if background and asked.told else {}
+    options = {"background": background} if background and asked.known_rms else {}
     case = Case(name, asked.lattice, parts, options, kinds)
     sizes = (total,) if len(causes) == 1 else ()
     truth = Truth(

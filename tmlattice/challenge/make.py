@@ -78,7 +78,7 @@ def make(
     amount: float | None = None,
     signal: tuple[float, float] = SIGNAL,
     background: Mapping[str, float | None] | None = None,
-    told: bool = False,
+    known_rms: bool = False,
     kinds: Sequence[str] = (),
     progress: bool = True,
 ) -> dict[str, int]:
@@ -103,7 +103,7 @@ def make(
         signal: smallest and largest signal to noise.
         background: tiers of kinds and tier B, rms of the distributed errors by effect (None: the
             catalogue's); default in tiers B and P: every usual one.
-        told: the diagnosis is given these rms; else it estimates them.
+        known_rms: the diagnosis is given these rms; else it estimates them.
         kinds: of measurement, for tiers E, M and P; of M two or three are drawn.
         progress: show a bar on a terminal.
 
@@ -116,7 +116,7 @@ def make(
     if tier not in TIERS:
         raise TmlatticeError(f"no tier '{tier}'; there are {', '.join(TIERS)}")
     kinds = _kinds(tier, kinds)
-    _check(tier, kinds, reference, learnt, told, bool(background))
+    _check(tier, kinds, reference, learnt, known_rms, bool(background))
     if correctors is not None and not learnt:
         raise TmlatticeError("correctors are those of a learnt response; give --learnt too")
     everywhere = background or ({"all": None} if tier in ("B", "P") else {})
@@ -137,7 +137,7 @@ def make(
         "background": rms,
     }
     if tier == "B" or kinds:
-        public["told"] = told
+        public["known_rms"] = known_rms
     if learnt:
         public[LEARNT] = True
     if correctors is not None:
@@ -147,7 +147,7 @@ def make(
     _begin(folder, public, seed)
     asked = CaseSettings(
         tier, lattice, ring, seed, kinds, tuple(chosen) if effects else None, shots, signal, amount,
-        rms, told,
+        rms, known_rms,
     )  # fmt: skip
     unreachable: Counter[str] = Counter()
     there = set(case_names(folder))
@@ -172,21 +172,28 @@ def make(
 
 
 def _check(
-    tier: str, kinds: Sequence[str], reference: bool, learnt: bool, told: bool, background: bool
+    tier: str,
+    kinds: Sequence[str],
+    reference: bool,
+    learnt: bool,
+    known_rms: bool,
+    background: bool,
 ) -> None:
     """Raise if a tier does not have the requested options."""
     if reference and tier != "B":
         raise TmlatticeError("a reference is for tier B; leave --reference out")
-    if learnt and (tier != "B" or reference or told):
+    if learnt and (tier != "B" or reference or known_rms):
         raise TmlatticeError(
-            "--learnt is for tier B, without --reference or --told; leave --learnt out"
+            "--learnt is for tier B, without --reference or --known-rms; leave --learnt out"
         )
     if background and tier != "B" and not kinds:
         raise TmlatticeError(
             "distributed errors are for tier B and for those of kinds; leave --background out"
         )
-    if told and "orbit_response" in kinds:
-        raise TmlatticeError("an orbit response determines those rms by itself; leave --told out")
+    if known_rms and "orbit_response" in kinds:
+        raise TmlatticeError(
+            "an orbit response determines those rms by itself; leave --known-rms out"
+        )
 
 
 def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Case:
@@ -303,7 +310,7 @@ class CaseDraw:
             settings = (*self.before.settings, *settings)
             before = len(self.before)
         options: dict[str, Any] = {}
-        if self.background and self.asked.told:
+        if self.background and self.asked.known_rms:
             options["background"] = self.background
         causes: list[Cause] = []
         unknown: dict[str, Any] | None = None

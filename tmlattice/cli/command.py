@@ -73,8 +73,8 @@ class Sections(click.Group):
         if args and args[0] not in self.commands and not args[0].startswith("-"):
             near = difflib.get_close_matches(args[0], self.commands, 1)
             near = [f"dev {args[0]}"] if args[0] in dev.commands else near
-            mend = f"did you mean '{near[0]}'?" if near else "`tmlattice --help` lists them"
-            raise click.UsageError(f"no command '{args[0]}'; {mend}", ctx)
+            advice = f"did you mean '{near[0]}'?" if near else "`tmlattice --help` lists them"
+            raise click.UsageError(f"no command '{args[0]}'; {advice}", ctx)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -90,11 +90,11 @@ def import_files(
     elif machine is not None and machine.lattice:
         options = replace(options, ring=lambda: open_ring(machine.lattice_name()))
     if machine is not None:
-        stated = machine.options_for(files[0])  # of a lattice that is among the files
+        of_file = machine.options_for(files[0])  # of a lattice that is among the files
         options = replace(
             options,
-            told=machine.told,
-            sequence=stated.get("sequence"),
+            stated=machine.stated,
+            sequence=of_file.get("sequence"),
             energy=machine.options.get("energy"),
         )
     brought = bring_in(files, options)

@@ -31,7 +31,7 @@ def init(
     in; the rest is there as comments. On a terminal LATTICE and DATA are asked for.
     """
     from tmlattice.files import OutputError, output_file
-    from tmlattice.importers.told import machine_text
+    from tmlattice.importers.stated import machine_text
     from tmlattice.lattice import builtin_lattices
     from tmlattice.machine_file import NAME
 

@@ -421,7 +421,9 @@ def read_data(path: Path, ring: "Ring") -> "tuple[AnyMeasurement, tuple[str, ...
     from tmlattice.importers import Options, bring_in, described
 
     machine = machine_file()
-    brought = bring_in([path], Options(ring=ring, told=None if machine is None else machine.told))
+    brought = bring_in(
+        [path], Options(ring=ring, stated=None if machine is None else machine.stated)
+    )
     said = (*brought.assumed, *brought.doubts)
     screen = console()
     screen.print(f"{path}: {described(brought)}", soft_wrap=True)

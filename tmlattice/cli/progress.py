@@ -1,7 +1,7 @@
 """A progress line on a terminal, for every command that works for more than a few seconds.
 
 >>> with shown("tmlattice diagnose", quiet) as line:
-...     line.tell("noise")      # what is being done
+...     line.show("noise")      # what is being done
 """
 
 import sys
@@ -34,7 +34,7 @@ class Line:
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def tell(self, stage: str) -> None:
+    def show(self, stage: str) -> None:
         """State what is being done."""
         self.stage = stage
 
@@ -111,7 +111,7 @@ stopped_in: list[str] = []
 def tell(stage: str) -> None:
     """State what the command is doing."""
     if _shown:
-        _shown[-1].tell(stage)
+        _shown[-1].show(stage)
 
 
 def clear() -> None:

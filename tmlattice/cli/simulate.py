@@ -167,7 +167,7 @@ def simulate(
     ring = open_ring(lattice)
     machine = machine_file()
     if options["noise"] is None and machine is not None and kind in ("trajectory", "turn-by-turn"):
-        options["noise"] = machine.told.noise
+        options["noise"] = machine.stated.noise
     _warn_of_large(effects)
     causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
     causes = [_named(ring, cause) for cause in causes]

@@ -49,7 +49,7 @@ NUMBER = Word("all|N", _number, "'{0}' is no number of magnets; give 'all' or 1,
     "--methods",
     default="adam,map,sparse",
     metavar="NAME,...",
-    help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, told (sparse with "
+    help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, known (sparse with "
     "the known magnet).",
 )
 @click.option(

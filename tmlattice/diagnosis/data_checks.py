@@ -439,7 +439,7 @@ def _words(names: Sequence[str], alike: Sequence[Sequence[str]]) -> tuple[str, s
     others = "; ".join(
         f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}" for own in alike
     )
-    corrections = ", ".join(dict.fromkeys(ASSUMPTIONS[n].mend for n in names))
+    corrections = ", ".join(dict.fromkeys(ASSUMPTIONS[n].correction for n in names))
     return (
         words,
         f" ({others})" if others else "",

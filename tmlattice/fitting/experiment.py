@@ -134,8 +134,8 @@ def tune_fit(
         noise: rms of a reading, m; drawn from the seed.
         turns: tracked for the tunes, at a vanishing amplitude.
         seed: of the noise.
-        methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map"; or "told".
-        candidates: names of the only magnets that may have changed, of "told".
+        methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map"; or "known".
+        candidates: names of the only magnets that may have changed, of "known".
         epochs, learning_rate, regularization, regularization_rate: of "adam", see
             `fitting.adam.fit_adam`.
         relative_to_design, free, clip, patience: of the same.
@@ -261,19 +261,19 @@ def tune_fit_measurement(
 
 class _Work:
     """What the methods share: which, how many turns from where, and the options of "adam" and of
-    "told"."""
+    "known"."""
 
     def __init__(
         self, methods: tuple[str, ...], turns: int, start: Array, progress: bool,
         recipe: dict[str, Any], candidates: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
         self.methods, self.turns, self.start, self.progress = methods, turns, start, progress
-        self.options = {"adam": recipe, "told": {"candidates": candidates}}
+        self.options = {"adam": recipe, "known": {"candidates": candidates}}
         self.watch, self.begun = _Stopwatch(), time.perf_counter()
 
 
 def _ordered(methods: Sequence[str]) -> tuple[str, ...]:
-    """In the order of `METHODS`, "told" last, each once."""
+    """In the order of `METHODS`, "known" last, each once."""
     known = (*METHODS, *(name for name in SPARSE_METHODS if name not in METHODS))
     unknown = [name for name in methods if name not in known]
     if unknown:

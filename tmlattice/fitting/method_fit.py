@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 METHODS = ("adam", "sparse", "map")
 """The paper's recipe first; then the sparse fit, which identifies magnets."""
 
-SPARSE_METHODS = ("sparse", "told")
+SPARSE_METHODS = ("sparse", "known")
 """Methods that identify magnets; the second is given the possible ones."""
 
 

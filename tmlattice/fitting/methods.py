@@ -34,7 +34,7 @@ class Method(StrEnum):
     ADAM = "adam"
     MAP = "map"
     SPARSE = "sparse"
-    TOLD = "told"
+    KNOWN = "known"
 
 
 @by_name
@@ -72,7 +72,7 @@ def fine_tune(
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
             (`fitting.map_fit.fit_map`); "sparse", the set of changed magnets with the largest
-            marginal likelihood (`fitting.sparse.fit_sparse`); "told", the same for given magnets
+            marginal likelihood (`fitting.sparse.fit_sparse`); "known", the same for given magnets
             (`candidates=`): nothing else can be better. All but the first state the error of their
             tunes.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n], m and
@@ -83,7 +83,7 @@ def fine_tune(
         relative_to_design, free, clip, patience: of the same.
         ring, kinds, noise: of the others: the ring whose magnets change (None: the network's own),
             the kinds of magnets, and the rms of one reading, m (None: the measurement's).
-        fault, largest_number, refined: of "sparse" and "told".
+        fault, largest_number, refined: of "sparse" and "known".
         candidates: of the same: the only magnets that may have changed.
         prior, scale, iterations: of "map".
 
@@ -101,13 +101,13 @@ def fine_tune(
         raise unknown_choice("method", method, Method) from None
     fit = _FITS[chosen]
     options = _options_of(fit, given, chosen)
-    if chosen is Method.TOLD and not candidates:
+    if chosen is Method.KNOWN and not candidates:
         raise ValueError(
-            "method 'told' needs the names of the magnets that may have changed: give candidates="
+            "method 'known' needs the names of the magnets that may have changed: give candidates="
         )
     if fit is fit_sparse and isinstance(network, SymplecticNetwork):
         if network.ring is None:
-            raise ValueError("methods 'sparse' and 'told' need a network made from a ring")
+            raise ValueError("methods 'sparse' and 'known' need a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
     result = fit(network, measurement, **options)
     if chosen is Method.ADAM:
@@ -116,7 +116,7 @@ def fine_tune(
 
 
 _FITS: dict[Method, Callable[..., FitResult]] = {
-    Method.ADAM: fit_adam, Method.MAP: fit_map, Method.SPARSE: fit_sparse, Method.TOLD: fit_sparse,
+    Method.ADAM: fit_adam, Method.MAP: fit_map, Method.SPARSE: fit_sparse, Method.KNOWN: fit_sparse,
 }  # fmt: skip
 
 

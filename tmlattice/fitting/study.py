@@ -36,7 +36,7 @@ from tmlattice.optics import Optics, matrix_tunes, one_turn_optics
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
-METHODS = ("adam", "adam-none", "adam-l1", "adam-l2", "map", "sparse", "told")
+METHODS = ("adam", "adam-none", "adam-l1", "adam-l2", "map", "sparse", "known")
 """Adam with the symplectic penalty, without, with l1, with l2; `map`; `sparse`; and `sparse` given
 the changed magnets, the best possible."""
 
@@ -185,7 +185,7 @@ def run_case(
             fit = fine_tune(design, measurement, progress=False, **options)
             predicted = network_tunes(fit.network, start, turns)[0]
         else:
-            only = names if method == "told" else None
+            only = names if method == "known" else None
             fit = fine_tune(
                 design, measurement, method=method, noise=noise, candidates=only, progress=False
             )
@@ -213,7 +213,7 @@ def run_case(
         tune_sigma=None if fit.tune_sigma is None else _pair(fit.tune_sigma),
         orbit_rms=_pair(np.array(rms)),
         prediction_rms=prediction,
-        found=tuple(fit.changes) if method in ("sparse", "told") else None,
+        found=tuple(fit.changes) if method in ("sparse", "known") else None,
         seconds=fit.seconds,
     )
 
@@ -362,7 +362,7 @@ def summarise(cases: Sequence[Case]) -> dict[str, Any]:
         (median after, m), "prediction_rms" {"median", "p95", "worst"} (m), "right" (fraction of
         cases with exactly the right magnets, or null), "coverage" ({"x", "y"}: fraction of cases
         within the stated 95 % error, or null), "stated" (standard errors of the tunes, as "abs_dq";
-        those of "told" are the Cramer-Rao bound, the readings' information on a known magnet),
+        those of "known" are the Cramer-Rao bound, the readings' information on a known magnet),
         "seconds" (median), "predicted", "failed"}},
         "cases", "unstable"}; "unstable" counts magnets whose perturbed ring has no tune.
     """

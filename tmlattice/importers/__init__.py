@@ -7,12 +7,12 @@
 
 from tmlattice.importers.bring_in import Options, bring_in, import_data, read_measurement
 from tmlattice.importers.imported import Imported, described, write_imported
-from tmlattice.importers.told import Told
+from tmlattice.importers.stated import Stated
 
 __all__ = [
     "Imported",
     "Options",
-    "Told",
+    "Stated",
     "bring_in",
     "described",
     "import_data",

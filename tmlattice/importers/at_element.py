@@ -26,14 +26,14 @@ TURNED_BY_AT = ("dx", "dy", "dz", "pitch", "yaw", "tilt", "reference")
 constructors would take a file's own use of them for these."""
 
 
-def at_element(fields: Mapping[str, Any], place: int, energy: float, said: Counter[str]) -> Any:
+def at_element(fields: Mapping[str, Any], place: int, energy: float, messages: Counter[str]) -> Any:
     """The element.
 
     Args:
         fields: of the structure.
         place: in the lattice, from 0, for errors.
         energy: of the ring, GeV.
-        said: what was done, counted; added to.
+        messages: what was done, counted; added to.
 
     Raises:
         LatticeError: AT cannot make it.
@@ -50,7 +50,7 @@ def at_element(fields: Mapping[str, Any], place: int, energy: float, said: Count
         kept["PassMethod"] = _method_of(kept)
         empty = kept["PassMethod"] in EMPTY
         as_what = "a drift" if empty else f"{kept['PassMethod']}, by its fields"
-        said[f"'{str(method)[:40]}' is no pass method of AT: {as_what}"] += 1
+        messages[f"'{str(method)[:40]}' is no pass method of AT: {as_what}"] += 1
         if empty:
             kept = {key: kept[key] for key in ("FamName", "PassMethod")} | {"Length": length}
     if kept["PassMethod"] in NO_ORBIT:

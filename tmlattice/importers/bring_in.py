@@ -30,8 +30,8 @@ from tmlattice.importers.loco import Iteration, bring_loco
 from tmlattice.importers.matlab_ring import Elements, elements_of
 from tmlattice.importers.middle_layer import bring_middle_layer
 from tmlattice.importers.readings import bring_readings, with_unit
+from tmlattice.importers.stated import Stated
 from tmlattice.importers.tables import bring_table, bring_turns, is_response_table
-from tmlattice.importers.told import Told
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import (
@@ -63,7 +63,7 @@ class Options:
         energy: GeV; else what the lattice states.
         turns: the kind of a turn-by-turn file, see `bring_turns`.
         unit: of the readings of first turns or turns; else as the file states, or from their size.
-        told: what a machine file states about a table of readings.
+        stated: what a machine file states about a table of readings.
         ring: instead of `lattice`, one that is loaded already, or a function that loads it where a
             file needs one.
         noise: rms of a reading, or of an orbit change, m, where the files give none.
@@ -77,7 +77,7 @@ class Options:
     turns: str | None = None
     unit: Unit | None = None
     noise: float | None = None
-    told: Told | None = None
+    stated: Stated | None = None
     ring: Ring | Callable[[], Ring] | None = None
 
 
@@ -178,10 +178,10 @@ def import_data(
         MeasurementError: a source that is unknown, or does not fit together.
         LatticeError: a lattice that cannot be made.
     """
-    told = Told(names=dict(names or {}), bad=tuple(bad)) if names or bad else None
+    stated = Stated(names=dict(names or {}), bad=tuple(bad)) if names or bad else None
     one = is_frame(source) or isinstance(source, str | PathLike)
     options = Options(
-        iteration, keep_bad, sequence, lattice, energy, turns, unit, noise, told, ring
+        iteration, keep_bad, sequence, lattice, energy, turns, unit, noise, stated, ring
     )
     every: Any = [source] if one else source
     return bring_in(every, options)
@@ -245,8 +245,8 @@ def _bring(
                 options.energy,
             )  # fmt: skip
     if len(rest) == len(files) == 1 and (ring := _ring(options)) is not None:
-        told = with_unit(options.told, options.unit, options.noise)
-        return bring_readings(label(files[0]), of_matlab(*rest[0]), ring, told)
+        stated = with_unit(options.stated, options.unit, options.noise)
+        return bring_readings(label(files[0]), of_matlab(*rest[0]), ring, stated)
     shown = ", ".join(f"'{path}'" for path in files)
     raise MeasurementError(
         f"{shown}: no measurement that is known; give a MATLAB LOCO file (with LocoMeasData), or "
@@ -259,47 +259,47 @@ def _table(source: Path | Any, ring: Ring | None, options: Options) -> Imported:
     name, columns = label(source), read_columns(source)
     plain_text = not isinstance(source, Path) or source.suffix.lower() in CSV
     if plain_text and is_response_table(columns):
-        return bring_table(name, columns, ring, options.told)
-    told = with_unit(options.told, options.unit, options.noise)
-    return bring_readings(name, columns, ring, told)
+        return bring_table(name, columns, ring, options.stated)
+    stated = with_unit(options.stated, options.unit, options.noise)
+    return bring_readings(name, columns, ring, stated)
 
 
 def _framed(frame: Any, options: Options) -> Imported:
     """As of `to_dataframe`, or as a table of a file."""
     ring = _ring(options)
-    stated = of_document(as_frame(frame))
-    if stated is not None:
-        return Imported(stated, ring, ("everything is as `to_dataframe` wrote it",))
+    written = of_document(as_frame(frame))
+    if written is not None:
+        return Imported(written, ring, ("everything is as `to_dataframe` wrote it",))
     return _table(frame, ring, options)
 
 
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
     """Turns of a known kind; of SDDS of another kind, the columns as they are."""
     try:
-        told = with_unit(options.told, options.unit, None)
-        unit = cast("Unit | None", "um" if told.unit == "µm" else told.unit)
-        return bring_turns(path, ring, options.turns, unit, told)
+        stated = with_unit(options.stated, options.unit, None)
+        unit = cast("Unit | None", "um" if stated.unit == "µm" else stated.unit)
+        return bring_turns(path, ring, options.turns, unit, stated)
     except MeasurementError:
         if options.turns or ring is None or path.suffix.lower() not in SDDS:
             raise
-        told = with_unit(options.told, options.unit, options.noise)
-        return bring_readings(label(path), read_columns(path), ring, told)
+        stated = with_unit(options.stated, options.unit, options.noise)
+        return bring_readings(label(path), read_columns(path), ring, stated)
 
 
 def _with_conventions(brought: Imported, ring: Ring | None, options: Options) -> Imported:
     """The readings with the stated conventions of signs and units undone; those that have a meaning
     for this kind of measurement."""
     data: Any = brought.measurement
-    stated = options.told.assume if options.told else ()
-    for name in stated:
+    wanted = options.stated.assume if options.stated else ()
+    for name in wanted:
         if name not in ASSUMPTIONS:
             raise unknown_name("assumption", name, ASSUMPTIONS)
     first, response = isinstance(data, Measurement), isinstance(data, OrbitResponse)
     own = [
-        name for name in stated
+        name for name in wanted
         if (first and ASSUMPTIONS[name].trajectory) or (response and ASSUMPTIONS[name].response)
     ]  # fmt: skip
-    if left := [name for name in stated if name not in own]:
+    if left := [name for name in wanted if name not in own]:
         brought = brought.saying(f"of no meaning for these data, not undone: {', '.join(left)}")
     if not own:
         return brought
@@ -359,8 +359,8 @@ def read_measurement(
     if monitors is not None and place.suffix.lower() in (*CSV, *HDF5, *SDDS):
         columns = read_columns(place)
         if place.suffix.lower() not in CSV or not is_response_table(columns):
-            told = with_unit(None, unit, None)
-            return _logged(bring_readings(str(place), columns, None, told, monitors), str(place))
+            stated = with_unit(None, unit, None)
+            return _logged(bring_readings(str(place), columns, None, stated, monitors), str(place))
     brought = bring_in([place], Options(ring=ring, unit=unit))
     return _logged(brought, str(place))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tmlattice.files import output_folder
-from tmlattice.importers.told import machine_text
+from tmlattice.importers.stated import machine_text
 from tmlattice.lattice import Ring, builtin_lattices
 from tmlattice.measurement import Measurement
 from tmlattice.observe.calibration import calibrated_response

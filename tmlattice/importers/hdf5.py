@@ -146,7 +146,7 @@ def bring_hdf5(
         "the RF frequency stood still while correctors were stepped",
         of_noise,
         of_rf,
-        *placed.said,
+        *placed.messages,
     )
     return Imported(measured, placed.ring, said, placed.doubts)
 

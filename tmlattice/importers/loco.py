@@ -109,7 +109,7 @@ def bring_loco(
     return Imported(
         measured,
         replace(placed.ring, model=model),
-        assumed=(*conventions(flags, measured), *of_form, *of_lists, of_lattice, *placed.said),
+        assumed=(*conventions(flags, measured), *of_form, *of_lists, of_lattice, *placed.messages),
         doubts=(
             *placed.doubts,
             *_computed(data, content.get("LocoModel"), good),

@@ -121,14 +121,14 @@ class Placed:
         ring: the model.
         monitors: names of the monitors, in the order of `Roles.monitors`.
         correctors: names by place and plane.
-        said: what was done to the lattice; sentences.
+        messages: what was done to the lattice; sentences.
         doubts: whether the model is what AT makes of the same elements; sentences.
     """
 
     ring: Ring
     monitors: tuple[str, ...]
     correctors: Mapping[tuple[int, str], str]
-    said: tuple[str, ...]
+    messages: tuple[str, ...]
     doubts: tuple[str, ...]
 
 
@@ -168,16 +168,16 @@ def ring_of_elements(
             f"place {wrong + 1} is beyond the lattice's {len(elements)} elements; the file's "
             "lattice is not that of its measurement"
         )
-    said: Counter[str] = Counter()
+    messages: Counter[str] = Counter()
     with warnings.catch_warnings():  # AT's own, of what it finds in old files
         warnings.simplefilter("ignore")
-        made = [at_element(fields, i, energy, said) for i, fields in enumerate(elements)]
+        made = [at_element(fields, i, energy, messages) for i, fields in enumerate(elements)]
     of_family = _planes_of_families(made, roles.kicks)
     sequence: list[Any] = []
     where: dict[tuple[int, str], int] = {}  # (place, "" or plane) -> in the sequence
     for i, element in enumerate(made):
         planes = roles.kicks.get(i, frozenset())
-        parts = _parts(element, planes, of_family, said)
+        parts = _parts(element, planes, of_family, messages)
         if i in roles.monitors:
             parts = _read(element, parts)
             where[i, ""] = len(sequence)
@@ -202,8 +202,8 @@ def ring_of_elements(
             for i, planes in roles.kicks.items()
             for plane in planes
         },
-        said=(
-            *(f"{what} ({count})" for what, count in said.items()),
+        messages=(
+            *(f"{what} ({count})" for what, count in messages.items()),
             *(str(warning.message) for warning in told),
         ),
         doubts=tuple(_unlike_at(lattice, ring)),
@@ -288,17 +288,17 @@ def _parts(
     element: Any,
     planes: frozenset[str],
     of_family: Mapping[str, frozenset[str]],
-    said: Counter[str],
+    messages: Counter[str],
 ) -> list[Any]:
     """An element as it kicks."""
     import at
 
     if isinstance(element, at.Corrector):
         if np.any(np.asarray(element.KickAngle, dtype=float)):
-            said["kicks of correctors in the lattice are taken as 0"] += 1
+            messages["kicks of correctors in the lattice are taken as 0"] += 1
         return _corrector(element, of_family.get(_family(element), frozenset()))
     if planes:
-        said["magnets that kick stand as two halves with thin correctors between"] += 1
+        messages["magnets that kick stand as two halves with thin correctors between"] += 1
         return _magnet(element, planes)
     return [element]
 

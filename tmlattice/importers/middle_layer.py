@@ -38,7 +38,7 @@ FIELDS = {
 
 def bring_middle_layer(
     response: Fields,
-    beside: Sequence[Fields],
+    with_dispersion: Sequence[Fields],
     loco: Fields,
     path: Path,
     iteration: Iteration = "first",
@@ -49,7 +49,7 @@ def bring_middle_layer(
 
     Args:
         response: variables with `Rmat`.
-        beside: variables with the dispersion or the noise.
+        with_dispersion: variables with the dispersion or the noise.
         loco: variables of the machine's LOCO file, the dictionary.
         path: of the LOCO file.
         iteration, keep_bad, energy: see `bring_loco`.
@@ -90,8 +90,8 @@ def bring_middle_layer(
         kicks=np.array(kicks),
         monitors=model.monitors,
         response=np.concatenate(changes),
-        noise=_noise(beside, reads, len(model.monitors)),
-        rf=_rf(beside, reads, model),
+        noise=_noise(with_dispersion, reads, len(model.monitors)),
+        rf=_rf(with_dispersion, reads, model),
         lattice=model.lattice,
         energy=model.energy,
         devices=model.devices,
@@ -224,19 +224,19 @@ def _kicks(
     )
 
 
-def _part(beside: Sequence[Fields], name: str) -> Fields | None:
-    part = next((content[name] for content in beside if name in content), None)
+def _part(with_dispersion: Sequence[Fields], name: str) -> Fields | None:
+    part = next((content[name] for content in with_dispersion if name in content), None)
     if part is not None:
         check_fields(part, FIELDS, name)
     return part
 
 
 def _noise(
-    beside: Sequence[Fields], reads: Sequence[Mapping[Device, int]], monitors: int
+    with_dispersion: Sequence[Fields], reads: Sequence[Mapping[Device, int]], monitors: int
 ) -> Array | None:
     noise = np.full((monitors, 2), np.nan)
     for p, plane in enumerate("xy"):
-        part = _part(beside, f"BPM{plane}Data")
+        part = _part(with_dispersion, f"BPM{plane}Data")
         if part is None or "Sigma" not in part:
             return None
         at = [_look_up(reads[p], d, f"monitor of {plane}") for d in _devices(part, "BPMxData")]
@@ -246,7 +246,7 @@ def _noise(
 
 
 def _rf(
-    beside: Sequence[Fields], reads: Sequence[Mapping[Device, int]], model: OrbitResponse
+    with_dispersion: Sequence[Fields], reads: Sequence[Mapping[Device, int]], model: OrbitResponse
 ) -> RfStep | None:
     """The dispersion, for its own step; in physics units it is m for a whole of dp/p."""
     if model.rf is None:
@@ -254,7 +254,7 @@ def _rf(
     orbit = np.full((len(model.monitors), 2), np.nan)
     step = 0.0
     for p, plane in enumerate("xy"):
-        part = _part(beside, f"BPM{plane}Disp")
+        part = _part(with_dispersion, f"BPM{plane}Disp")
         if part is None:
             return None
         at = [

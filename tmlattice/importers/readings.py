@@ -22,7 +22,7 @@ from tmlattice.importers.imported import (
     device_names,
     first_turns_or_stored,
 )
-from tmlattice.importers.told import Told
+from tmlattice.importers.stated import Stated
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.arrays import METRES
@@ -75,7 +75,7 @@ def bring_readings(
     path: str,
     columns: Sequence[Column],
     ring: Ring | None,
-    told: Told | None = None,
+    stated: Stated | None = None,
     monitors: Sequence[str] | None = None,
 ) -> Imported:
     """The measurement of a table with unknown columns.
@@ -84,23 +84,23 @@ def bring_readings(
         path: what messages call it, see `columns.label`.
         columns: of `read_columns`.
         ring: the lattice, whose monitors are looked for; None: names are as the file has them.
-        told: names, unit, noise, bad monitors.
+        stated: names, unit, noise, bad monitors.
         monitors: names to look for, instead of the lattice's.
 
     Raises:
         MeasurementError: no table, no monitor of the ring, a field that is no number, or most
             readings above 0.2 m.
-        UnknownNameError: `told` names a monitor that the ring does not have.
+        UnknownNameError: `stated` names a monitor that the ring does not have.
     """
-    told = told or Told()
-    found = _long(path, columns, told) or _wide(path, columns, told)
+    stated = stated or Stated()
+    found = _long(path, columns, stated) or _wide(path, columns, stated)
     shots, turns, places, values, units = found
     position = np.array([place.plane != SUM for place in places])
     devices = list(dict.fromkeys(place.device for place in places if place.plane != SUM))
     if not devices:
         raise MeasurementError(f"{path}: sum signals without x and y; give the positions too")
     names = list(monitors or devices if ring is None else [e.name for e in ring.monitors])
-    finder = _Finder(names, told, [] if ring is None else [e.name for e in ring.elements])
+    finder = _Finder(names, stated, [] if ring is None else [e.name for e in ring.elements])
     monitor = finder.all(path, devices)
     for place in places:
         monitor.setdefault(place.device, finder.find(place.device))
@@ -108,7 +108,7 @@ def bring_readings(
     fill = _fill(values[position])
     scale[position], of_unit, guessed = _scale(
         np.where(np.abs(values) == fill, np.nan, values)[position],
-        [u for u, p in zip(units, position, strict=True) if p], told,
+        [u for u, p in zip(units, position, strict=True) if p], stated,
     )  # fmt: skip
     both = np.full((len(set(shots)), max(turns) + 1, len(names), 3), np.nan)
     order = {shot: i for i, shot in enumerate(dict.fromkeys(shots))}
@@ -135,7 +135,7 @@ def bring_readings(
     bad = sorted({names[at] for at in finder.bad if np.isfinite(readings[:, :, at]).any()})
     taken[:, :, sorted(finder.bad)] = False
     read = np.flatnonzero(taken[..., :SUM].any(axis=(0, 1, 3)))
-    noise = None if told.noise is None else np.full((len(read), 2), told.noise)
+    noise = None if stated.noise is None else np.full((len(read), 2), stated.noise)
     hints = (None, None) if ring is None else (ring.name, ring.energy)
     devices_of = device_names(
         (names[at], device) for device in devices if (at := monitor.get(device)) in read.tolist()
@@ -150,8 +150,8 @@ def bring_readings(
     )
     of_noise = (
         "no noise is given: a diagnosis estimates it from the readings"
-        if told.noise is None
-        else f"the noise is {1e6 * told.noise:g} µm, as stated"
+        if stated.noise is None
+        else f"the noise is {1e6 * stated.noise:g} µm, as stated"
     )
     beam = "the launch of the beam is unknown"
     if isinstance(data, TurnByTurn):
@@ -159,7 +159,7 @@ def bring_readings(
     sums = about_sums(both[..., SUM], silent, before, names)
     said = [
         of_unit, beam, of_noise, *finder.said, *sums, *missing, *said_of_large,
-        *_unused(columns, told),
+        *_unused(columns, stated),
     ]  # fmt: skip
     if bad:
         said.append(f"bad monitors, left out as stated: {counted(bad)}")
@@ -207,13 +207,20 @@ def _scattered(readings: Array, filled: NDArray[np.bool_], fill: float | None) -
     return [f"{filled.sum()} readings are {fill:g}, far above all others: taken as missing"]
 
 
-def _unused(columns: Sequence[Column], told: Told) -> list[str]:
+def _unused(columns: Sequence[Column], stated: Stated) -> list[str]:
     """A sentence about columns that are not read."""
-    known = {*SHOTS, *TURNS, *MONITORS, *VALUES, *PLANES, *map(str.casefold, told.columns.values())}
+    known = {
+        *SHOTS,
+        *TURNS,
+        *MONITORS,
+        *VALUES,
+        *PLANES,
+        *map(str.casefold, stated.columns.values()),
+    }
     names = [
         c.name for c in columns
         if c.name and c.name.casefold().replace(" ", "_") not in known
-        and _plane(c.name) is None and place_of(c.name, told) is None
+        and _plane(c.name) is None and place_of(c.name, stated) is None
     ]  # fmt: skip
     return [f"columns that are not read: {counted(names)}"] if names else []
 
@@ -222,15 +229,15 @@ Found = tuple[list[str], list[int], list[Place], Array, list[str]]
 """Of every number: its shot, turn, place, value, and unit."""
 
 
-def _long(path: str, columns: Sequence[Column], told: Told) -> Found | None:
+def _long(path: str, columns: Sequence[Column], stated: Stated) -> Found | None:
     """A row a monitor; None where no column holds names."""
-    names = _called(columns, "monitor", MONITORS, told)
+    names = _called(columns, "monitor", MONITORS, stated)
     if names is None or all(_is_number(text) for text in names.values):
         return None
-    value = _called(columns, "value", VALUES, told)
-    plane = _called(columns, "plane", PLANES, told)
-    shots = _labels(columns, "shot", SHOTS, told) or ["0"] * len(names.values)
-    turns = _turns(path, columns, told) or [0] * len(names.values)
+    value = _called(columns, "value", VALUES, stated)
+    plane = _called(columns, "plane", PLANES, stated)
+    shots = _labels(columns, "shot", SHOTS, stated) or ["0"] * len(names.values)
+    turns = _turns(path, columns, stated) or [0] * len(names.values)
     parts: list[tuple[list[Place | None], Column]] = []
     if value is not None and plane is not None:
         planes = [_plane(text) for text in plane.values]
@@ -251,16 +258,16 @@ def _long(path: str, columns: Sequence[Column], told: Told) -> Found | None:
     return _joined(path, [(shots, turns, places, column) for places, column in parts])
 
 
-def _wide(path: str, columns: Sequence[Column], told: Told) -> Found:
+def _wide(path: str, columns: Sequence[Column], stated: Stated) -> Found:
     """A row a shot, a column a monitor and plane."""
     rows = len(columns[0].values)
-    turns = _turns(path, columns, told)
-    shots = _labels(columns, "shot", SHOTS, told)
+    turns = _turns(path, columns, stated)
+    shots = _labels(columns, "shot", SHOTS, stated)
     if shots is None:
         shots = ["0"] * rows if turns is not None else [str(i) for i in range(rows)]
     used = [
         column for column in columns
-        if (place := place_of(column.name, told)) is not None and _holds(place.plane, column)
+        if (place := place_of(column.name, stated)) is not None and _holds(place.plane, column)
     ]  # fmt: skip
     if not used:
         alone = [column.name for column in columns if _plane(column.name) is not None]
@@ -276,7 +283,7 @@ def _wide(path: str, columns: Sequence[Column], told: Told) -> Found:
     turns = turns or [0] * rows
     return _joined(
         path,
-        [(shots, turns, [place_of(column.name, told)] * rows, column) for column in used],
+        [(shots, turns, [place_of(column.name, stated)] * rows, column) for column in used],
     )
 
 
@@ -331,27 +338,29 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _called(columns: Sequence[Column], key: str, usual: Sequence[str], told: Told) -> Column | None:
+def _called(
+    columns: Sequence[Column], key: str, usual: Sequence[str], stated: Stated
+) -> Column | None:
     """The column of this meaning, by its stated name or its usual names."""
-    wanted = [told.columns[key].casefold()] if key in told.columns else usual
+    wanted = [stated.columns[key].casefold()] if key in stated.columns else usual
     for name in wanted:
         for column in columns:
             if column.name.casefold().replace(" ", "_") == name.replace(" ", "_"):
                 return column
-    if key in told.columns:
-        raise unknown_name("column", told.columns[key], [column.name for column in columns])
+    if key in stated.columns:
+        raise unknown_name("column", stated.columns[key], [column.name for column in columns])
     return None
 
 
 def _labels(
-    columns: Sequence[Column], key: str, usual: Sequence[str], told: Told
+    columns: Sequence[Column], key: str, usual: Sequence[str], stated: Stated
 ) -> list[str] | None:
-    column = _called(columns, key, usual, told)
+    column = _called(columns, key, usual, stated)
     return None if column is None else column.values
 
 
-def _turns(path: str, columns: Sequence[Column], told: Told) -> list[int] | None:
-    column = _called(columns, "turn", TURNS, told)
+def _turns(path: str, columns: Sequence[Column], stated: Stated) -> list[int] | None:
+    column = _called(columns, "turn", TURNS, stated)
     if column is None:
         return None
     numbers = [_number(path, i, column.name, text) for i, text in enumerate(column.values)]
@@ -368,14 +377,14 @@ def _plane(text: str) -> int | None:
     return None if match is None else int(match["p"][0].casefold() in "yv")
 
 
-def place_of(name: str, told: Told | None = None) -> Place | None:
+def place_of(name: str, stated: Stated | None = None) -> Place | None:
     """Device and plane of a column's or channel's name; None where it names no plane.
 
     >>> place_of("SR:C01-BPM:1:X-I"), place_of("x_bpm7"), place_of("temperature")
     (Place(device='SR:C01-BPM:1:I', plane=0), Place(device='bpm7', plane=0), None)
     """
-    if told is not None and name in told.names:  # the whole column: 'bpm_1 x'
-        device, _, last = told.names[name].rpartition(" ")
+    if stated is not None and name in stated.names:  # the whole column: 'bpm_1 x'
+        device, _, last = stated.names[name].rpartition(" ")
         plane = _plane(last)
         if device and plane is not None:
             return Place(device, plane)
@@ -397,17 +406,17 @@ def _norm(text: str) -> str:
 class _Finder:
     """The lattice's monitor of a device."""
 
-    def __init__(self, names: Sequence[str], told: Told, elements: Sequence[str] = ()) -> None:
+    def __init__(self, names: Sequence[str], stated: Stated, elements: Sequence[str] = ()) -> None:
         self._names = list(names)
         self._exact = {name.casefold(): i for i, name in enumerate(self._names)}
         self._plain = _unique(_norm, self._names)
         self._told: dict[str, int] = {}
-        self._in_order = told.in_order
-        self._stated = told
+        self._in_order = stated.in_order
+        self._stated = stated
         others = {name.casefold() for name in elements}
         self.bad: set[int] = set()
         self.said: list[str] = []
-        for device, name in told.names.items():
+        for device, name in stated.names.items():
             plain = name if name.casefold() in self._exact else name.rpartition(" ")[0]
             if plain.casefold() not in self._exact and name.casefold() in others:
                 continue  # a corrector's
@@ -482,7 +491,7 @@ def _unique(key: Callable[[str], str], names: Sequence[str]) -> dict[str, int]:
     return {name: i for name, i in table.items() if name not in twice}
 
 
-def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str, str | None]:
+def _scale(values: Array, units: Sequence[str], stated: Stated) -> tuple[Array, str, str | None]:
     """Metres per unit of each number, a sentence about it, and a unit that is a guess."""
     known = {"µm": "um", "μm": "um", "micron": "um", "metre": "m", "meter": "m"}
     words = [re.sub("metre|meter$", "m", unit.strip().casefold().rstrip("s")) for unit in units]
@@ -495,12 +504,12 @@ def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str,
         )
     silent = np.array([not unit for unit in plain])
     scale = np.array([METRES[unit] if unit else 1.0 for unit in plain])
-    stated = sorted(set(plain) - {""})
+    in_file = sorted(set(plain) - {""})
     if not silent.any():
-        return scale, f"readings are in {' and '.join(stated)}, as the file states", None
-    if told.unit is not None:
-        scale[silent] = METRES[told.unit]
-        return scale, f"readings are in {told.unit}, as stated", None
+        return scale, f"readings are in {' and '.join(in_file)}, as the file states", None
+    if stated.unit is not None:
+        scale[silent] = METRES[stated.unit]
+        return scale, f"readings are in {stated.unit}, as stated", None
     own = np.abs(values[silent])
     own = own[np.isfinite(own)]
     size = float(np.percentile(own, 95)) if len(own) else 0.0
@@ -514,11 +523,11 @@ def _scale(values: Array, units: Sequence[str], told: Told) -> tuple[Array, str,
     )
 
 
-def with_unit(told: Told | None, unit: str | None, noise: float | None) -> Told:
+def with_unit(stated: Stated | None, unit: str | None, noise: float | None) -> Stated:
     """What the user stated, together with the options of the command."""
-    told = told or Told()
+    stated = stated or Stated()
     return replace(
-        told,
-        unit=told.unit if unit is None else unit,
-        noise=told.noise if noise is None else noise,
+        stated,
+        unit=stated.unit if unit is None else unit,
+        noise=stated.noise if noise is None else noise,
     )

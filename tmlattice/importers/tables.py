@@ -23,7 +23,7 @@ from tmlattice.importers.imported import (
     first_turns_or_stored,
 )
 from tmlattice.importers.middle_layer import RADIANS
-from tmlattice.importers.told import Told
+from tmlattice.importers.stated import Stated
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse, read_turn_by_turn
 from tmlattice.measurement.arrays import METRES, Unit
@@ -47,7 +47,7 @@ def is_response_table(columns: Sequence[Column]) -> bool:
 
 
 def bring_table(
-    path: str, columns: Sequence[Column], ring: Ring | None, told: Told | None = None
+    path: str, columns: Sequence[Column], ring: Ring | None, stated: Stated | None = None
 ) -> Imported:
     """An orbit response of a table.
 
@@ -55,7 +55,7 @@ def bring_table(
         path: what messages call it, see `columns.label`.
         columns: of `read_columns`.
         ring: the lattice, which knows the correctors' planes.
-        told: names of monitors and correctors, bad monitors.
+        stated: names of monitors and correctors, bad monitors.
 
     Raises:
         MeasurementError: an unknown header, or a field that is no number: with its line.
@@ -70,7 +70,7 @@ def bring_table(
             "which knows the planes of its correctors"
         )
     read = _long if "corrector" in names else _wide
-    return read(path, header, rows, ring, told or Told())
+    return read(path, header, rows, ring, stated or Stated())
 
 
 _FILES = (
@@ -84,7 +84,7 @@ def bring_turns(
     ring: Ring | None,
     kind: str | None = None,
     unit: Unit | None = None,
-    told: Told | None = None,
+    stated: Stated | None = None,
 ) -> Imported:
     """Turns of the beam, of a file that the package `turn_by_turn` reads.
 
@@ -95,7 +95,7 @@ def bring_turns(
         ring: the lattice, whose names the monitors then have; None: names as they are.
         kind: see `read_turn_by_turn`; None: lhc, then sps.
         unit: of the file; None: mm.
-        told: names of monitors.
+        stated: names of monitors.
 
     Raises:
         OtherFormatError: it cannot be read.
@@ -112,7 +112,7 @@ def bring_turns(
             continue
         doubts: tuple[str, ...] = ()
         if ring is not None:
-            data, doubts = _of_ring(data, ring, told or Told())
+            data, doubts = _of_ring(data, ring, stated or Stated())
         read = np.atleast_2d(np.isfinite(data.readings).any(axis=(0, 1)))
         single = int((read.sum(axis=1) == 1).sum())
         said = [
@@ -144,10 +144,10 @@ def bring_turns(
     ) from why
 
 
-def _of_ring(data: Measurement, ring: Ring, told: Told) -> tuple[Measurement, tuple[str, ...]]:
+def _of_ring(data: Measurement, ring: Ring, stated: Stated) -> tuple[Measurement, tuple[str, ...]]:
     """The monitors that the ring has, under its names and in its order, and what it has not."""
     ours = Names("monitor", [element.name for element in ring.monitors])
-    place = {name: ours.find(told.name_of(name)) for name in data.monitors}
+    place = {name: ours.find(stated.name_of(name)) for name in data.monitors}
     there = sorted((at, name) for name, at in place.items() if at is not None)
     missing = [name for name, at in place.items() if at is None]
     if not there:
@@ -182,7 +182,7 @@ def _factor(path: str, name: str, unit: str, of: dict[str, float]) -> float:
 
 
 def _long(
-    path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring, told: Told
+    path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring, stated: Stated
 ) -> Imported:
     place = {name.lower(): i for i, (name, _) in enumerate(header)}
     for name in ("corrector", "monitor", "x", "y", "kick"):
@@ -212,12 +212,12 @@ def _long(
     said = [f"x in {header[place['x']][1] or 'm'}, kicks in {header[place['kick']][1] or 'rad'}"]
     return _response(
         ring, {n: (angle * kicks[n], own) for n, own in columns.items()},
-        None if rf is None or rf_orbit is None else (kicks[rf], rf_orbit), said, told,
+        None if rf is None or rf_orbit is None else (kicks[rf], rf_orbit), said, stated,
     )  # fmt: skip
 
 
 def _wide(
-    path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring, told: Told
+    path: str, header: Header, rows: Sequence[Sequence[str]], ring: Ring, stated: Stated
 ) -> Imported:
     place = {name.lower(): i for i, (name, _) in enumerate(header)}
     for name in ("monitor", "plane"):
@@ -242,7 +242,7 @@ def _wide(
         f"the table is orbit per kick, in {header[-1][1] or 'm/rad'}: the steps are "
         f"unknown, and {KICK:g} rad is taken"
     ]
-    return _response(ring, columns, None, said, told)
+    return _response(ring, columns, None, said, stated)
 
 
 def _response(
@@ -250,11 +250,11 @@ def _response(
     columns: dict[str, tuple[float, dict[str, tuple[float, float]]]],
     rf: tuple[float, dict[str, tuple[float, float]]] | None,
     said: Sequence[str],
-    told: Told,
+    stated: Stated,
 ) -> Imported:
     every = dict.fromkeys(m for _, own in columns.values() for m in own)
-    of = {device: ring[told.name_of(device)].name for device in (*columns, *every)}
-    bad = [m for m in every if told.is_bad(m, of[m])]
+    of = {device: ring[stated.name_of(device)].name for device in (*columns, *every)}
+    bad = [m for m in every if stated.is_bad(m, of[m])]
     monitors = list(dict.fromkeys(of[m] for m in every if m not in bad))
     index = {name: i for i, name in enumerate(monitors)}
 

@@ -81,11 +81,11 @@ class Tracker:
             LatticeError: AT cannot track it, dies over it, or does not come back.
         """
         check_methods([element])
-        said = self._asked(pickle.dumps((element, self._energy)))
-        if len(said) == 42 * 8:
-            numbers = np.frombuffer(said, "<f8").reshape(7, 6)
+        reply = self._asked(pickle.dumps((element, self._energy)))
+        if len(reply) == 42 * 8:
+            numbers = np.frombuffer(reply, "<f8").reshape(7, 6)
             return numbers[:6], numbers[6]
-        why = said.decode("utf-8", "replace") or "its tracking does not come back"
+        why = reply.decode("utf-8", "replace") or "its tracking does not come back"
         raise LatticeError(
             f"AT cannot track the element '{element.FamName!s:.40}' ({why:.200}); correct it"
         )
@@ -110,16 +110,16 @@ class Tracker:
             child.stdin.write(struct.pack("<q", len(message)) + message)
             child.stdin.flush()
             head = child.stdout.read(8)
-            said = child.stdout.read(struct.unpack("<q", head)[0]) if len(head) == 8 else b""
+            reply = child.stdout.read(struct.unpack("<q", head)[0]) if len(head) == 8 else b""
         except BrokenPipeError:
-            said = b""
+            reply = b""
         finally:
             late.cancel()
-        if not said:
+        if not reply:
             self._child = None
             child.kill()
             child.communicate()
-        return said
+        return reply
 
 
 _CHILD = """
@@ -133,9 +133,9 @@ while len(head := source.read(8)) == 8:
         element, energy = pickle.loads(source.read(struct.unpack("<q", head)[0]))
         beam = {"energy": energy, "particle": at.Particle("relativistic")}
         kick = element.track(np.zeros(6), **beam).reshape(1, 6)
-        said = np.vstack([at.find_elem_m66(element, **beam), kick]).astype("<f8").tobytes()
+        reply = np.vstack([at.find_elem_m66(element, **beam), kick]).astype("<f8").tobytes()
     except Exception as error:
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200].encode()
-    sink.write(struct.pack("<q", len(said)) + said)
+        reply = " ".join(f"{type(error).__name__}: {error}".split())[:200].encode()
+    sink.write(struct.pack("<q", len(reply)) + reply)
     sink.flush()
 """

@@ -99,11 +99,11 @@ def need_monitors(ring: Ring) -> None:
     """
     if not ring.monitors:
         names = dict.fromkeys(e.family for e in ring.elements if e.kind == "marker")
-        mend = f", such as '{next(iter(names))}'" if names else ""
+        example = f", such as '{next(iter(names))}'" if names else ""
         raise LatticeError(
             f"'{ring.name}' has no monitor; state which of its elements are: [lattice] monitors = "
             f"['BPM*'] in tmlattice.toml (in Python: monitors='BPM*'), names of markers or "
-            f"drifts{mend}"
+            f"drifts{example}"
         )
 
 

@@ -31,13 +31,13 @@ class Assumption:
 
     Attributes:
         words: what is wrong, a clause.
-        mend: what to do about it in the data, an order.
+        correction: what to do about it in the data, an order.
         trajectory, response: what undoes it in first turns, in an orbit response; None where it
             has no meaning there.
     """
 
     words: str
-    mend: str
+    correction: str
     trajectory: Callable[[Measurement], Measurement] | None = None
     response: Callable[[OrbitResponse], OrbitResponse] | None = None
 
@@ -239,19 +239,21 @@ def _rf(data: OrbitResponse, factor: float) -> OrbitResponse:
 
 
 # --- the list -------------------------------------------------------------------------------------
-def _both(words: str, mend: str, change: Callable[..., Any], *values: Any) -> Assumption:
+def _both(words: str, correction: str, change: Callable[..., Any], *values: Any) -> Assumption:
     """Of readings, whatever they are."""
-    return Assumption(words, mend, *[lambda data: change(data, *values)] * 2)
+    return Assumption(words, correction, *[lambda data: change(data, *values)] * 2)
 
 
-def _first(words: str, mend: str, change: Callable[..., Measurement], *values: float) -> Assumption:
-    return Assumption(words, mend, lambda data: change(data, *values))
+def _first(
+    words: str, correction: str, change: Callable[..., Measurement], *values: float
+) -> Assumption:
+    return Assumption(words, correction, lambda data: change(data, *values))
 
 
 def _columns(
-    words: str, mend: str, change: Callable[..., OrbitResponse], *values: float
+    words: str, correction: str, change: Callable[..., OrbitResponse], *values: float
 ) -> Assumption:
-    return Assumption(words, mend, None, lambda data: change(data, *values))
+    return Assumption(words, correction, None, lambda data: change(data, *values))
 
 
 def _shifts() -> dict[str, Assumption]:

@@ -10,7 +10,7 @@ COLUMNS = ("monitor", "plane", "value", "shot", "turn")
 
 
 @dataclass(frozen=True)
-class Told:
+class Stated:
     """Of a file.
 
     Attributes:
