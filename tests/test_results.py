@@ -198,13 +198,20 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
     ):
         with pytest.raises(MeasurementError, match=r"diagnosis.json does not hold"):
             call()
-    (tmp_path / "diagnosis.lattice.json").unlink()
-    assert Diagnosis.load(tmp_path).report() == again.report()  # the lattice that it names
+    other = (tmp_path / "diagnosis.lattice.json").rename(tmp_path / "other.json")
+    with pytest.raises(MeasurementError, match="is Python code, which would be run"):
+        Diagnosis.load(tmp_path)
     path = tmp_path / "diagnosis.json"
     document = json.loads(path.read_text())
-    moved = document["provenance"] | {"lattice": "away.py"}
-    path.write_text(json.dumps(document | {"provenance": moved}))
-    with pytest.raises(MeasurementError, match=r"needs its lattice 'away.py'.*give the lattice"):
+
+    def names(lattice):
+        moved = document["provenance"] | {"lattice": lattice}
+        path.write_text(json.dumps(document | {"provenance": moved}))
+
+    names(str(other))
+    assert Diagnosis.load(tmp_path).verdict == again.verdict
+    names("away.json")
+    with pytest.raises(MeasurementError, match=r"needs its lattice 'away.json'.*give the lattice"):
         Diagnosis.load(tmp_path)
     assert Diagnosis.load(tmp_path, SMALL_RING()).verdict == "identified"
     with pytest.raises(MeasurementError, match="has no element 'QD::5'"):
