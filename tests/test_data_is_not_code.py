@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import pickle
 import shutil
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
@@ -12,17 +13,20 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+import torch
 from at_ring import at_lattice
 from command import tmlattice
 from test_lattice_files import madx, write
 from test_other_codes import ELEGANT
 
-from tmlattice import load_ring
+from tmlattice import Diagnosis, load_ring, read_measurement
 from tmlattice.challenge import make, run
+from tmlattice.correction.knobs import read_knobs
 from tmlattice.errors import LatticeError, TmlatticeError, harmless
 from tmlattice.importers.columns import read_columns
 from tmlattice.input_files import check_shape, content_of, json_of, yaml_of
 from tmlattice.lattice.mat_file import read_mat
+from tmlattice.machine_file import load_machine_file
 from tmlattice.network import TaylorNetwork
 from tmlattice.network.stored import load_network, save_network
 from tmlattice.report.interactive import as_plain
@@ -218,6 +222,36 @@ def test_archives_of_arrays_are_not_compressed(tmp_path, small_ring):
             other.writestr(name, whole.read(name))
     with pytest.raises(TmlatticeError, match="compressed archive"):
         load_network(small_ring, tmp_path / "b.pt")
+
+
+class Evil:
+    """Makes a folder where it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("MARK",)
+
+
+def test_pickles_are_read_from_no_file(tmp_path, monkeypatch, small_ring):
+    """Bare, or as torch and NumPy pack them, whatever the file is called."""
+    monkeypatch.chdir(tmp_path)
+    torch.save({"state": Evil()}, "packed.pt")
+    np.savez("packed.npz", x=np.array([Evil()], dtype=object))
+    readers = {
+        ".json": [load_ring, Diagnosis.load, read_measurement], ".toml": [load_machine_file],
+        ".mat": [load_ring, read_mat], ".m": [load_ring], ".repr": [load_ring],
+        ".h5": [read_columns], ".sdds": [read_columns], ".csv": [read_columns],
+        ".yaml": [lambda path: read_knobs(path, small_ring)],
+        ".pt": [lambda path: load_network(small_ring, path)],
+    }  # fmt: skip
+    for content in (pickle.dumps(Evil()), Path("packed.pt").read_bytes(),
+                    Path("packed.npz").read_bytes()):  # fmt: skip
+        for suffix, some in readers.items():
+            path = tmp_path / f"a{suffix}"
+            path.write_bytes(content)
+            for read in some:
+                with pytest.raises(TmlatticeError):
+                    read(path)
+    assert not Path("MARK").exists()
 
 
 def test_what_a_file_says_is_shown_without_control_characters_and_escaped():

@@ -52,7 +52,7 @@ def same(brought, data):
 
 
 @pytest.mark.parametrize(
-    ("header", "scale", "told"),
+    ("header", "scale", "stated"),
     [
         (lambda m, p: f"{m} {p} [mm]", 1e3, "in mm, as the file states"),
         (lambda m, p: f"{m}_{p}_um", 1e6, "in um, as the file states"),

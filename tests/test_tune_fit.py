@@ -120,4 +120,4 @@ def test_one_method_alone_takes_its_own_options(small_ring):
     assert [m.method for m in outcome.methods] == ["known"]
     assert set(outcome.best.named) == {"QD::5"}
     assert outcome.fit.options["candidates"] == ["QD::5", "QD::6"]
-    assert outcome.advice.startswith("Trust told")
+    assert outcome.advice.startswith("Trust known")

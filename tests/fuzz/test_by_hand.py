@@ -229,7 +229,7 @@ WIDE = (
 def test_a_reading_that_no_pipe_has_room_for_is_rejected_by_name(folder):
     for value in ("-1e300", "1e9", "inf"):
         (folder / "a.csv").write_text(WIDE.format(value))
-        done = tmlattice("diagnose", "ring.json", "a.csv", cwd=folder, check=0)
+        done = tmlattice("check", "ring.json", "a.csv", cwd=folder)
         assert "rejected readings, above 0.2 m: 1, of 'm::1'" in done.stdout
     (folder / "a.csv").write_text(WIDE.format("1").replace("0.", "900."))
     assert "most readings are above 0.2 m" in told(tmlattice("check", "ring.json", "a.csv",
@@ -270,9 +270,9 @@ def test_a_table_that_never_ends_is_not_read(folder, place, sealed):
 
 
 def test_deep_json_ends_in_its_own_sentence(folder):
+    edited(folder / "own.json", lambda d: d.update(extra=0))
+    text = (folder / "own.json").read_text()
     for depth in (150, 960, 100_000):
-        edited(folder / "own.json", lambda d: d.update(extra=0))
-        text = (folder / "own.json").read_text()
         deep = "[" * depth + "]" * depth
         (folder / "own.json").write_text(text.replace('"extra": 0', f'"extra": {deep}'))
         done = tmlattice("info", "own.json", cwd=folder, check=2)
