@@ -4,7 +4,8 @@
 
 Each machine has all usual errors of the catalogue, and quadrupoles displaced by `--offset` rms, m.
 Machines whose beam completes the first turn are not counted. Six shots are read as far as the beam
-gets, diagnosed, and corrected with the target `first_turn`; then again, `--rounds` times at most.
+gets, diagnosed, and corrected with the target `first_turn`; then again from the estimated ring,
+`--rounds` times at most.
 The oracle knows all errors. A beam circulates if it is launched on the axis and read on 20 turns.
 """
 
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from tmlattice import correct, diagnose, load_ring
+from tmlattice.correction.estimate import estimate_of
 from tmlattice.effects import Cause, RingEffect, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.machine.at_engine import AtEngine
@@ -52,11 +54,13 @@ def case(ring, seed, options):
     best = correct(apply(ring, on_ring), goal=ring, targets=TARGET)
     found = {"seed": seed, "before": before, "rounds": [],
              "oracle": turns(set_to(ring, best), on_ring)}  # fmt: skip
-    now = ring
+    now = model = ring  # with the kicks that were set; and with the errors that were estimated
     for shift in range(options.rounds):
-        data = simulate(now, causes, seed=1000 * seed + shift).measurement()
         try:
-            now = set_to(now, correct(diagnose(now, data), goal=ring, targets=TARGET))
+            data = simulate(now, causes, seed=1000 * seed + shift).measurement()
+            estimate = estimate_of(diagnose(model, data))
+            own = correct(estimate, goal=ring, targets=TARGET)
+            now, model = set_to(now, own), set_to(estimate.ring, own)
         except TmlatticeError as error:
             found["stopped"] = str(error)
             break
