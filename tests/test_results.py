@@ -198,18 +198,6 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
     ):
         with pytest.raises(MeasurementError, match=r"diagnosis.json does not hold"):
             call()
-<<<<<<< HEAD
-    (tmp_path / "diagnosis.lattice.json").unlink()
-    with pytest.raises(
-        MeasurementError, match=r"small_ring\.py' is Python code, which would be run"
-    ):
-        Diagnosis.load(tmp_path)
-    path = tmp_path / "diagnosis.json"
-    document = json.loads(path.read_text())
-    moved = document["provenance"] | {"lattice": "away.mat"}
-    path.write_text(json.dumps(document | {"provenance": moved}))
-    with pytest.raises(MeasurementError, match=r"needs its lattice 'away.mat'.*give the lattice"):
-=======
     other = (tmp_path / "diagnosis.lattice.json").rename(tmp_path / "other.json")
     with pytest.raises(MeasurementError, match="is Python code, which would be run"):
         Diagnosis.load(tmp_path)
@@ -224,7 +212,6 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
     assert Diagnosis.load(tmp_path).verdict == again.verdict
     names("away.json")
     with pytest.raises(MeasurementError, match=r"needs its lattice 'away.json'.*give the lattice"):
->>>>>>> fuzz
         Diagnosis.load(tmp_path)
     assert Diagnosis.load(tmp_path, SMALL_RING()).verdict == "identified"
     with pytest.raises(MeasurementError, match="has no element 'QD::5'"):
