@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -267,6 +268,15 @@ def test_a_table_that_never_ends_is_not_read(folder, place, sealed):
         folder / "ring.json", [folder / "turns"], folder / "B", jobs=1, progress=False
     )
     assert "readings.csv" in json.loads(files["turns"].read_text())["error"]
+
+
+def test_streams_that_are_closed_take_no_file_s_place(folder):
+    command = f"'{sys.executable}' -P -m tmlattice simulate ring.json --shots 2 --out"
+    for number, closed in enumerate((">&-", "2>&-", "<&-", "<&- >&- 2>&-")):
+        words = ["sh", "-c", f"{command} D{number} {closed}"]
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+        assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+        assert (folder / f"D{number}/readings.csv").read_text().startswith("shot,")
 
 
 def test_deep_json_ends_in_its_own_sentence(folder):
