@@ -28,8 +28,7 @@ GPU = (
      "torch loop, training step 100000"),
     ("the same with the symplectic penalty", "training step 100000, with penalty", None),
 )  # fmt: skip
-OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling", "square")
-CORRECTED = ("before", "tmlattice", "oracle", "svd", "loco")
+OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling")
 BLIND = {"tool": "`diagnose`", "oracle": "oracle", "omp": "matching pursuit", "lasso": "LASSO",
          "svd_gradients": "SVD, gradients"}  # fmt: skip
 BANDS = {"above 20": "20 and more", "10-20": "10 to 20", "5-10": "5 to 10"}
@@ -44,11 +43,30 @@ def of_gpu(stored):
 
 
 def of_corrections(machines):
-    """Medians over the machines of `correct.py`."""
-    yield ["quantity", *(m.upper() if m in ("svd", "loco") else m for m in CORRECTED)]
-    for key in OPTICS:
-        own = [[np.sqrt(np.mean(np.square(one[m][key]))) for one in machines] for m in CORRECTED]
-        yield [key.replace("_", " "), *(f"{np.median(values):.3g}" for values in own)]
+    """Each study of `correct.py`: sums of squares in tolerances, medians over its machines."""
+    yield ["study", "machines", "before", "after", "oracle", "SVD", "LOCO",
+           "rms over the oracle's, median (worst)", "not worse than before", "68 % intervals: now",
+           "expected"]  # fmt: skip
+    for study in sorted({tuple(one["study"]) for one in machines}):
+        own = [one for one in machines if tuple(one["study"]) == study]
+        square = {m: np.array([one[m]["square"] for one in own if m in one])
+                  for m in ("before", "tmlattice", "oracle", "svd", "loco")}  # fmt: skip
+        ratio = np.sqrt(square["tmlattice"] / square["oracle"])
+        hold = [
+            np.mean([
+                low <= value <= high
+                for one in own for name in OPTICS
+                for (_, low, high), value in zip(one[when][name], one[true][name], strict=True)
+            ])
+            for when, true in (("now", "before"), ("expected", "tmlattice"))
+        ]  # fmt: skip
+        yield [
+            ", ".join(study).replace("_", " "), str(len(own)),
+            *(f"{np.median(v):.3g}" if len(v) == len(own) else "" for v in square.values()),
+            f"{np.median(ratio):.3f} ({ratio.max():.3f})",
+            str(np.sum(square["tmlattice"] <= square["before"])),
+            *(f"{100 * share:.0f} %" for share in hold),
+        ]  # fmt: skip
 
 
 def of_score(scored):
@@ -63,7 +81,11 @@ def of_score(scored):
             yield [text, *(f"{100 * found[name][rate]['share']:.1f} %" for name in BLIND)]
 
 
-SOURCES = {"gpu_raw.json": of_gpu, "correct.jsonl": of_corrections, "blind_score.json": of_score}
+SOURCES = {
+    "gpu_raw.json": of_gpu,
+    "correct_studies.jsonl": of_corrections,
+    "blind_score.json": of_score,
+}
 
 
 def filled(text):
