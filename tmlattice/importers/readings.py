@@ -171,8 +171,8 @@ def _without_large(path: str, readings: Array, names: Sequence[str]) -> list[str
             "(`unit` in [data] of tmlattice.toml)"
         )
     readings[large] = np.nan
-    of = [name for name, some in zip(names, large.any(axis=(0, 1, 3)), strict=True) if some]
-    return [f"rejected readings, above {LARGEST_READING} m: {count}, of {counted(of)}"]
+    of = counted([names[i] for i in np.unique(np.argwhere(large)[:, 2])])
+    return [f"rejected readings, above {LARGEST_READING} m: {count}, of {of}"]
 
 
 Found = tuple[list[str], list[int], list[Place], Array, list[str]]
