@@ -179,12 +179,8 @@ def _without_large(path: str, readings: Array, names: Sequence[str]) -> list[str
             "(`unit` in [data] of tmlattice.toml)"
         )
     readings[large] = np.nan
-    of = [
-        name
-        for name, some in zip(names, np.any(large, axis=(0, 1, 3)).tolist(), strict=True)
-        if some
-    ]
-    return [f"rejected readings, above {LARGEST_READING} m: {count}, of {counted(of)}"]
+    of = counted([names[i] for i in np.unique(np.argwhere(large)[:, 2])])
+    return [f"rejected readings, above {LARGEST_READING} m: {count}, of {of}"]
 
 
 def _fill(values: Array) -> float | None:
