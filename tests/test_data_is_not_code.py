@@ -1,10 +1,12 @@
 """Files that would run something: each carries a harmless mark, which must not appear."""
 
+import ast
 import contextlib
 import json
 import os
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
 
@@ -21,7 +23,8 @@ from test_other_codes import ELEGANT
 
 from tmlattice import Diagnosis, load_ring, read_measurement
 from tmlattice.challenge import make, run
-from tmlattice.correction.knobs import read_knobs
+from tmlattice.correction.knobs import default_knobs, read_knobs
+from tmlattice.correction.snippets import snippet
 from tmlattice.errors import LatticeError, TmlatticeError, harmless
 from tmlattice.importers.columns import read_columns
 from tmlattice.input_files import check_shape, content_of, json_of, yaml_of
@@ -222,6 +225,24 @@ def test_archives_of_arrays_are_not_compressed(tmp_path, small_ring):
             other.writestr(name, whole.read(name))
     with pytest.raises(TmlatticeError, match="compressed archive"):
         load_network(small_ring, tmp_path / "b.pt")
+
+
+@pytest.mark.parametrize("name", ["q'): pass\nopen('MARK', 'w')\n#", 'q;system,"touch MARK";'])
+def test_statements_of_settings_run_nothing_that_a_name_holds(tmp_path, monkeypatch, name):
+    """`settings.at.py`, `.madx` and `.ele` are code, which the user runs."""
+    monkeypatch.chdir(tmp_path)
+    ring = load_ring(write(tmp_path, "ring.seq", madx(BEAM)))
+    family = next(e.family for e in ring.elements if e.kind == "quadrupole")
+    evil = replace(ring, elements=tuple(
+        replace(e, family=name) if e.family == family else e for e in ring.elements
+    ))  # fmt: skip
+    changes = [(knob, 0.01) for knob in default_knobs(evil, ["quadrupoles"])]
+    called = [node.args[0] for node in ast.walk(ast.parse(snippet(evil, changes, "at")))
+              if isinstance(node, ast.Call)]  # fmt: skip
+    assert name in [ast.literal_eval(argument) for argument in called]
+    for code in ("madx", "elegant"):
+        lines = snippet(evil, changes, code).splitlines()
+        assert all(line.startswith("!") for line in lines if "MARK" in line)
 
 
 class Evil:

@@ -279,6 +279,12 @@ def test_streams_that_are_closed_take_no_file_s_place(folder):
         assert (folder / f"D{number}/readings.csv").read_text().startswith("shot,")
 
 
+@pytest.mark.parametrize("suffix", ["json", "mat", "m", "repr", "tfs", "seq", "lte"])
+def test_a_lattice_that_never_ends_is_not_read(tmp_path, suffix):
+    (tmp_path / f"a.{suffix}").symlink_to("/proc/kmsg")
+    assert "is empty" in told(tmlattice("info", f"a.{suffix}", cwd=tmp_path))
+
+
 def test_deep_json_ends_in_its_own_sentence(folder):
     edited(folder / "own.json", lambda d: d.update(extra=0))
     text = (folder / "own.json").read_text()

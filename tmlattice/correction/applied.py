@@ -5,6 +5,7 @@
 """
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,10 +50,15 @@ def read_settings(path: Path) -> dict[str, tuple[float, float]]:
     Raises:
         MeasurementError: a table that cannot be read.
     """
-    found = {}
+    found: dict[str, tuple[float, float]] = {}
     for row in csv.DictReader(text_of(path, MeasurementError).splitlines()):
         try:
-            found[str(row["device"])] = float(row["present"]), float(row["new"])
+            device, *numbers = row["device"], float(row["present"]), float(row["new"])
+            if device in found:
+                raise MeasurementError(f"{path}: the device '{plain(device, 40)}' occurs twice")
+            if not all(map(math.isfinite, numbers)):
+                raise ValueError
+            found[device] = numbers[0], numbers[1]
         except (KeyError, TypeError, ValueError):
             raise MeasurementError(
                 f"{path}: a row has no device, present or new; give the settings.csv of a "

@@ -5,11 +5,16 @@ MAD-X an occurrence has the name that `write_ring` gives it: `qd..12` for `qd::1
 """
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from tmlattice.correction.knobs import KINDS, Knob
+from tmlattice.errors import plain
 from tmlattice.lattice import Element, Ring
+
+_LEGAL = re.compile(r"[A-Za-z_][A-Za-z0-9_.$:+/-]*")
+"""Of names that MAD-X and elegant take as they are."""
 
 
 class New(NamedTuple):
@@ -32,13 +37,16 @@ def snippet(ring: Ring, changes: Sequence[tuple[Knob, float]], code: str) -> str
     lines = []
     for knob, amount in changes:
         if not knob.members:
-            lines.append(f"{comment} {knob.name}: relative change {amount:.9g}")
+            lines.append(f"{comment} {plain(knob.name)}: relative change {amount:.9g}")
             continue
         new = [_new(ring[member], knob, amount) for member in knob.members]
         families: dict[str, list[New]] = {}
         for one in new:
             families.setdefault(one.element.family, []).append(one)
         for family, own in families.items():
+            if code != "at" and not _LEGAL.fullmatch(family):  # a name may hold statements
+                lines.append(f"{comment} {plain(family)}: no name of this code; set it by hand")
+                continue
             every = [e for e in ring.elements if e.family == family]
             if len(every) == len(own) and len({one.value for one in own}) == 1:
                 lines.append(statement(own[0], None))
@@ -66,7 +74,7 @@ def _madx(new: New, place: int | None) -> str:
 
 
 def _at(new: New, place: int | None) -> str:
-    index = f"ring.get_uint32_index('{new.element.family}')"
+    index = f"ring.get_uint32_index({new.element.family!a})"
     which = index if place is None else f"{index}[{place}:{place + 1}]"
     plane = int(new.element.kind == "vcorrector")
     set_to = {
@@ -80,7 +88,7 @@ def _at(new: New, place: int | None) -> str:
 
 def _elegant(new: New, place: int | None) -> str:
     if new.attribute == "k1s":
-        return f"! {new.element.name}: skew gradient {new.value:.12g} 1/m2"
+        return f"! {plain(new.element.name)}: skew gradient {new.value:.12g} 1/m2"
     where = "" if place is None else f", start_occurence={place + 1}, end_occurence={place + 1}"
     return (
         f"&alter_elements name={new.element.family.upper()}, item={new.attribute.upper()}, "

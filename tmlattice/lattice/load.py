@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.input_files import check_regular
 from tmlattice.lattice import stored
 from tmlattice.lattice.checks import check_ring, reading
 from tmlattice.lattice.marked import marked
@@ -93,6 +94,8 @@ def _loaded(lattice: Any, sequence: str | None, energy: float | None) -> Ring:
 
 
 def _of_file(path: Path, name: str, sequence: str | None, energy: float | None) -> Ring:
+    if not check_regular(path, LatticeError):  # nothing is waited for, as of /proc/kmsg
+        raise LatticeError(f"'{name}' is empty; give a lattice file")
     key = stored.key_of(path, sequence, energy)
     kept = stored.load(key, name) if key else None
     if kept is not None:

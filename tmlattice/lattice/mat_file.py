@@ -36,7 +36,10 @@ def read_apart(
         error: no such file; the reader refuses it, fails, dies, or takes more time or memory than
             such a file can take.
     """
-    seconds = SECONDS + int(check_regular(path, error) / RATE)
+    size = check_regular(path, error)
+    if not size:  # nothing is waited for, as of /proc/kmsg
+        raise error(f"'{path}' is empty; save it again")
+    seconds = SECONDS + int(size / RATE)
     # absolute: the child reads a file, never an option; -P: nothing of the working directory
     command = [sys.executable, "-P", binary_files.__file__]
     given = pickle.dumps((kind, str(path.absolute()), seconds, arguments))
