@@ -556,21 +556,6 @@ def test_momentum_of_at_and_ocelot():
     assert abs(state[4] / p - 1) > 1e-3
 
 
-def test_thousands_of_causes_are_built_at_once(petra3, rng):
-    import time
-
-    causes = [
-        Cause(name, place, float(1e-4 * rng.standard_normal()))
-        for name, effect in CATALOGUE.items()
-        if effect.group == "quadrupoles"
-        for place in effect.places(petra3)
-    ]
-    assert len(causes) > 2400
-    begun = time.perf_counter()
-    AtEngine(petra3, causes)
-    assert time.perf_counter() - begun < 2  # 0.15 s were measured
-
-
 def test_effects_on_readings_and_beam_are_the_callers(small_ring):
     causes = [
         Cause(name, effect.places(small_ring)[0], 1.0)

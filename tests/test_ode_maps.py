@@ -1,6 +1,5 @@
 """Maps of polynomial equations, against closed solutions, expm and a tight numerical solver."""
 
-import time
 import tracemalloc
 
 import numpy as np
@@ -149,17 +148,14 @@ def test_the_two_solvers_agree():
 
 
 @pytest.mark.parametrize(("n", "order"), [(2, 10), (6, 4)])
-def test_high_order_and_dimension_against_the_solver_within_seconds_and_megabytes(n, order):
+def test_high_order_and_dimension_against_the_solver_within_megabytes(n, order):
     terms = random_terms(n, n, 2, constant=0.2)
     tracemalloc.start()
-    begin = time.perf_counter()
     m = taylor_map_of_ode(terms, order, 0.5)
-    seconds = time.perf_counter() - begin
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     x = 0.02 * np.random.default_rng(1).normal(size=n)
     np.testing.assert_allclose(m(x), solution(terms, x, 0.5), atol=1e-8 if n == 6 else 1e-12)
-    assert seconds < 10  # measured 0.01 to 0.2
     assert peak < 50e6  # measured 3
 
 
