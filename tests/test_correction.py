@@ -338,6 +338,7 @@ def test_on_the_command_line(small_ring, wrong, quadrupoles, tmp_path):
                            str(tmp_path / "out")])  # fmt: skip
     assert done.exit_code == 0, done.output
     assert "the beta beating in" in done.output
+    assert "e-1" not in done.output  # rounding of an uncoupled ring is 0
     document = json.loads((tmp_path / "out" / "correction.json").read_text())
     assert document["targets"]["beta_beating"] == 0.02
     rows = list(csv.DictReader((tmp_path / "out" / "settings.csv").open()))

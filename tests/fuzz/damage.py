@@ -327,7 +327,7 @@ def _damage_object(rng, file, name):
             other = file[every[int(rng.integers(len(every)))]].ref
             value.flat[int(rng.integers(value.size))] = other
         item[()] = value
-    elif data and item.dtype.kind in "fiu" and item.shape:
+    elif data and item.dtype.kind in "fiu" and item.shape and item.size < 1e6:
         value = np.asarray(_damaged_numbers(rng, item[()]))
         value = value.astype("S") if value.dtype.kind == "U" else value
         del group[own]

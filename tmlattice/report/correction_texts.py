@@ -6,6 +6,8 @@ from tmlattice.report.text import columns, wrapped
 
 MOST = 20
 """Devices that are listed; the table has all."""
+ROUNDING = 1e-6
+"""Share of a tolerance below which an error is shown as 0: rounding of the optics."""
 
 
 def setting_rows(correction: Correction) -> list[list[str]]:
@@ -41,8 +43,9 @@ def expected_rows(correction: Correction) -> list[list[str]]:
 
 
 def amount(name: str, value: float) -> str:
-    """An error of a target with its unit."""
+    """An error of a target with its unit; 0 for what is rounding of its tolerance."""
     unit = TARGETS[name].unit
+    value = 0.0 if value < ROUNDING * TARGETS[name].tolerance else value
     if unit == "relative":
         return f"{100 * value:.3g} %"
     if unit == "m":
