@@ -298,6 +298,24 @@ def test_a_constant_behind_a_lost_beam_is_left_to_the_check_of_lost_beams(
     assert beam_lost(own).first.tolist() == 3 * [count // 2]
 
 
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_a_number_that_no_beam_gives_is_no_reading_wherever_the_beam_was_lost(
+    small_ring, data, tmp_path, share
+):
+    """Most readings were -999 mm, and the message asked for the unit, which the file states."""
+    ordered = data.in_order_of([m.name for m in small_ring.monitors])
+    count = len(ordered.monitors)
+    first = int(share * count)
+    text = long(ordered, edit=lambda k, text: "-999" if k % count >= first else text)
+    (tmp_path / "a.csv").write_text(text)
+    brought = bring_in([tmp_path / "a.csv"], Options(ring=small_ring))
+    assert any("are 999, far above all others" in said for said in brought.assumed)
+    expected = ordered.readings.copy()
+    expected[:, :, first:] = np.nan
+    own = brought.measurement.select(monitors=ordered.monitors).readings
+    np.testing.assert_allclose(own, expected, rtol=1e-6, atol=1e-12)
+
+
 def test_columns_that_are_not_read_are_named(small_ring, data, tmp_path):
     rows = long(data).splitlines()
     rows = [f"{rows[0]},status,Σ", *(f"{row},BAD,1000" for row in rows[1:])]

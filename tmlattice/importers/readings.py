@@ -127,7 +127,7 @@ def bring_readings(
         both[where] = value * factor
         filled[where] = abs(value) == fill
     readings, silent = both[..., :SUM], no_beam(both[..., SUM])
-    missing = _scattered(readings, filled[..., :SUM], fill)
+    missing = _taken_out(readings, filled[..., :SUM], fill)
     before = np.isfinite(readings).any(axis=3)
     readings[silent] = np.nan
     said_of_large = _without_large(path, readings, names)
@@ -191,13 +191,13 @@ def _fill(values: Array) -> float | None:
     return float(own[-1]) if often else None
 
 
-def _scattered(readings: Array, filled: NDArray[np.bool_], fill: float | None) -> list[str]:
-    """Take that number for no reading where others follow it in its shot: else the beam was lost
-    there. A sentence about it."""
+def _taken_out(readings: Array, filled: NDArray[np.bool_], fill: float | None) -> list[str]:
+    """Take that number for no reading where no beam can be, or where others follow it in its shot;
+    else the beam was lost there, as `check` states. A sentence about it."""
     own = filled.any(axis=3).reshape(len(filled), -1)
     other = np.isfinite(readings).any(axis=3).reshape(len(filled), -1) & ~own
     behind = [o.any() and t[o.argmax() :].any() for o, t in zip(own, other, strict=True)]
-    if not any(behind):
+    if not any(behind) and not (np.abs(readings[filled]) > LARGEST_READING).any():
         return []
     readings[filled] = np.nan
     return [f"{filled.sum()} readings are {fill:g}, far above all others: taken as missing"]

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.assessment import combined_p_value
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
 from tmlattice.diagnosis.families.family import StatedCause
@@ -44,7 +43,6 @@ from tmlattice.diagnosis.response.misplaced import Misplaced, misplaced
 from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.outlier_readings import outlier_readings, without_gross
 from tmlattice.diagnosis.response.outlier_steps import beside
-from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_chi2, fit_steps
@@ -279,7 +277,6 @@ def as_diagnosis(
     noise_x, noise_y = np.sqrt(np.mean(data.noise[good] ** 2, axis=0)).tolist()
     causes = tuple(cause for cause, _ in found)
     corrected = apply(ring, within)
-    blocks = remainder(fit.state)
     errors = tuple(sigma for _, sigma in found)
     named = [(finding.effect or "", finding.element) for finding in fields["findings"]]
     return Diagnosis(
@@ -287,9 +284,9 @@ def as_diagnosis(
         fit_after=_misfit(fit, fit.state.at.read),
         heldout=_gap(fit),
         heldout_shots=(),
-        compared=blocks,
+        compared=fit.blocks,
         unexplained={
-            "p_value": combined_p_value(blocks),
+            "p_value": fit.p_value,
             "places": [],
             "patterns": _patterns(fit),
         },

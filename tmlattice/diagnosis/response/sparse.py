@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.assessment import combined_p_value
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
-from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import Step, StepwiseFit
@@ -77,7 +75,6 @@ class SparseFit:
         verdict: the least certain of theirs.
         fitted_causes: the causes with their errors.
         messages: about the findings.
-        p_value: of the residual, over its blocks.
         noise: whether the residual is noise of the stated size, neither more nor less, in each of
             its blocks.
     """
@@ -87,7 +84,6 @@ class SparseFit:
     verdict: str
     fitted_causes: list[StatedCause]
     messages: tuple[str, ...]
-    p_value: float
     noise: bool
 
 
@@ -161,7 +157,7 @@ def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bo
     """Return whether the hierarchical fit explains more than the sparse solution: it alone leaves
     noise, or it predicts held-out readings better, at the BPMs that it does not reject, in the
     planes that were read."""
-    if sparse.p_value < judgement.noise[0] <= combined_p_value(remainder(fit.state)):
+    if sparse.fit.p_value < judgement.noise[0] <= fit.p_value:
         return True
     state = sparse.fit.state
     of_all = fit.heldout[1]
@@ -324,8 +320,5 @@ def _result(
     stepwise = StepwiseFit(design, state, tuple(steps), (), heldout)
     fitted_causes = list(zip(causes, errors, strict=True))
     expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
-    left = combined_p_value(remainder(state))
-    return SparseFit(
-        stepwise, findings[:most], verdict, fitted_causes, messages, left,
-        noise=expected and left >= judgement.noise[0],
-    )  # fmt: skip
+    noise = expected and stepwise.p_value >= judgement.noise[0]
+    return SparseFit(stepwise, findings[:most], verdict, fitted_causes, messages, noise)

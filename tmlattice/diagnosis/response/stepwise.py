@@ -10,17 +10,20 @@ gradients move the tunes.
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.diagnosis.assessment import Block, combined_p_value
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.outlier_readings import robust
 from tmlattice.diagnosis.response.outlier_steps import beside, outlier_steps
+from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others
 from tmlattice.diagnosis.response.rounds import Evidence, evidence_of, linear_evidence, settle
 from tmlattice.diagnosis.response.set_aside import taken_back
@@ -140,6 +143,16 @@ class StepwiseFit:
     rejected_steps: tuple[Step, ...]
     heldout: tuple[Score, Score]
     messages: tuple[str, ...] = ()
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """The residual, compared with its expected covariance."""
+        return remainder(self.state)
+
+    @property
+    def p_value(self) -> float:
+        """Of the residual, over its blocks."""
+        return combined_p_value(self.blocks)
 
 
 def fit_steps(
