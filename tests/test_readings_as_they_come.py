@@ -274,6 +274,12 @@ def test_headers_of_control_systems(small_ring, data, tmp_path, header, above, s
     same(bring_in([path], Options(ring=small_ring)), data)
 
 
+def test_blanks_and_decimal_commas(small_ring, data, tmp_path):
+    text = long(data, "shot BPM x[mm] y[mm]", " ", edit=lambda _, text: text.replace(".", ","))
+    (tmp_path / "a.txt").write_text(text)
+    same(bring_in([tmp_path / "a.txt"], Options(ring=small_ring)), data)
+
+
 def test_numbers_and_words_that_stand_for_no_reading_are_missing(small_ring, data, tmp_path):
     words = {7: "N/A", 20: "--", 33: "-999", 41: "-999", 50: "-999"}
     path = tmp_path / "a.csv"

@@ -24,6 +24,8 @@ _BRACKETS = re.compile(r"^\s*(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 _TAIL = re.compile(r"^\s*(?P<name>.*?)[\s_/,]+(?P<unit>mm|um|µm|nm)\s*$", re.IGNORECASE)
 _COMMENT = "#%!@$"
 """What lines begin with that hold no readings: of scripts, MATLAB, MAD-X and its tables."""
+_DECIMAL = re.compile(r"^([+-]?\d*),(\d+)")
+"""A number with a decimal comma."""
 _UNITS = {"mm", "um", "µm", "nm", "m", "", "-"}
 
 _POSITION = re.compile(r"(?:^|[^a-z])(?:x|y|hor\w*|ver\w*)(?:[^a-z]|$)", re.IGNORECASE)
@@ -156,11 +158,12 @@ def _csv(path: Path) -> list[Column]:
     if not lines:
         raise MeasurementError(f"{path}: the file is empty; write its header first")
     last = lines[-1][1]
-    separator = next((sign for sign in ";\t," if sign in last), " ")
-    blanks = separator == " "
+    commas = [field for field in last.split() if "," in field]
+    decimal = len(last.split()) > 1 and all(map(_DECIMAL.match, commas))
+    separator = next((sign for sign in ";\t" if sign in last), " " if decimal else ",")
 
     def cut(line: str) -> list[str]:
-        if blanks:
+        if separator == " ":
             return re.sub(r"\s+([\[(])", r"\1", line.lstrip("* ")).split()
         try:
             fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
@@ -187,8 +190,8 @@ def _csv(path: Path) -> list[Column]:
             raise MeasurementError(
                 f"{path}, line {line}: {len(row)} fields where the header has {len(header)}"
             )
-    if not blanks and separator != ",":  # a decimal comma
-        rows = [(i, [re.sub(r"^([+-]?\d*),(\d+)", r"\1.\2", f) for f in row]) for i, row in rows]
+    if separator != ",":
+        rows = [(i, [_DECIMAL.sub(r"\1.\2", field) for field in row]) for i, row in rows]
     return [Column(*named(name), [row[i] for _, row in rows]) for i, name in enumerate(header)]
 
 
