@@ -120,7 +120,7 @@ def test_run_needs_no_truth_and_score_does(made, tmp_path):
     assert not result["failed"]
     schema = resources.files("tmlattice") / "schemas" / "challenge.schema.json"
     jsonschema.validate(json.loads(json.dumps(result)), json.loads(schema.read_text()))
-    methods = {"tool", "oracle", "omp", "lasso", "svd_gradients"}
+    methods = {"tool", "oracle", "omp", "lasso", "svd_gradients", "weight_change"}
     assert methods <= set(result["rows"][0]["answers"])
 
 
@@ -154,7 +154,10 @@ def test_the_oracle_of_several_causes_is_given_the_others(tmp_path):
 
 def test_plain_methods_name_three_and_no_more(made):
     guesses = baselines(read_case(made, "0000"))
-    assert set(guesses) == {"svd_gradients", "omp", "lasso"}
+    assert set(guesses) == {"svd_gradients", "omp", "lasso", "weight_change"}
+    layers = {magnet.name for magnet in ring_of(LATTICE).magnets}
+    assert len({guess["element"] for guess in guesses["weight_change"]}) == 3
+    assert {guess["element"] for guess in guesses["weight_change"]} <= layers
     assert all(len(found) <= 3 for found in guesses.values())
 
 

@@ -326,7 +326,8 @@ def fields(part: Part) -> NDArray[np.complex128]:
 def strengths(part: Part) -> NDArray[np.complex128]:
     """`fields` over n!, as AT has them."""
     total = fields(part)
-    return total / np.array([math.factorial(n) for n in range(len(total))], dtype=float)
+    total /= np.array([math.factorial(n) for n in range(len(total))], dtype=float)
+    return total
 
 
 def _places(part: Part, ring: Ring, charge: float, report: Report) -> list[Place]:

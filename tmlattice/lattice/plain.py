@@ -73,7 +73,7 @@ def part_of(element: Element) -> Part | None:
     source, length = element.source, element.length
     keyword, values = "drift" if length else "marker", dict[str, Any]()
 
-    def own(names: str) -> dict[str, float]:
+    def own(names: str) -> dict[str, Any]:
         return {name: float(getattr(source, name)) for name in names.split()}
 
     if element.kind == "monitor":
