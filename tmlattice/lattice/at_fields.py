@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.errors import LatticeError
 from tmlattice.lattice.places import RADIUS, Place, halves
 from tmlattice.lattice.ring import Kind
 
@@ -120,20 +121,28 @@ def straight_magnet(
 def thin(
     element: Any, family: str, mad: str, roll: float, left_out: Counter[str]
 ) -> tuple[Kind, Any]:
-    """A thin multipole, of integrated fields."""
+    """A thin multipole, of integrated fields; it may bend the design orbit.
+
+    Raises:
+        LatticeError: it bends in y.
+    """
     strengths = strengths_of(element)
     if np.any(strengths[3:]):
         left_out["thin multipoles above the sextupole"] += 1
-    return "multipole", _combined(strengths, 0.0, roll, family)
+    angle = np.append(np.ravel(getattr(element, "BendingAngle", 0.0)), 0.0)
+    if angle[1]:
+        raise LatticeError(f"the thin multipole '{family}' bends in y, which is not modelled")
+    return "multipole", _combined(strengths, 0.0, roll, family, float(angle[0]))
 
 
-def _combined(strengths: Any, length: float, roll: float, family: str) -> Any:
+def _combined(strengths: Any, length: float, roll: float, family: str, angle: float = 0.0) -> Any:
     from tmlattice.lattice.combined import CombinedMultipole
 
     k = [complex(strength) * math.factorial(n) for n, strength in enumerate(strengths[:3])]
     return CombinedMultipole(
         l=length,
         k0=k[0].real, k0s=k[0].imag, k1=k[1].real, k1s=k[1].imag, k2=k[2].real, k2s=k[2].imag,
+        angle=angle,
         tilt=roll,
         eid=family,
     )  # fmt: skip
@@ -176,13 +185,18 @@ def bend(
         e2=float(getattr(element, "ExitAngle", 0.0)),
         tilt=roll,
         gap=float(getattr(element, "FullGap", 0.0)),
-        fint=float(getattr(element, "FringeInt1", 0.0)),
-        fintx=float(getattr(element, "FringeInt2", 0.0)),
+        fint=_fringe(element, "FringeInt1", "FringeBendEntrance"),
+        fintx=_fringe(element, "FringeInt2", "FringeBendExit"),
         h_pole1=float(getattr(element, "H1", 0.0)),
         h_pole2=float(getattr(element, "H2", 0.0)),
         eid=family,
     )
     return "bend", source
+
+
+def _fringe(element: Any, integral: str, model: str) -> float:
+    """The fringe integral of a face; model 0 has none."""
+    return float(getattr(element, integral, 0.0)) if getattr(element, model, 1) else 0.0
 
 
 def with_coils(element: Any, family: str, source: Any) -> list[Place]:
