@@ -72,8 +72,8 @@ def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
     given = [[c for c in asked if c is not cause] for cause in asked] if several else [[]]
     left = None
     if truth.unknown is not None:
-        fit_ = replace(case.fit, readings=truth.clean["fit"][:, None])
-        quiet = refitted(replace(case, parts={**case.parts, "fit": fit_}), truth)
+        clean = replace(case.fit, readings=truth.clean["fit"][:, None])
+        quiet = refitted(replace(case, parts={**case.parts, "fit": clean}), truth)
         left = float(np.sqrt(max(quiet.left, 0.0)))
     found = [refitted(case, truth, others) for others in given]
     return {"oracles": [_as_answer(one) for one in found], "residual": left}

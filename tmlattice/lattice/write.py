@@ -22,7 +22,7 @@ FORMATS = {
     ".seq": "write_madx", ".py": "write_ocelot",
 }  # fmt: skip
 """Modules by suffix. Each states the errors that its format `holds` of an element; its `made` is
-the package's object of a ring of plain elements, its `write` a file. Both state what is lacking."""
+the package's object of a ring of plain elements, its `write` a file. Both state what they leave out."""
 
 SUFFIXES = (
     ".json (the package's own), .at.json (AT), .xsuite.json (Xsuite), .madx or .seq (MAD-X), .py "
@@ -147,7 +147,8 @@ def to_dataframe(ring: Ring) -> Any:
 def _object(ring: Ring, package: str, suffix: str, *more: Any) -> Any:
     module = _module(suffix)
     bare, lacks = plain(ring, module.holds)
-    made, told = module.made(bare, *more)
-    if lacks or told:
-        warnings.warn(f"'{ring.name}' in {package}: {'; '.join((*lacks, *told))}", stacklevel=3)
+    made, more_lacks = module.made(bare, *more)
+    if lacks or more_lacks:
+        text = "; ".join((*lacks, *more_lacks))
+        warnings.warn(f"'{ring.name}' in {package}: {text}", stacklevel=3)
     return made

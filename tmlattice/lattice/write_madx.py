@@ -116,13 +116,13 @@ THICK = ("quadrupole", "sextupole", "octupole", "sbend")
 def _text(keyword: str, values: Mapping[str, Any]) -> str:
     """A definition with those of its numbers that are not zero, and what it cannot be without."""
     needed = {"fintx", *(("l", "angle") if keyword in THICK else ())}
-    told = [keyword.upper()]
+    items = [keyword.upper()]
     for name, value in values.items():
         if isinstance(value, list):
-            told.append(f"{name.upper()}={{{', '.join(map(_number, value))}}}")
+            items.append(f"{name.upper()}={{{', '.join(map(_number, value))}}}")
         elif value or name in needed:
-            told.append(f"{name.upper()}={_number(value)}")
-    return ", ".join(told)
+            items.append(f"{name.upper()}={_number(value)}")
+    return ", ".join(items)
 
 
 def _definition(element: Element, energy: float, left_out: Counter[str]) -> str:
