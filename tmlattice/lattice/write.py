@@ -21,8 +21,9 @@ FORMATS = {
     ".at.json": "write_at", ".xsuite.json": "write_xsuite", ".madx": "write_madx",
     ".seq": "write_madx", ".py": "write_ocelot",
 }  # fmt: skip
-"""Modules by suffix. Each states the errors that its format `holds` of an element; its `made` is
-the package's object of a ring of plain elements, its `write` a file. Both state what they leave out."""
+"""Modules by suffix. Each states the errors that its format `holds` of an element. Its `made` is
+the package's object of a ring of plain elements, its `write` a file; both state what they leave
+out."""
 
 SUFFIXES = (
     ".json (the package's own), .at.json (AT), .xsuite.json (Xsuite), .madx or .seq (MAD-X), .py "
