@@ -184,21 +184,6 @@ def test_element_moves_a_particle_as_in_at(what):
     assert kick > big / 100  # it does something
 
 
-def test_thin_bend_of_at_turns_a_particle_of_more_energy():
-    from tmlattice.maps.magnets import way_map
-
-    thin = at.ThinMultipole("t", [0.0, 0.0], [0.0, -0.3], BendingAngle=0.02)
-    lattice = at.Lattice([thin], energy=ENERGY * 1e9, periodicity=1)
-    ring = ring_from_at(lattice, "thin")
-    assert ring.elements[0].bending == 0.02
-    moved = way_map(ring.elements, ENERGY, 6)(np.array([1e-4, 0, 0, 0, 0, 1e-4]))
-    tracked = lattice.track(np.array([1e-4, 0, 0, 0, 1e-4, 0]), refpts=[1])[0][:4, 0, 0, 0]
-    np.testing.assert_allclose(moved[:4], tracked, rtol=0, atol=1e-9)
-    vars(thin)["BendingAngle"] = np.array([0.02, 0.01])
-    with pytest.raises(LatticeError, match="'t' bends in y"):
-        ring_from_at(lattice, "thin")
-
-
 def test_matrix_element_keeps_dispersion_in_ocelots_coordinates():
     bend = at.Dipole("b", 1.0, 0.3, 0.2, PassMethod="BendLinearPass")
     both = [

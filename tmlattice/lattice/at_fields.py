@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import LatticeError
 from tmlattice.lattice.places import RADIUS, Place, halves
 from tmlattice.lattice.ring import Kind
 
@@ -121,28 +120,20 @@ def straight_magnet(
 def thin(
     element: Any, family: str, mad: str, roll: float, left_out: Counter[str]
 ) -> tuple[Kind, Any]:
-    """A thin multipole, of integrated fields; it may bend the design orbit.
-
-    Raises:
-        LatticeError: it bends in y.
-    """
+    """A thin multipole, of integrated fields."""
     strengths = strengths_of(element)
     if np.any(strengths[3:]):
         left_out["thin multipoles above the sextupole"] += 1
-    angle = np.append(np.ravel(getattr(element, "BendingAngle", 0.0)), 0.0)
-    if angle[1]:
-        raise LatticeError(f"the thin multipole '{family}' bends in y, which is not modelled")
-    return "multipole", _combined(strengths, 0.0, roll, family, float(angle[0]))
+    return "multipole", _combined(strengths, 0.0, roll, family)
 
 
-def _combined(strengths: Any, length: float, roll: float, family: str, angle: float = 0.0) -> Any:
+def _combined(strengths: Any, length: float, roll: float, family: str) -> Any:
     from tmlattice.lattice.combined import CombinedMultipole
 
     k = [complex(strength) * math.factorial(n) for n, strength in enumerate(strengths[:3])]
     return CombinedMultipole(
         l=length,
         k0=k[0].real, k0s=k[0].imag, k1=k[1].real, k1s=k[1].imag, k2=k[2].real, k2s=k[2].imag,
-        angle=angle,
         tilt=roll,
         eid=family,
     )  # fmt: skip
