@@ -322,11 +322,3 @@ class Chain(LayerChain):
         rf = cavities.exits, cavities.values
         kernels.trajectories(0, 1, *turn.W, turn.curved, *rf, states, tangents)
         return states[0], tangents[0]
-
-
-def tangents(network: LayerChain, x: Array) -> tuple[Array, Array, Array]:
-    """States [layer + 1, n] for the launch x [n], at all exits, their Jacobians M [layer + 1, n, n]
-    by the launch, and the inverses of these."""
-    path, total = network.tangents(x)
-    M = total[:-1]
-    return path[:-1], M, np.asarray(np.linalg.inv(M), dtype=float)
