@@ -79,6 +79,9 @@ FINE, FINE_GAIN = 0.1, 30.0
 few corrector settings, must then gain."""
 
 
+ERRORS = 4.0
+"""Independent numbers by which a fault changes what is read in a section, or at a joint, whatever
+the number of shots: a kick and a gradient in each plane."""
 SINGULAR = 1e-9
 """Smallest relative variance of mismatches by noise."""
 KICKS = np.append(0.0, 10.0 ** np.arange(0, 11))
@@ -117,6 +120,7 @@ class Split:
         kicked: its change by unit kicks of the ring, [term, row, kick].
         changes: sum of squares of the rest, [term].
         freedom: of both, [2, term].
+        errors: degrees of freedom that a fault of the machine changes.
     """
 
     common: Array
@@ -124,9 +128,13 @@ class Split:
     kicked: Array
     changes: Array
     freedom: Array
+    errors: float
 
     @classmethod
-    def of(cls, miss: Array, spread: Array, kicked: Array, there: Flags, freedom: Array) -> "Split":
+    def of(
+        cls, miss: Array, spread: Array, kicked: Array, there: Flags, freedom: Array,
+        errors: float = ERRORS,
+    ) -> "Split":  # fmt: skip
         """Split mismatches.
 
         Args:
@@ -147,7 +155,7 @@ class Split:
         return cls(
             mean * root, usual, np.nan_to_num(kicked) * root[..., None],
             size * np.where(freedom > 0, each, 0.0).sum(axis=0),
-            np.stack([most, freedom.sum(axis=0) - most]),
+            np.stack([most, freedom.sum(axis=0) - most]), errors,
         )  # fmt: skip
 
     def cost(self, square: float, kicks: Array) -> Array:
@@ -171,8 +179,8 @@ class Split:
         free, changing = self.freedom
         misfit = (own / wider).sum(axis=2) / np.maximum(free, 1) / square
         changes = self.changes / np.maximum(changing, 1) / square
-        common_cost = free / 2 * _robust(misfit) + np.log(wider).sum(axis=2) / 2
-        rest = np.broadcast_to(changing / 2 * _robust(changes), common_cost.shape)
+        common_cost = _robust(misfit, free, self.errors) + np.log(wider).sum(axis=2) / 2
+        rest = np.broadcast_to(_robust(changes, changing, self.errors), common_cost.shape)
         return np.concatenate([np.where(free > 0, common_cost, 0.0), rest], axis=1)
 
     def level(self, worst: bool = False) -> float:
@@ -187,8 +195,12 @@ class Split:
         return float(each.max() if worst else np.median(each / usual))
 
 
-def _robust(misfit: Array) -> Array:
-    return np.where(misfit < 1, misfit - 1, np.log(np.maximum(misfit, 1.0)))
+def _robust(misfit: Array, freedom: Array, errors: float) -> Array:
+    """Negative log likelihood of mean squares in units of the noise, by their degrees of freedom,
+    of which a fault of the machine makes no more than some."""
+    own = np.maximum(np.minimum(freedom, errors), 1)
+    large = own * np.log1p(freedom / own * np.maximum(misfit - 1, 0.0))
+    return np.asarray(np.where(misfit < 1, freedom * (misfit - 1), large) / 2)
 
 
 @dataclass(frozen=True)
@@ -491,9 +503,8 @@ class OfTurns(Search):
         planes = miss.reshape(-1, 2, 2)
         spreads = np.stack([spread[:, p, p] for p in (slice(0, 2), slice(2, 4))], axis=1)
         free = np.full(planes.shape[:2], 2)
-        split = Split.of(
-            planes, spreads, kicked.reshape(2, 2, -1), np.ones(planes.shape, dtype=bool), free
-        )
+        every = np.ones(planes.shape, dtype=bool)
+        split = Split.of(planes, spreads, kicked.reshape(2, 2, -1), every, free, np.inf)
         return split, distance(planes, spreads), blur
 
     def _carried(
