@@ -24,7 +24,13 @@ from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
 from tmlattice.diagnosis.signals import Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
-from tmlattice.errors import MeasurementError, TmlatticeError, UnknownNameError, first_of
+from tmlattice.errors import (
+    MeasurementError,
+    TmlatticeError,
+    TooFewTurnsError,
+    UnknownNameError,
+    first_of,
+)
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
@@ -56,6 +62,10 @@ FAR = 100.0
 benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first BPMs change."""
+NOTHING_FROM, NO_BEAM, HALF = 2, 0.75, 0.5
+"""Sections at the end that follow no trajectory, from which on the beam was lost: swapped BPMs
+spoil one; the share of their readings that is left then, of noise 0.9; and the share that separates
+them from others."""
 SECTIONS = 4
 """Fewest passes that determine the usual misfit."""
 SPOILT = 3.0
@@ -245,6 +255,8 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
         return checks  # nothing can be fitted to such turns
     errors, checked = _global(OfTurns(ring, data, known))
     passes, found = checked.found(checked.data)
+    if lost_too := _no_beam(ring, checked, passes, found):
+        return [*checks, *errors, *lost_too]
     lattice = _lattice(ring, checked, passes, found)
     if lattice.status == "wrong":  # no wrong sign, unit or order explains that
         return [*checks, lattice]
@@ -274,6 +286,26 @@ def _lattice(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
             before=found.level if stated else None,
         )
     return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
+
+
+def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -> list[Check]:
+    """The check for readings behind a lost beam: the last sections of all shots follow nothing."""
+    shares = found.shares(passes)
+    read = np.flatnonzero(np.isfinite(shares))
+    if len(passes.readings) < 2 or not len(read) or passes.turn.any():
+        return []
+    strange = np.cumsum(np.log(np.maximum(shares[read], 1e-9) / HALF)[::-1])[::-1]
+    behind = read[strange.argmax() :]
+    left = float(np.sqrt(np.mean(shares[behind] ** 2)))
+    if not (NOTHING_FROM <= len(behind) < len(read) and left > NO_BEAM):
+        return []
+    first = ring[checked.data.monitors[found.owner[behind[0], 0]]]
+    return [wrong(
+        "lost beam",
+        f"from {first.name} (s = {first.s:.2f} m) on the readings follow no trajectory in any "
+        "shot, and before they do: the beam was lost, or these BPMs have other names; leave their "
+        "readings out, or correct the names",
+    )]  # fmt: skip
 
 
 def _launches(checked: OfTurns) -> Check:
@@ -387,7 +419,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
         checks += [fine("tunes", sentence) for sentence in search.tunes]
         errors, checked = _global(search)
         left = checked.misfit()
-    except MeasurementError as error:
+    except (MeasurementError, TooFewTurnsError) as error:
         return [*checks, wrong("data", str(error))]
     if not np.isfinite(left).any():
         text = "one orbit is the sum of all errors: it shows neither signs nor the order of BPMs"

@@ -168,22 +168,36 @@ class SectionFits:
 
     def share(self, passes: Passes) -> float:
         """Share of the readings' rms that the typical trajectory leaves: 1 if it explains none."""
-        owner, plane = np.maximum(self.owner, 0), np.arange(self.owner.shape[1]) % 2
-        read = np.where(self.there, passes.readings[:, owner, plane], 0.0)
-        left = np.where(self.there, self.left * passes.sigma[owner, plane], 0.0)
         enough = self.freedom > 3
         if enough.sum() < 3:
             return float("nan")
-        count = self.there.sum(axis=2)[enough]
-        shares = []
-        for common in (0.0, 1.0):  # as read; and less what is the same in all passes, as kicks are
+        part, whole = self._squares(passes)
+        shares = np.sqrt(part / np.maximum(whole, 1e-60))[:, enough]
+        return float(np.median(shares, axis=1).min())
+
+    def shares(self, passes: Passes) -> Array:
+        """The same of each section, from all passes together, [section]; NaN if undetermined."""
+        enough = self.freedom > 3
+        part, whole = (np.where(enough, own, 0.0).sum(axis=1) for own in self._squares(passes))
+        own = np.sqrt(part / np.maximum(whole, 1e-60)).min(axis=0)
+        return np.where(enough.any(axis=0), own, np.nan)
+
+    def _squares(self, passes: Passes) -> tuple[Array, Array]:
+        """Mean squares of the residuals and of the readings [2, pass, section], m^2: as read; and
+        of several passes less what is the same in all, as it is of kicks."""
+        owner, plane = np.maximum(self.owner, 0), np.arange(self.owner.shape[1]) % 2
+        read = np.where(self.there, passes.readings[:, owner, plane], 0.0)
+        left = np.where(self.there, self.left * passes.sigma[owner, plane], 0.0)
+        count, free = np.maximum(self.there.sum(axis=2), 1), np.maximum(self.freedom, 1)
+        found = []
+        for common in (0.0, 1.0)[: len(read)]:
             whole, part = (
                 (np.where(self.there, own - common * mean_pass(own, self.there), 0.0) ** 2).sum(2)
                 for own in (read, left)
             )
-            part, whole = part[enough] / self.freedom[enough], whole[enough] / count
-            shares.append(float(np.median(np.sqrt(part / np.maximum(whole, 1e-60)))))
-        return min(shares) if len(read) > 1 else shares[0]
+            found.append((part / free, whole / count))
+        parts, wholes = zip(*found, strict=True)
+        return np.stack(parts), np.stack(wholes)
 
 
 def mean_pass(values: Array, there: Flags) -> Array:
