@@ -22,10 +22,11 @@ from tmlattice.effects import modelled
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, TuneReading, TurnByTurn
-from tmlattice.measurement.assume import assume
+from tmlattice.measurement.assume import assume, read_of
 from tmlattice.measurement.shots import FEWEST
 from tmlattice.observe.global_errors import Names, Search, Verdict
 from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.sections import mean_pass
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
 from tmlattice.optics import ring_tunes
@@ -211,24 +212,32 @@ class OfOrbits(Compared):
     def _designs(self) -> dict[str, Array]:
         return {}
 
+    def design(self, data: ClosedOrbit | Dispersion) -> Array:
+        """Orbits [state, monitor, 2] of the design in the states of the data."""
+        own, key = self.data, repr(getattr(data, "settings", ()))
+        if isinstance(data, Dispersion) and isinstance(own, Dispersion):
+            pairs = zip(own.steps, data.steps, strict=True)
+            own = replace(own, steps=tuple(replace(a, step=b.step) for a, b in pairs))
+            key = repr([step.step for step in own.steps])
+        elif isinstance(data, ClosedOrbit):
+            own = replace(own, settings=data.settings)
+        if key not in self._designs:
+            make: Any = dispersion if isinstance(own, Dispersion) else closed_orbits
+            problem = make(self.ring, own, dict.fromkeys(modelled(), 1.0))
+            order = {name: i for i, name in enumerate(self.monitors)}
+            at = [order[self.ring[name].name] for name in data.monitors]
+            self._designs[key] = problem.read(problem.view(()), NOTHING)[:, at]
+        return self._designs[key]
+
     def pairs(self, data: ClosedOrbit | Dispersion) -> tuple[Any, Any, Any]:
         """See `Compared`. One orbit is the sum of all errors, and has no change."""
-        prior = dict.fromkeys(modelled(), 1.0)
-        if isinstance(data, Dispersion):
-            problem: Any = dispersion(self.ring, data, prior)
-            key = repr([(step.step, step.frequency) for step in data.steps])
-        else:
-            problem = closed_orbits(self.ring, data, prior)
-            key = repr(data.settings)
-        if key not in self._designs:
-            self._designs[key] = problem.read(problem.view(()), NOTHING)
-        read = np.where(problem.used, problem.values, np.nan)
-        made = self._designs[key]
+        read, made = read_of(data), self.design(data)
         if isinstance(data, ClosedOrbit):
             if not any(data.settings):
                 return np.full_like(read, np.nan), made, 0.0
-            read, made = (own - own.mean(axis=0) for own in (read, made))
-        return read, made, 2 * problem.sigma**2
+            there = np.isfinite(read)
+            read, made = (own - mean_pass(own, there) for own in (read, made))
+        return read, made, 2 * np.broadcast_to(np.nan_to_num(data.noise), read.shape) ** 2
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""
