@@ -13,15 +13,15 @@ import numpy as np
 
 from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
 from tmlattice.correction.first_turn import Threading
-from tmlattice.correction.knobs import Knob, default_knobs, kinds_for, read_knobs
+from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_knobs
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.solve import (
-    MAX_EXCESS,
+    COUNTS,
     Point,
     Problem,
-    by_gain,
     drawn,
     fewest,
+    nearly,
     optimised,
     rounded,
 )
@@ -36,8 +36,8 @@ Array = np.ndarray
 
 DRAWS = 200
 """Draws from the posterior: the ends of an interval scatter by a tenth of its half width."""
-COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
-"""Numbers of knobs with a stated gain."""
+MAX_WORSE = 0.01
+"""Probability, over the draws, of a worse ring above which no setting is changed."""
 INTERVAL = (50.0, 15.87, 84.13)
 """Percentiles: the median and the central 68.27 %."""
 SIGMAS = 3.0
@@ -48,7 +48,7 @@ def correct(
     diagnosis: Diagnosis | Estimate | Ring | Any,
     *,
     goal: Ring | Any | None = None,
-    knobs: Sequence[Knob] | Iterable[str] | str | Path | None = None,
+    knobs: Sequence[Knob | str] | str | Path | None = None,
     targets: Iterable[str] | Mapping[str, float | None] | None = None,
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
@@ -88,7 +88,7 @@ def correct(
         )
     else:
         compared = Targets(wanted, chosen)
-    devices = _knobs(knobs, estimate.settings, compared.names)
+    devices = chosen_knobs(knobs, estimate.settings, compared.names)
     progress("correction")
     problem = drawn(estimate, devices, compared, DRAWS, seed)
     try:
@@ -100,7 +100,8 @@ def correct(
     end, order = _corrected(problem, begin)
     found = _fields(begin, end, order)
     seconds = time.perf_counter() - begun
-    made = {"seed": seed, "draws": DRAWS, "knobs": len(devices), "seconds": seconds}
+    made = {"lattice": estimate.settings.name, "seed": seed, "draws": DRAWS,
+            "knobs": len(devices), "seconds": seconds}  # fmt: skip
     return Correction(**found, ring=estimate.settings, provenance=made)
 
 
@@ -114,61 +115,34 @@ def _estimate(diagnosis: Diagnosis | Estimate | Any, goal: Ring | None) -> Estim
     return estimate_with(load_ring(diagnosis), goal, None)
 
 
-def _knobs(
-    knobs: Sequence[Knob] | Iterable[str] | str | Path | None,
-    settings: Ring,
-    names: Sequence[str],
-) -> list[Knob]:
-    if knobs is None:
-        return default_knobs(settings, kinds_for(names))
-    if isinstance(knobs, str | Path):
-        return read_knobs(Path(knobs), settings)
-    some = list(knobs)
-    devices = [own for own in some if isinstance(own, Knob)]
-    kinds = [own for own in some if isinstance(own, str)]
-    return devices + (default_knobs(settings, kinds) if kinds else [])
-
-
 def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
     """Where the correction ends, and its knobs by falling gain."""
     every = np.arange(len(problem.knobs))
     whole = optimised(problem, begin, every)
-    order = by_gain(whole)
-    counts = [n for n in COUNTS if n < len(order)] + [len(order)]
-    number = fewest(whole, order, counts)
-    if number < len(order):
-        chosen = np.array(order[:number], dtype=np.int64)
-        goal, _ = whole.step(chosen)
-        end = optimised(problem, problem.better(goal, begin.square) or begin, chosen)
-        if end.square <= (1 + 2 * MAX_EXCESS) * whole.square:
-            return rounded(problem, end), order[:number]
-    return rounded(problem, whole), order  # or not as linear as that
+    order = fewest(whole, whole.step(every)[1])
+    chosen = np.array(order, dtype=np.int64)
+    goal, _ = whole.step(chosen)
+    end = optimised(problem, problem.better(goal, begin.square) or begin, chosen)
+    if nearly(end.square, whole.square):
+        return rounded(problem, end), order
+    return rounded(problem, whole), [*whole.by_gain()]  # or not as linear as that
 
 
 def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     """Fields of the result."""
     problem, targets = end.problem, end.problem.targets
-    rows = targets.rows(begin.open)
-    change = 2 * rows @ (begin.rows - end.rows)
-    gained = begin.square - end.square
-    error = float(np.std(change))
-    whole = max(begin.square + float(np.mean(np.sum(rows**2, axis=1))), 1e-30)
-    refused = _refusal(begin, gained, error)
+    now, then = (np.sum((p.rows + targets.rows(p.open)) ** 2, axis=-1) for p in (begin, end))
+    whole = max(float(now.mean()), 1e-30)
+    refused = _refusal(now / whole, then / whole)
     if refused:
-        end = begin
-    before, after = (_intervals(point) for point in (begin, end))
-    squares, gains = [begin.square], []
-    for n in range(1, len(order) + 1 if not refused else 1):
-        amounts, square = end.step(np.array(order[:n], dtype=np.int64))
-        squares.append(square)
-        if n in COUNTS or n == len(order):
-            gains.append((n, _expected(amounts, end)))
-    shares = -np.diff(squares) / max(begin.square - min(squares), 1e-30)
+        end, order = begin, []
+    shares = end.gains(np.array(order, dtype=np.int64))
+    shares /= max(float(shares.sum()), 1e-30)
     settings = [
         Setting(knob, amount, knob.setting(amount), share)
         for knob, amount, share in zip(
             (problem.knobs[k] for k in order), end.amounts[order].tolist(), shares.tolist(),
-            strict=False,
+            strict=True,
         )
         if amount
     ]  # fmt: skip
@@ -179,7 +153,9 @@ def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     }
     shown = targets.names[0] if "beta_beating" not in end.errors else "beta_beating"
     profile = tuple(
-        np.moveaxis(np.percentile(p.errors[shown] + p.open[shown], INTERVAL, axis=0), 0, -1)
+        np.moveaxis(
+            np.percentile(p.errors[shown] + p.open[shown], INTERVAL, axis=0), 0, -1
+        ).tolist()
         for p in (begin, end)
     )
     tunes = {}
@@ -189,31 +165,37 @@ def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     return {
         "settings": tuple(settings),
         "refused": refused,
-        "before": before,
-        "after": after,
+        "before": _intervals(begin),
+        "after": _intervals(end),
         "stays": stays,
-        "gains": tuple(gains),
-        "gain": gained / whole,
-        "gain_error": error / whole,
+        "gains": tuple(
+            (n, _expected(end.step(np.array(order[:n]))[0], end))
+            for n in sorted({*COUNTS, len(order)}) if 0 < n <= len(order)
+        ),
+        "gain": float((now - then).mean()) / whole,
+        "gain_error": float((now - then).std()) / whole,
         "tunes": {name: _pair(value % 1.0) for name, value in tunes.items()},
         "shown": shown,
         "profile": profile,
-        "s": targets.s,
-        "counted": targets.tolerance,
+        "s": tuple(targets.s.tolist()),
+        "targets": targets.tolerance,
         "iterations": _iterations(end),
         "warnings": tuple(_warnings(end, settings)),
-    }
+    }  # fmt: skip
 
 
-def _refusal(begin: Point, gained: float, error: float) -> str:
-    """Why nothing is changed."""
-    if gained > error:
+def _refusal(now: Array, then: Array) -> str:
+    """Why nothing is changed, from the squares of the draws, [draw]."""
+    gain, worse = now - then, float(np.mean(then >= now))
+    if worse <= MAX_WORSE:
         return ""
-    if gained <= 0:
+    if gain.mean() <= 0:
         return "No setting is changed: these knobs do not bring the ring closer to the goal."
     return (
-        f"No setting is changed: the expected gain, {gained:.2g} of {begin.square:.2g} in units of "
-        f"the tolerances, is below its error of {error:.2g}."
+        f"No setting is changed: the expected gain is {100 * gain.mean():.2g} ± "
+        f"{100 * gain.std():.2g} % of the squared errors, and the ring becomes worse with a "
+        f"probability of {100 * worse:.2g} % (limit {100 * MAX_WORSE:g} %). Measure more, or name "
+        "fewer targets (--target)."
     )
 
 
