@@ -21,7 +21,13 @@ from tmlattice.correction.knobs import write_knobs
 from tmlattice.correction.result import read_correction
 from tmlattice.diagnosis.twin import known_document
 from tmlattice.effects import Cause, apply, find
-from tmlattice.errors import ChoiceError, MeasurementError, TmlatticeError, UnknownNameError
+from tmlattice.errors import (
+    ChoiceError,
+    MeasurementError,
+    TmlatticeError,
+    UnknownNameError,
+    UnstableRingError,
+)
 from tmlattice.files import write_json
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.lattice import save_ring, write_ring
@@ -208,6 +214,18 @@ def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupol
     small = posterior(quadrupoles, 5e-3, 1e-4 * rng.standard_normal(len(quadrupoles)))
     hardly = correct(estimate_with(small_ring, small_ring, small), targets=["beta_beating"])
     assert not hardly.settings or hardly.gain > 2 * hardly.gain_error
+
+
+def test_a_mean_that_stores_no_beam_is_shortened(small_ring, quadrupoles):
+    """The linear estimate of a ring that stores a beam goes too far."""
+    signs = [0.6 if name.startswith("QF") else -0.6 for name in quadrupoles]
+    with pytest.raises(UnstableRingError):
+        correct(apply(small_ring, [Cause("quadrupole_gradient", name, amount)
+                                   for name, amount in zip(quadrupoles, signs, strict=True)]),
+                goal=small_ring)  # fmt: skip
+    known = posterior(quadrupoles, 1e-3, np.array(signs))
+    found = correct(estimate_with(small_ring, small_ring, known), targets=["tunes"])
+    assert found.settings
 
 
 def test_a_dispersion_that_the_errors_make_is_counted_once(small_ring):

@@ -17,13 +17,14 @@ from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_k
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.solve import (
     COUNTS,
+    MAX_WORSE,
     Point,
     Problem,
     drawn,
     fewest,
     nearly,
     optimised,
-    rounded,
+    shortened,
 )
 from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
@@ -36,8 +37,6 @@ Array = np.ndarray
 
 DRAWS = 200
 """Draws from the posterior: the ends of an interval scatter by a tenth of its half width."""
-MAX_WORSE = 0.01
-"""Probability, over the draws, of a worse ring above which no setting is changed."""
 INTERVAL = (50.0, 15.87, 84.13)
 """Percentiles: the median and the central 68.27 %."""
 SIGMAS = 3.0
@@ -97,8 +96,9 @@ def correct(
         raise UnstableRingError(f"the estimated ring stores no beam: {error}") from error
     if not begin.slopes.any():
         raise TmlatticeError("no knob changes a target; name others (--knobs, --target)")
-    end, order = _corrected(problem, begin)
-    found = _fields(begin, end, order)
+    whole, order = _corrected(problem, begin)
+    end, share = shortened(begin, whole)
+    found = _fields(begin, whole, end, share, order)
     seconds = time.perf_counter() - begun
     made = {"lattice": estimate.settings.name, "seed": seed, "draws": DRAWS,
             "knobs": len(devices), "seconds": seconds}  # fmt: skip
@@ -120,28 +120,35 @@ def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
     every = np.arange(len(problem.knobs))
     whole = optimised(problem, begin, every)
     order = fewest(whole, whole.step(every)[1])
+    if len(order) == len(every):
+        return whole, order
     chosen = np.array(order, dtype=np.int64)
     goal, _ = whole.step(chosen)
     end = optimised(problem, problem.better(goal, begin.square) or begin, chosen)
     if nearly(end.square, whole.square):
-        return rounded(problem, end), order
-    return rounded(problem, whole), [*whole.by_gain()]  # or not as linear as that
+        return end, order
+    return whole, [*whole.by_gain()]  # or not as linear as that
 
 
-def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
-    """Fields of the result."""
+def _fields(
+    begin: Point, whole: Point, end: Point, share: float, order: Sequence[int]
+) -> dict[str, Any]:
+    """Fields of the result: the whole correction, and a share of it where all ends."""
     problem, targets = end.problem, end.problem.targets
-    now, then = (np.sum((p.rows + targets.rows(p.open)) ** 2, axis=-1) for p in (begin, end))
-    whole = max(float(now.mean()), 1e-30)
-    refused = _refusal(now / whole, then / whole)
-    if refused:
-        end, order = begin, []
-    shares = end.gains(np.array(order, dtype=np.int64))
-    shares /= max(float(shares.sum()), 1e-30)
+    now, then = (
+        np.sum((p.rows + targets.rows(p.open)) ** 2, axis=-1)
+        for p in (begin, end if share else whole)
+    )
+    square = max(float(now.mean()), 1e-30)
+    gain = (now - then) / square
+    refused = "" if share else _refusal(float(gain.mean()), float(gain.std()))
+    order = order if share else []
+    gains = end.gains(np.array(order, dtype=np.int64))
+    gains /= max(float(gains.sum()), 1e-30)
     settings = [
-        Setting(knob, amount, knob.setting(amount), share)
-        for knob, amount, share in zip(
-            (problem.knobs[k] for k in order), end.amounts[order].tolist(), shares.tolist(),
+        Setting(knob, amount, knob.setting(amount), own)
+        for knob, amount, own in zip(
+            (problem.knobs[k] for k in order), end.amounts[order].tolist(), gains.tolist(),
             strict=True,
         )
         if amount
@@ -169,33 +176,28 @@ def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
         "after": _intervals(end),
         "stays": stays,
         "gains": tuple(
-            (n, _expected(end.step(np.array(order[:n]))[0], end))
+            (n, _expected(share * end.step(np.array(order[:n]))[0], end))
             for n in sorted({*COUNTS, len(order)}) if 0 < n <= len(order)
         ),
-        "gain": float((now - then).mean()) / whole,
-        "gain_error": float((now - then).std()) / whole,
+        "gain": float(gain.mean()),
+        "gain_error": float(gain.std()),
         "tunes": {name: _pair(value % 1.0) for name, value in tunes.items()},
         "shown": shown,
         "profile": profile,
         "s": tuple(targets.s.tolist()),
         "targets": targets.tolerance,
-        "iterations": _iterations(end),
-        "warnings": tuple(_warnings(end, settings)),
+        "iterations": _iterations(end, share),
+        "warnings": tuple(_warnings(end, share, settings)),
     }  # fmt: skip
 
 
-def _refusal(now: Array, then: Array) -> str:
-    """Why nothing is changed, from the squares of the draws, [draw]."""
-    gain, worse = now - then, float(np.mean(then >= now))
-    if worse <= MAX_WORSE:
-        return ""
-    if gain.mean() <= 0:
+def _refusal(gain: float, error: float) -> str:
+    """Why nothing is changed."""
+    if gain <= 0:
         return "No setting is changed: these knobs do not bring the ring closer to the goal."
     return (
-        f"No setting is changed: the expected gain is {100 * gain.mean():.2g} ± "
-        f"{100 * gain.std():.2g} % of the squared errors, and the ring becomes worse with a "
-        f"probability of {100 * worse:.2g} % (limit {100 * MAX_WORSE:g} %). Measure more, or name "
-        "fewer targets (--target)."
+        f"No setting is changed: the expected gain, {100 * gain:.2g} ± {100 * error:.2g} % of the "
+        "squared errors, is too uncertain. Measure more, or name fewer targets (--target)."
     )
 
 
@@ -220,13 +222,19 @@ def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _iterations(end: Point) -> int:
-    """One, and another one where most of what stays comes from errors of the knobs' changes, which
-    a second measurement shows."""
-    return 2 if float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
+def _iterations(end: Point, share: float) -> int:
+    """One, and another one after a share of the changes, or where most of what stays comes from
+    errors of the knobs' changes, which a second measurement shows."""
+    return 2 if share < 1 or float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
 
 
-def _warnings(end: Point, settings: Sequence[Setting]) -> Iterable[str]:
+def _warnings(end: Point, share: float, settings: Sequence[Setting]) -> Iterable[str]:
+    if 0 < share < 1:
+        yield (
+            f"the settings make {100 * share:.0f} % of the most probable correction, so that the "
+            f"probability of a worse ring is at most {100 * MAX_WORSE:g} %; measure again, and "
+            "correct the rest"
+        )
     held = [setting.knob.name for setting in settings if setting.at_limit]
     if held:
         yield f"held by their limits: {', '.join(held)}"

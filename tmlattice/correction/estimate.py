@@ -4,17 +4,19 @@
 >>> estimate.draw(200, np.random.default_rng(0)).shape      # [draw, error]
 """
 
-import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
 from tmlattice.effects import Cause, RingEffect, apply, find
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
@@ -22,7 +24,8 @@ from tmlattice.observe.calibration import Dispersion, read_dispersion, read_ener
 Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
 
-log = logging.getLogger(__name__)
+MAX_HALVINGS = 4
+"""Halvings, at most, of a posterior mean with which the ring stores no beam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +90,8 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
     kept = [i for i in kept if known.rms[i] > 0]
     mean = [Cause(*known.hypotheses[i], float(known.amounts[i])) for i in kept]
     mean = [cause for cause in mean if cause.amount]
+    if mean and not _stores(apply(ring, mean)) and _stores(ring):
+        mean = _shortened(ring, mean)
     every = [*known.causes]
     every += [Cause(*h, a) for h, a in zip(known.hypotheses, known.amounts.tolist(), strict=True)]
     scales: dict[str, float] = {}
@@ -101,6 +106,24 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
         np.array(kept, dtype=np.int64),
         scales,
     )
+
+
+def _shortened(ring: Ring, mean: Sequence[Cause]) -> list[Cause]:
+    """The largest half, quarter, ... of a linearised mean with which the ring stores a beam, as the
+    measured one does."""
+    for halving in range(1, MAX_HALVINGS + 1):
+        some = [replace(cause, amount=cause.amount / 2**halving) for cause in mean]
+        if _stores(apply(ring, some)):
+            return some
+    return []
+
+
+def _stores(ring: Ring) -> bool:
+    try:
+        StoredBeam(ResponseModel(ring))
+    except UnstableRingError:
+        return False
+    return True
 
 
 def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:

@@ -37,12 +37,15 @@ log = logging.getLogger(__name__)
 MAX_ROUNDS = 30
 """Linearisations at most: a threaded beam gets further with each of them."""
 MIN_FALL = 1e-3
-"""Relative fall of the expected square below which the iteration ends."""
+"""Fall of the expected square, relative and in squares of the tolerances, that ends the search."""
 MAX_HALVINGS = 6
 """Halvings, at most, of a step that does not lower the expected square."""
 MAX_EXCESS = 2e-3
 """Excess over the smallest expected square that is allowed for fewer knobs: relative (0.1 % in
 rms), and in squares of the tolerances."""
+MAX_WORSE, MIN_SHARE = 0.01, 0.1
+"""Probability, over the draws, that a correction makes the ring worse; and the smallest share of
+its changes that is worth while: it has a fifth of the expected gain."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Numbers of knobs with a stated gain."""
 ROUNDING = 1e-10
@@ -307,7 +310,7 @@ def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
         if found is None:
             return now
         log.info("expected square %.4g -> %.4g", now.square, found.square)
-        done = now.square - found.square < MIN_FALL * now.square
+        done = now.square - found.square < MIN_FALL * (1 + found.square)
         now = found
         if done:
             break
@@ -329,11 +332,22 @@ def nearly(square: float, least: float) -> bool:
     return square <= (1 + MAX_EXCESS) * least + MAX_EXCESS
 
 
-def rounded(problem: Problem, point: Point) -> Point:
-    """Return the point at settings that the devices' steps allow; derivatives stay."""
-    pairs = zip(problem.knobs, point.amounts.tolist(), strict=True)
-    amounts = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
-    return point if np.array_equal(amounts, point.amounts) else problem.at(amounts)
+def shortened(begin: Point, end: Point) -> tuple[Point, float]:
+    """Return the point at the largest share of a correction's changes that keeps the probability of
+    a worse ring below `MAX_WORSE`, at settings that the devices' steps allow; and that share.
+
+    In a draw with the rows r, and r + d after all changes, the ring is worse beyond the share
+    -2 r d / d^2.
+    """
+    problem, amounts = end.problem, end.amounts
+    now, then = (p.rows + problem.targets.rows(p.open) for p in (begin, end))
+    change = then - now
+    size = np.maximum(np.sum(change**2, axis=1), 1e-30)
+    share = float(np.quantile(-2 * np.sum(now * change, axis=1) / size, MAX_WORSE))
+    share = 0.0 if share < MIN_SHARE else min(share, 1.0)
+    pairs = zip(problem.knobs, (share * amounts).tolist(), strict=True)
+    new = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
+    return (end if np.array_equal(new, amounts) else problem.at(new)), share
 
 
 def drawn(
