@@ -167,8 +167,8 @@ def _fields(
     )
     tunes = {}
     if isinstance(targets, Targets):
-        tunes = {"goal": targets.goal.tunes, "now": begin.shown.values.tunes,
-                 "expected": end.shown.values.tunes}  # fmt: skip
+        tunes = {"goal": targets.goal["tunes"], "now": begin.shown.values["tunes"],
+                 "expected": end.shown.values["tunes"]}  # fmt: skip
     return {
         "settings": tuple(settings),
         "refused": refused,
@@ -240,7 +240,7 @@ def _warnings(end: Point, share: float, settings: Sequence[Setting]) -> Iterable
         yield f"held by their limits: {', '.join(held)}"
     if "tunes" not in end.errors:
         return
-    tunes = end.shown.values.tunes + end.open["tunes"][:, 0]
+    tunes = end.shown.values["tunes"] + end.open["tunes"][:, 0]
     mean, sigma = tunes.mean(axis=0), tunes.std(axis=0)
     for plane, (q, s) in enumerate(zip(mean, sigma, strict=True)):
         near = abs(2 * q - round(2 * q)) / 2

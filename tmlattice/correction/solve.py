@@ -50,9 +50,8 @@ COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Numbers of knobs with a stated gain."""
 ROUNDING = 1e-10
 """Of the squares of slopes, relative to a knob's size: a ridge for knobs without errors."""
-MAX_PIVOTS, PATIENCE = 200, 10
-"""Of the search for the knobs at their limits: systems solved, and those without progress until
-knobs change one at a time."""
+MAX_PIVOTS = 50
+"""Of the search for the knobs at their limits: systems solved."""
 AT_ONCE = 500
 """Uncertain errors whose derivatives are in memory."""
 
@@ -263,16 +262,15 @@ class Point:
 def bounded(matrix: Array, right: Array, low: Array, high: Array) -> Array:
     """Return the minimum of x matrix x / 2 - right x with low <= x <= high.
 
-    Knobs beyond a limit are held there, and released where the slope leads back inside: all at
-    once, or one at a time as soon as that reduces their number no more (block principal pivoting,
-    Judice & Pires, Computers & Operations Research 21 (1994) 587).
+    Knobs beyond a limit are held there, and released where the slope leads back inside, all at once
+    (block principal pivoting: Judice & Pires, Computers & Operations Research 21 (1994) 587).
 
     Args:
         matrix: positive definite, [knob, knob].
         right, low, high: [knob].
     """
     held = np.zeros(len(right), dtype=int)  # -1 at the low limit, 1 at the high one
-    fewest, patience = len(right) + 1, PATIENCE
+    x = np.zeros(len(right))
     for _ in range(MAX_PIVOTS):
         free = held == 0
         x = np.where(held > 0, high, np.where(held < 0, low, 0.0))
@@ -280,13 +278,8 @@ def bounded(matrix: Array, right: Array, low: Array, high: Array) -> Array:
         x[free] = solve(matrix[np.ix_(free, free)], rest[free], assume_a="pos")
         outward = held * (rest - matrix[:, free] @ x[free])
         wrong = (x < low) | (x > high) | (outward < 0)
-        count = int(wrong.sum())
-        if not count:
+        if not wrong.any():
             break
-        patience = PATIENCE if count < fewest else patience - 1
-        fewest = min(count, fewest)
-        if patience < 0:
-            wrong[: np.flatnonzero(wrong)[-1]] = False
         held[wrong] = np.where(held, 0, np.where(x > high, 1, -1))[wrong]
     return np.clip(x, low, high)
 
