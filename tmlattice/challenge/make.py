@@ -77,7 +77,7 @@ def make(
     effects: Sequence[str] | None = None,
     amount: float | None = None,
     signal: tuple[float, float] = SIGNAL,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     known_rms: bool = False,
     kinds: Sequence[str] = (),
     progress: bool = True,

@@ -87,7 +87,7 @@ class StoredSimulation(Errors):
 def errors(
     ring: Ring,
     causes: Sequence[Cause],
-    background: Mapping[str, float | None] | None,
+    background: str | Mapping[str, float | None] | None,
     seed: int,
     machine_seed: int | None,
     **more: Any,
