@@ -24,8 +24,8 @@ from tmlattice.observe.calibration import Dispersion, read_dispersion, read_ener
 Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
 
-MAX_HALVINGS = 4
-"""Halvings, at most, of a posterior mean with which the ring stores no beam."""
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
+"""Shares of a posterior mean that are tried until the ring stores a beam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +90,6 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
     kept = [i for i in kept if known.rms[i] > 0]
     mean = [Cause(*known.hypotheses[i], float(known.amounts[i])) for i in kept]
     mean = [cause for cause in mean if cause.amount]
-    if mean and not _stores(apply(ring, mean)) and _stores(ring):
-        mean = _shortened(ring, mean)
     every = [*known.causes]
     every += [Cause(*h, a) for h, a in zip(known.hypotheses, known.amounts.tolist(), strict=True)]
     scales: dict[str, float] = {}
@@ -99,7 +97,7 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
         if cause.effect == "corrector_calibration" and cause.element is not None:
             scales[cause.element] = scales.get(cause.element, 1.0) * (1 + cause.amount)
     return Estimate(
-        apply(ring, mean) if mean else ring,
+        _with_mean(ring, mean) if mean else ring,
         settings,
         tuple(known.hypotheses[i] for i in kept),
         known,
@@ -108,22 +106,17 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
     )
 
 
-def _shortened(ring: Ring, mean: Sequence[Cause]) -> list[Cause]:
-    """The largest half, quarter, ... of a linearised mean with which the ring stores a beam, as the
-    measured one does."""
-    for halving in range(1, MAX_HALVINGS + 1):
-        some = [replace(cause, amount=cause.amount / 2**halving) for cause in mean]
-        if _stores(apply(ring, some)):
-            return some
-    return []
-
-
-def _stores(ring: Ring) -> bool:
-    try:
-        StoredBeam(ResponseModel(ring))
-    except UnstableRingError:
-        return False
-    return True
+def _with_mean(ring: Ring, mean: Sequence[Cause]) -> Ring:
+    """The ring with a linearised posterior mean; with a half of it, a quarter, ..., where it stores
+    a beam only then."""
+    for share in SHARES:
+        found = apply(ring, [replace(cause, amount=share * cause.amount) for cause in mean])
+        try:
+            StoredBeam(ResponseModel(found))
+        except UnstableRingError:
+            continue
+        return found
+    return apply(ring, mean)  # a beam that is not stored anyway, as of first turns
 
 
 def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:
