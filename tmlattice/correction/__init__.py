@@ -17,7 +17,7 @@ from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_k
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.solve import (
     COUNTS,
-    MAX_WORSE,
+    SIGMAS,
     Point,
     Problem,
     drawn,
@@ -39,8 +39,6 @@ DRAWS = 200
 """Draws from the posterior: the ends of an interval scatter by a tenth of its half width."""
 INTERVAL = (50.0, 15.87, 84.13)
 """Percentiles: the median and the central 68.27 %."""
-SIGMAS = 3.0
-"""Standard deviations by which tunes stay clear of integers and half integers."""
 
 
 def correct(
@@ -231,9 +229,8 @@ def _iterations(end: Point, share: float) -> int:
 def _warnings(end: Point, share: float, settings: Sequence[Setting]) -> Iterable[str]:
     if 0 < share < 1:
         yield (
-            f"the settings make {100 * share:.0f} % of the most probable correction, so that the "
-            f"probability of a worse ring is at most {100 * MAX_WORSE:g} %; measure again, and "
-            "correct the rest"
+            f"the settings are {100 * share:.0f} % of the most probable correction, since larger "
+            "ones may make the ring worse; measure again, and correct the rest"
         )
     held = [setting.knob.name for setting in settings if setting.at_limit]
     if held:

@@ -43,9 +43,9 @@ MAX_HALVINGS = 6
 MAX_EXCESS = 2e-3
 """Excess over the smallest expected square that is allowed for fewer knobs: relative (0.1 % in
 rms), and in squares of the tolerances."""
-MAX_WORSE, MIN_SHARE = 0.01, 0.1
-"""Probability, over the draws, that a correction makes the ring worse; and the smallest share of
-its changes that is worth while: it has a fifth of the expected gain."""
+SIGMAS, MIN_SHARE = 3.0, 0.1
+"""Standard deviations by which a correction is expected to make the ring better; and the smallest
+share of its changes that is worth while: it has a fifth of the expected gain."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Numbers of knobs with a stated gain."""
 ROUNDING = 1e-10
@@ -326,17 +326,18 @@ def nearly(square: float, least: float) -> bool:
 
 
 def shortened(begin: Point, end: Point) -> tuple[Point, float]:
-    """Return the point at the largest share of a correction's changes that keeps the probability of
-    a worse ring below `MAX_WORSE`, at settings that the devices' steps allow; and that share.
+    """Return the point at the largest share of a correction's changes whose gain is expected to be
+    `SIGMAS` standard deviations above zero, at settings that the devices' steps allow; and that
+    share.
 
-    In a draw with the rows r, and r + d after all changes, the ring is worse beyond the share
-    -2 r d / d^2.
+    In a draw with the rows r, and r + d after all changes, a share x changes the square by
+    x (2 r d + x d^2).
     """
     problem, amounts = end.problem, end.amounts
     now, then = (p.rows + problem.targets.rows(p.open) for p in (begin, end))
-    change = then - now
-    size = np.maximum(np.sum(change**2, axis=1), 1e-30)
-    share = float(np.quantile(-2 * np.sum(now * change, axis=1) / size, MAX_WORSE))
+    slope = 2 * np.sum(now * (then - now), axis=1)
+    size = max(float(np.mean(np.sum((then - now) ** 2, axis=1))), 1e-30)
+    share = -float(slope.mean() + SIGMAS * slope.std()) / size
     share = 0.0 if share < MIN_SHARE else min(share, 1.0)
     pairs = zip(problem.knobs, (share * amounts).tolist(), strict=True)
     new = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
