@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tmlattice.challenge.case import BEFORE, Case, Truth
 from tmlattice.challenge.draw import Draw
-from tmlattice.diagnosis.kinds import How, Measured, part_of, stacked
+from tmlattice.diagnosis.kinds import Measured, PartOptions, part_of, stacked
 from tmlattice.effects import Cause, Effect, LaunchEffect, find, modelled
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
@@ -130,11 +130,11 @@ def problem_of(
 ) -> Problem:
     """Return measurements as a problem, with distributed errors of known sizes if there are any."""
     places = {name: float(max(len(find(name).places(ring)), 1)) for name in modelled(turns=True)}
-    how = How(ring, places, DEFAULT)
+    options = PartOptions(ring, places, DEFAULT)
     first, then = (
-        [part_of(label, one, how) for label, one in some.items()] for some in (measured, before)
+        [part_of(label, one, options) for label, one in some.items()] for some in (measured, before)
     )
-    problem = stacked(first, then, how)
+    problem = stacked(first, then, options)
     if not background:
         return problem
     everywhere = [
