@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.beam.model import Model
-from tmlattice.diagnosis.data_checks import corrected_data, data_checks
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks, raise_if_wrong
 from tmlattice.diagnosis.prepare import batch, noise_of, prepare
-from tmlattice.diagnosis.stored_data_checks import raise_if_wrong
-from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
@@ -207,11 +205,7 @@ def _of_stored(
     """A kind of a stored beam; with `shots`, some are held out if there are enough of them."""
 
     def made(label: str, kind: str, measured: Any, how: How) -> Part:
-        if how.assume:
-            raise MeasurementError(
-                f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
-                "correct the data themselves"
-            )
+        measured = corrected_data(how.ring, measured, how.assume)
         held = None
         ids = list(measured.shots) if shots else []
         count = round(how.holdout * len(ids))
