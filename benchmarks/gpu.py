@@ -26,6 +26,7 @@ from tmlattice.errors import BeamLostError
 from tmlattice.fitting.adam import fit_adam
 from tmlattice.harmonics import tunes
 from tmlattice.lattice.write import write_ring
+from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.measurement import Measurement
 from tmlattice.network import symplectic_penalty
 from tmlattice.network.reference import packed, plain_pass
@@ -208,6 +209,9 @@ class Run:
             begun = time.perf_counter()
             self.design.track(self.launches(count) * 0.1, turns, keep_lost=True)
             self.say(f"network.track, {count} x {turns}, s", time.perf_counter() - begun)
+        begun = time.perf_counter()
+        simulate_turns(load_ring("petra3"), turns=1000, particles=100_000, engine="network")
+        self.say("simulate_turns, 100000 x 1000, s", time.perf_counter() - begun)
 
     def xsuite(self, turns=3):
         """The design through Xsuite's own elements (exact drifts, thick magnets)."""

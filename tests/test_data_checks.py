@@ -16,7 +16,7 @@ from tmlattice.effects import Cause
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.machine import simulate
 from tmlattice.machine.response import simulate_response
-from tmlattice.measurement import write_measurement
+from tmlattice.measurement import Measurement, write_measurement
 from tmlattice.measurement.assume import ASSUMPTIONS, assume
 from tmlattice.observe.sections import Passes, Sections
 
@@ -348,7 +348,7 @@ def test_a_lattice_without_monitors_is_told(small_ring, healthy):
         diagnose(bare, healthy)
 
 
-@pytest.mark.parametrize("name", [n for n, a in ASSUMPTIONS.items() if a.trajectory])
+@pytest.mark.parametrize("name", [n for n, a in ASSUMPTIONS.items() if Measurement in a.kinds])
 def test_an_assumption_undoes_itself_and_touches_nothing_else(small_ring, machine, name):
     """The given measurement stays as it is, and what comes out is a measurement still."""
     monitors = [monitor.name for monitor in small_ring.monitors]

@@ -13,6 +13,7 @@ from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse
 from tmlattice.measurement.lost_beam import FEWEST, LostBeam
+from tmlattice.measurement.monitors import LARGEST_READING
 from tmlattice.observe.noise import SAME_PLACE
 
 Array = NDArray[np.float64]
@@ -159,6 +160,14 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     if not np.count_nonzero(values[there]):
         text = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen monitors", text)]
+    large = np.abs(values) > LARGEST_READING
+    if 0 < 2 * large.sum() < there.sum():  # if most are, their unit is wrong
+        own = some([names[m] for m in np.flatnonzero(large.any(axis=(0, 2)))])
+        text = (
+            f"{large.sum()} of {there.sum()} readings are above {LARGEST_READING} m, of {own}: no "
+            "beam reads that; leave them out (NaN, or an empty field)"
+        )
+        return [wrong("large readings", text)]
     checks = []
     checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [

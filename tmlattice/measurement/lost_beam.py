@@ -7,15 +7,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.measurement.shots import TurnByTurn
 from tmlattice.measurement.trajectory import Measurement
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
+Data = TypeVar("Data", Measurement, TurnByTurn)
 
 FEWEST = 3
 """BPMs without signal, the last ones, from which the beam is lost: one or two may be frozen."""
@@ -30,7 +33,7 @@ REPEATED = 0.01
 
 
 @dataclass(frozen=True)
-class LostBeam:
+class LostBeam(Generic[Data]):
     """Where the signals of a measurement end.
 
     Attributes:
@@ -41,7 +44,7 @@ class LostBeam:
         last: the last reading with a signal before that, [shot]; -1 where there is none.
     """
 
-    without: Measurement
+    without: Data
     first: Places
     last: Places
 
@@ -51,7 +54,7 @@ class LostBeam:
         return np.flatnonzero(self.first < self.without.readings[0].size // 2)
 
 
-def beam_lost(data: Measurement) -> LostBeam:
+def beam_lost(data: Data) -> LostBeam[Data]:
     """Where the signals of each shot end in a constant.
 
     No signal is a run of the last BPMs of a shot that read the same, to the last digit in both
@@ -59,7 +62,7 @@ def beam_lost(data: Measurement) -> LostBeam:
     shots is none.
 
     Args:
-        data: monitors in beam order.
+        data: first turns, or turns of a stored beam; monitors in beam order.
     """
     shots = len(data.readings)
     data = _planes(data)
@@ -81,7 +84,7 @@ def beam_lost(data: Measurement) -> LostBeam:
     return LostBeam(replace(data, readings=readings), first, last)
 
 
-def _planes(data: Measurement) -> Measurement:
+def _planes(data: Data) -> Data:
     """Without a plane that is one constant at all BPMs in all shots, where the other one is none.
 
     Readings without noise may be so: the orbit of a flat ring.
