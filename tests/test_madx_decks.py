@@ -102,7 +102,7 @@ REFUSED = {
         "'q' begins at 2.700000 m, before the end of 'qd' at 3.100000 m",
     ),
     "beyond": (
-        with_element("q: quadrupole, l=0.4, at=5.1;"), "L ends at 41.600000 m, before"
+        with_element("q: quadrupole, l=0.4, at=5.1;"), "its length ends at 41.600000 m, before"
     ),
     "particle": (
         PLAIN.replace("particle=electron", "particle=pb54"), "particle 'pb54' without a MASS"

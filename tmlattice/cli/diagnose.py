@@ -137,7 +137,9 @@ def diagnose(
     an orbit response alone has a step for each family of errors; options about launches do not
     apply to it.
     """
-    with outputs(out, json_file) as (folder, write):
+    from tmlattice.correction.result import FILES
+
+    with outputs(out, json_file, FILES) as (folder, write):
         from tmlattice.correction.applied import applied, read_settings
         from tmlattice.correction.applied import sentence as of_device
         from tmlattice.effects import background_rms, names
@@ -147,11 +149,11 @@ def diagnose(
         background_rms(dict(background))
         if settings_file and not references:
             raise click.UsageError("--settings needs the measurement from before: --reference")
-        asked = read_settings(settings_file) if settings_file else {}
         from tmlattice.diagnosis import diagnose as run
         from tmlattice.measurement import Measurement, OrbitResponse
 
         ring = open_ring(lattice)
+        asked = read_settings(settings_file, ring) if settings_file else []
         (data, said), (before, _) = (_read(p, ring) for p in (measurements, references))
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more

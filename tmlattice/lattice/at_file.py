@@ -16,6 +16,7 @@ Coordinates of a matrix element are turned from AT's (.., delta, ct) into OCELOT
 tau = ct, p = beta0 delta.
 """
 
+import cmath
 import logging
 import math
 import re
@@ -233,9 +234,34 @@ def _places(
     if isinstance(element, at.Corrector) and not _acts(element):
         return _correctors(element, family, mad)
     kind, source = _convert(element, family, mad, energy, left_out, tracker)
-    if kind == "bend":
-        return with_coils(element, family, source)
-    return [(family, kind, source)]
+    own = with_coils(element, family, source) if kind == "bend" else [(family, kind, source)]
+    if kind not in ("matrix", "wiggler"):  # those are all that AT makes of the element
+        own = _with_fringes(element, family, own, energy, tracker)
+    return own
+
+
+def _with_fringes(
+    element: Any, family: str, own: list[Place], energy: float, tracker: Tracker
+) -> list[Place]:
+    """An element between the matrices of its linear quadrupole fringes (AT's model 2)."""
+    sides = [s for s in ("Entrance", "Exit") if getattr(element, f"FringeQuad{s}", 0) == 2]
+    if not sides or not all(hasattr(element, f"fringeInt{sign}0") for sign in "MP"):
+        return own
+
+    def without(*off: str) -> Array:
+        other = element.deepcopy()
+        for side in off:
+            setattr(other, f"FringeQuad{side}", 0)
+        return tracker.map(other)[0]
+
+    bare = np.linalg.inv(without("Entrance", "Exit"))
+    fringes = {"Entrance": bare @ without("Exit"), "Exit": without("Entrance") @ bare}
+    made: dict[str, Place] = {
+        side: (f"{family}_fringe", *_matrix(fringes[side], f"{family}_fringe", 0.0, energy))
+        for side in sides
+    }
+    first, last = ([made[s]] if s in made else [] for s in ("Entrance", "Exit"))
+    return [*first, *own, *last]
 
 
 def _convert(
@@ -329,7 +355,9 @@ def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     given = np.asarray(element.KickAngle, dtype=float).ravel()[:2]
     if element.PassMethod.startswith(("Corrector", *_FIELDS)):  # else it is switched off
         kicks[: len(given)] = given
-    x, y = kicks.tolist()
+    R1, _ = _rotations(element)
+    turned = complex(*kicks) * cmath.exp(1j * math.atan2(R1[0, 2], R1[0, 0]))
+    x, y = turned.real, turned.imag
     names = (str(element.FamName), family)
     horizontal = mad == "HKICKER" or any(_HORIZONTAL.search(name) for name in names)
     vertical = mad == "VKICKER" or any(_VERTICAL.search(name) for name in names)

@@ -37,7 +37,7 @@ def displaced(ring: Ring) -> Ring:
     return ring.with_elements(moved)
 
 
-def magnetic_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
+def made(ring: Ring) -> tuple[Any, tuple[str, ...]]:
     """OCELOT's `MagneticLattice` with elements of its own, and what it lacks.
 
     Args:
@@ -75,7 +75,7 @@ def _lacks(ring: Ring) -> tuple[str, ...]:
     return tuple(told)
 
 
-def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
+def write(ring: Ring, path: Path) -> tuple[str, ...]:
     """Write plain elements as code; what it lacks.
 
     Args:
