@@ -144,6 +144,8 @@ def test_an_orbit_that_is_millimetres_off_is_no_global_error(small_ring, seed):
     causes = draw_background(small_ring, rms, seed)
     data = simulate(small_ring, causes, seed=1000 * seed).measurement()
     assert [check.sentence for check in told(check_data(small_ring, data))] == []
+    if np.isfinite(data.readings).mean() < 0.5:
+        return  # a third of the BPMs does not show what is exchanged
     swapped = replace(data, readings=data.readings[..., ::-1])
     (check,) = told(check_data(small_ring, swapped))
     assert check.assume == ("planes-exchanged",)

@@ -26,6 +26,7 @@ from tmlattice.measurement.assume import assume, read_of
 from tmlattice.measurement.shots import FEWEST
 from tmlattice.observe.global_errors import Names, Search, Verdict
 from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.response_data import read as read_rf
 from tmlattice.observe.sections import mean_pass
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
@@ -191,7 +192,7 @@ class OfResponse(Compared):
 
     def rf_scale(self) -> float:
         """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
-        if not self.stepped:
+        if not self.stepped or not read_rf(self.data):
             return float("nan")
         read, made, _ = self.pairs(self.data)
         return ratio(read[-1:], made[-1:])
