@@ -25,6 +25,8 @@ CUT = FEWEST
 """Silent BPMs at the end of a shot from which on the beam counts as lost."""
 ALIKE = 0.5
 """Share of constant signals from which on the data are no readings."""
+SENSIBLE = LARGEST_READING / 100
+"""m; typical reading below which the readings are in metres, and larger ones are none."""
 STRAY = 0.02
 """Share of a turn's readings below which a turn far behind the others is a wrong number."""
 
@@ -161,7 +163,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         text = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen monitors", text)]
     large = np.abs(values) > LARGEST_READING
-    if 0 < 2 * large.sum() < there.sum():  # if most are, their unit is wrong
+    if large.any() and np.median(np.abs(values[there])) < SENSIBLE:  # else their unit is wrong
         own = some([names[m] for m in np.flatnonzero(large.any(axis=(0, 2)))])
         text = (
             f"{large.sum()} of {there.sum()} readings are above {LARGEST_READING} m, of {own}: no "
