@@ -62,10 +62,10 @@ FAR = 100.0
 benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first BPMs change."""
-NOTHING_FROM, NO_BEAM, HALF = 2, 0.75, 0.5
-"""Sections at the end that follow no trajectory, from which on the beam was lost: swapped BPMs
-spoil one; the share of their readings that is left then, of noise 0.9; and the share that separates
-them from others."""
+NOTHING_FROM, SURE, NO_BEAM, HALF = 2, 4, 0.75, 0.5
+"""Sections at the end that follow no trajectory, from which on the beam may be lost, and is: a few
+swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9; and the share
+that separates them from others."""
 SECTIONS = 4
 """Fewest passes that determine the usual misfit."""
 SPOILT = 3.0
@@ -300,7 +300,8 @@ def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
     if not (NOTHING_FROM <= len(behind) < len(read) and left > NO_BEAM):
         return []
     first = ring[checked.data.monitors[found.owner[behind[0], 0]]]
-    return [wrong(
+    make = wrong if len(behind) >= SURE else note
+    return [make(
         "lost beam",
         f"from {first.name} (s = {first.s:.2f} m) on the readings follow no trajectory in any "
         "shot, and before they do: the beam was lost, or these BPMs have other names; leave their "
