@@ -408,6 +408,8 @@ def _spikes(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
 # --- what is compared with the design's -----------------------------------------------------------
 def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[Check]:
     checks: list[Check] = []
+    if isinstance(data, TurnByTurn):
+        data = beam_lost(data).without
     if not isinstance(data, TuneReading):
         values = read_of(data).reshape(-1, len(data.monitors), 2)
         moved = isinstance(data, OrbitResponse | TurnByTurn)

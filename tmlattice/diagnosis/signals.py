@@ -14,6 +14,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse
 from tmlattice.measurement.lost_beam import FEWEST, LostBeam
 from tmlattice.measurement.monitors import LARGEST_READING
+from tmlattice.measurement.shots import FEWEST as TURNS
 from tmlattice.observe.noise import SAME_PLACE
 
 Array = NDArray[np.float64]
@@ -24,7 +25,8 @@ NAMED = 3
 CUT = FEWEST
 """Silent BPMs at the end of a shot from which on the beam counts as lost."""
 ALIKE = 0.5
-"""Share of constant signals from which on the data are no readings."""
+"""Share of constant signals from which on the data are no readings; and of the readings of a signal
+that repeat the one before, from which on it is frozen."""
 SENSIBLE = LARGEST_READING / 100
 """m; typical reading below which the readings are in metres, and larger ones are none."""
 STRAY = 0.02
@@ -187,7 +189,8 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     with np.errstate(invalid="ignore"):
         high = np.where(there, values, -np.inf).max(axis=0)
         low = np.where(there, values, np.inf).min(axis=0)
-    stuck = many & (high == low)
+    again = (values[1:] == values[:-1]).sum(axis=0) > ALIKE * (len(values) - 1)
+    stuck = many & ((high == low) | (again & (moved & (len(values) >= TURNS))))
     frozen = [
         n if both else f"{n} in {'x' if x else 'y'}"
         for n, (x, y), both in zip(names, stuck, stuck.all(axis=1), strict=True)
@@ -200,7 +203,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         )
         checks.append(wrong("frozen monitors", text))
     elif frozen:
-        text = f"the same reading in every shot and turn: {some(frozen)}; leave the signal out"
+        text = f"the same reading again and again: {some(frozen)}; leave the signal out"
         checks.append(note("frozen monitors", text))
     else:
         checks.append(fine("frozen monitors", "no BPM is frozen"))
