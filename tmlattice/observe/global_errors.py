@@ -405,8 +405,8 @@ class OfTurns(Search):
             ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
         noise = np.log(ratio * np.sqrt(square)) / NOISE_WIDTH if data.noise is not None else 0.0
         orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
-        size = max(float(np.median((sections.kicked**2).sum(axis=2))), 1e-300)
-        kicks = KICKS / size
+        moved = (sections.kicked**2).sum(axis=2)  # none where nothing was read
+        kicks = KICKS / np.median(moved[moved > 0]) if moved.any() else KICKS[:1]
         parts = [own.cost(square, kicks) for own in (sections, *joints)]
         if launch is not None:  # in m and rad; the information of launches differs
             parts.append(np.maximum(launch.cost(1.0, square * kicks), 0.0))
