@@ -112,9 +112,10 @@ def check_data(
     if few is None:
         names = [monitor.name for monitor in ring.monitors]
         data = assume(in_beam_order(data, names), assumed, names)
-        first = isinstance(data, Measurement)
-        known = expected_radiation(ring) if radiation and first else ()
-        checks += _of_first_turns(ring, data, known) if first else _of_compared(ring, data)
+        if isinstance(data, Measurement):
+            checks += _of_first_turns(ring, data, expected_radiation(ring) if radiation else ())
+        else:
+            checks += _of_compared(ring, data)
     else:
         checks.append(few)
     plain = "trajectory" if isinstance(data, Measurement) else "orbit_response"

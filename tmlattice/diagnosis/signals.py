@@ -11,7 +11,7 @@ from tmlattice.diagnosis.records import encoded, named
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.measurement import AnyMeasurement, Measurement, TuneReading
 from tmlattice.measurement.lost_beam import FEWEST, LostBeam
 from tmlattice.measurement.monitors import LARGEST_READING
 from tmlattice.measurement.shots import FEWEST as TURNS
@@ -166,7 +166,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         return [wrong("frozen monitors", text)]
     large = np.abs(values) > LARGEST_READING
     if large.any() and np.median(np.abs(values[there])) < SENSIBLE:  # else their unit is wrong
-        own = some([names[m] for m in np.flatnonzero(large.any(axis=(0, 2)))])
+        own = some([names[m] for m in np.flatnonzero(large.any(axis=(0, 2))).tolist()])
         text = (
             f"{large.sum()} of {there.sum()} readings are above {LARGEST_READING} m, of {own}: no "
             "beam reads that; leave them out (NaN, or an empty field)"
@@ -234,7 +234,7 @@ def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> li
     return found
 
 
-def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
+def first_turns(ring: Ring, data: Measurement, lost: LostBeam[Measurement]) -> list[Check]:
     """Check first turns for invalid turn numbers and lost beams.
 
     Args:
@@ -265,7 +265,7 @@ def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
     return checks
 
 
-def _no_signal(ring: Ring, lost: LostBeam) -> str:
+def _no_signal(ring: Ring, lost: LostBeam[Measurement]) -> str:
     """The message where the beam was lost, by constant readings."""
     data, shots = lost.without, lost.shots
     ends = sorted(set(lost.last[shots].tolist()))
@@ -305,9 +305,9 @@ def _turns(there: Flags) -> Check:
     return fine("turns", f"{turns} read")
 
 
-def few(ring: Ring, data: Measurement | OrbitResponse) -> Check | None:
+def few(ring: Ring, data: AnyMeasurement) -> Check | None:
     """The check for too few BPMs."""
-    if not ring.monitors:
+    if not ring.monitors and not isinstance(data, TuneReading):
         return wrong(
             "monitors", f"'{ring.name}' has no monitor; name those elements of the lattice that "
             "are monitors",

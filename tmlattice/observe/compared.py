@@ -215,15 +215,15 @@ class OfOrbits(Compared):
 
     def design(self, data: ClosedOrbit | Dispersion) -> Array:
         """Orbits [state, monitor, 2] of the design in the states of the data."""
-        own, key = self.data, repr(getattr(data, "settings", ()))
-        if isinstance(data, Dispersion) and isinstance(own, Dispersion):
-            pairs = zip(own.steps, data.steps, strict=True)
+        own: Any = self.data
+        make: Any = closed_orbits
+        if isinstance(data, Dispersion):
+            make, pairs = dispersion, zip(own.steps, data.steps, strict=True)
             own = replace(own, steps=tuple(replace(a, step=b.step) for a, b in pairs))
-            key = repr([step.step for step in own.steps])
-        elif isinstance(data, ClosedOrbit):
+        else:
             own = replace(own, settings=data.settings)
+        key = repr([step.step for step in own.steps] if make is dispersion else own.settings)
         if key not in self._designs:
-            make: Any = dispersion if isinstance(own, Dispersion) else closed_orbits
             problem = make(self.ring, own, dict.fromkeys(modelled(), 1.0))
             order = {name: i for i, name in enumerate(self.monitors)}
             at = [order[self.ring[name].name] for name in data.monitors]
@@ -238,7 +238,8 @@ class OfOrbits(Compared):
                 return np.full_like(read, np.nan), made, 0.0
             there = np.isfinite(read)
             read, made = (own - mean_pass(own, there) for own in (read, made))
-        return read, made, 2 * np.broadcast_to(np.nan_to_num(data.noise), read.shape) ** 2
+        noise = np.zeros(2) if data.noise is None else np.nan_to_num(data.noise)
+        return read, made, 2 * np.broadcast_to(noise, read.shape) ** 2
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""

@@ -117,8 +117,8 @@ class Split:
 
     @classmethod
     def of(
-        cls, miss: Array, spread: Array, kicked: Array, there: Flags, freedom: Array,
-        errors: float = ERRORS,
+        cls, miss: Array, spread: Array, kicked: Array, there: Flags,
+        freedom: Array | NDArray[np.int64], errors: float = ERRORS,
     ) -> "Split":  # fmt: skip
         """Split mismatches.
 
