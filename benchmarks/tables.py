@@ -11,6 +11,7 @@ import platform
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -85,11 +86,80 @@ def of_score(scored):
             yield [text, *(f"{100 * found[name][rate]['share']:.1f} %" for name in BLIND)]
 
 
+def false_alarm(row):
+    """Whether something was found in a machine of `healthy.py`."""
+    return bool(row.get("found")) or (row["verdict"], row["errors"]) == ("distributed", "none")
+
+
+def of_healthy(rows):
+    """False alarms of `healthy.py` by ring and kind of measurement, where there is a diagnosis."""
+    kinds = list(dict.fromkeys((row["errors"], row["kind"]) for row in rows))
+    yield ["ring", *(f"{kind.replace('_', ' ')}, {errors}" for errors, kind in kinds)]
+    for name in [*dict.fromkeys(row["ring"] for row in rows), "all"]:
+        line = [name]
+        for errors, kind in kinds:
+            own = [r for r in rows if name in (r["ring"], "all")
+                   and (r["errors"], r["kind"]) == (errors, kind)]  # fmt: skip
+            done = [r for r in own if r["verdict"] not in ("no beam", "refused", "traceback")]
+            others = Counter(r["verdict"] for r in own if r not in done)
+            cells = [f"{sum(map(false_alarm, done))} of {len(done)}"] if done else []
+            line.append(", ".join(cells + [f"{n} {verdict}" for verdict, n in others.items()]))
+        yield line
+
+
+def of_turns(rows):
+    """Counts of `turns_amplitude.py` by ring, fault and amplitude, of what was not refused."""
+    amplitudes = sorted({row["amplitude"] for row in rows})
+    yield ["ring", "quadrupole", *(f"{1e3 * own:g} mm" for own in amplitudes)]
+    for name, fault in dict.fromkeys((row["ring"], row["fault"]) for row in rows):
+        line = [name, f"{100 * fault:g} %: named" if fault else "right: false alarms"]
+        for amplitude in amplitudes:
+            case = name, fault, amplitude
+            own = [r for r in rows if (r["ring"], r["fault"], r["amplitude"]) == case]
+            done = [r for r in own if r["verdict"] not in ("refused", "error")]
+            count = sum(r["right"] if fault else r["verdict"] != "none" for r in done)
+            cells = [f"{count} of {len(done)}"] if done else []
+            cells += [f"{len(own) - len(done)} refused"] if len(done) < len(own) else []
+            line.append(", ".join(cells))
+        yield line
+
+
+def of_stated_errors(rows):
+    """The rms pulls of `stated_errors.py`, by ring."""
+
+    def rms(values):
+        return f"{np.sqrt(np.mean(np.square(values))):.2f}" if values else ""
+
+    yield ["ring", "machines", "numbers", "all", "determined by the data", "not determined",
+           "gradients", "faulty quadrupole", "its largest pull"]  # fmt: skip
+    for name in [*dict.fromkeys(row["ring"] for row in rows), "all"]:
+        some = [row for row in rows if name in (row["ring"], "all")]
+        pairs = [pair for row in some for own in row["pulls"].values() for pair in own]
+        faulty = [own["pull"] for row in some for own in row["faulty"]]
+        yield [
+            name, str(len(some)), f"{len(pairs):,}", rms([pull for pull, _ in pairs]),
+            rms([pull for pull, share in pairs if share >= 0.5]),
+            rms([pull for pull, share in pairs if share < 0.5]),
+            rms([pull for row in some for pull, _ in row["pulls"]["quadrupole_gradient"]]),
+            rms(faulty), f"{max(map(abs, faulty), default=0):.1f}",
+        ]  # fmt: skip
+
+
 SOURCES = {
+    "healthy.jsonl": of_healthy,
+    "turns_amplitude.jsonl": of_turns,
+    "stated_errors.jsonl": of_stated_errors,
     "gpu_raw.json": of_gpu,
     "correct_studies.jsonl": of_corrections,
     "blind_score.json": of_score,
 }
+
+
+def markdown(rows):
+    """Rows of cells as a table."""
+    head, *others = ["| " + " | ".join(row) + " |" for row in rows]
+    line = "|---" * (head.count(" | ") + 1) + "|"
+    return "\n".join([head, line, *others])
 
 
 def filled(text):
@@ -103,9 +173,7 @@ def filled(text):
             if stored["source"].endswith(".jsonl"):
                 source = f"[{','.join(source.splitlines())}]"
             rows = SOURCES[stored["source"]](json.loads(source))
-        head, *others = ["| " + " | ".join(row) + " |" for row in rows]
-        line = "|---" * (head.count(" | ") + 1) + "|"
-        return "\n".join([place[1], head, line, *others, place[3]])
+        return f"{place[1]}\n{markdown(rows)}\n{place[3]}"
 
     return PLACE.sub(made, text)
 

@@ -11,7 +11,7 @@ from tmlattice import Cause, diagnose, simulate, write_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import stages
-from tmlattice.diagnosis.kinds import How, part_of, stacked
+from tmlattice.diagnosis.kinds import PartOptions, part_of, stacked
 from tmlattice.diagnosis.twin import known_of
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import EffectError, MeasurementError
@@ -274,7 +274,7 @@ def test_readings_that_are_given_twice_are_refused(small_ring):
 def test_small_errors_that_leave_no_stored_beam_are_told(small_ring):
     """Half of them stood in the model that is shown, and nobody said so."""
     places = {"quadrupole_gradient": 1.0}
-    how = How(small_ring, places, DEFAULT)
+    how = PartOptions(small_ring, places, DEFAULT)
     problem = stacked([part_of("orbit", _orbit(small_ring, []), how)], [], how)
     far = tuple(Cause("quadrupole_gradient", f"QF::{i}", 0.9) for i in range(16))
     about = {(cause.effect, cause.element): 0.0 for cause in far}

@@ -285,7 +285,7 @@ def read_case(folder: Path, name: str) -> Case:
     return Case(name, public["lattice"], parts, public["options"], tuple(kinds))
 
 
-RECORDS: Mapping[str, type] = {kind: record for kind, (record, _) in KINDS.items()}
+RECORDS: Mapping[str, type] = {name: kind.record for name, kind in KINDS.items()}
 
 
 def read_truth(folder: Path, name: str) -> Truth:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tmlattice.beam.model import Model
 from tmlattice.challenge.case import BEFORE, Case, Truth, ring_of
 from tmlattice.challenge.draw import Draw
-from tmlattice.diagnosis.kinds import How, Measured, part_of, stacked
+from tmlattice.diagnosis.kinds import Measured, PartOptions, part_of, stacked
 from tmlattice.effects import Cause, Effect, LaunchEffect, Settings, find, modelled
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
@@ -136,11 +136,11 @@ def problem_of(
     background: Mapping[str, float],
 ) -> Problem:
     """Return measurements as a problem, with distributed errors of known sizes if there are any."""
-    how = How(ring, _places(ring, turns=True), DEFAULT)
+    options = PartOptions(ring, _places(ring, turns=True), DEFAULT)
     first, then = (
-        [part_of(label, one, how) for label, one in some.items()] for some in (measured, before)
+        [part_of(label, one, options) for label, one in some.items()] for some in (measured, before)
     )
-    return _among(stacked(first, then, how), ring, background)
+    return _among(stacked(first, then, options), ring, background)
 
 
 def problem_of_case(

@@ -24,7 +24,7 @@ from tmlattice.diagnosis.findings import (
     verdict_of,
     with_consequences,
 )
-from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
+from tmlattice.diagnosis.kinds import Measured, Part, PartOptions, kind_of, part_of, stacked
 from tmlattice.diagnosis.next_kind import leading, next_kind
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
@@ -106,27 +106,31 @@ def diagnose_together(
     """
     begun = time.perf_counter()
     judgement = Judgement(false_alarm=false_alarm)
-    how = How(ring, {}, judgement, holdout, assume, seed)
+    options = PartOptions(ring, {}, judgement, holdout, assume, seed)
     progress("data")
     kinds = [kind_of(one) for one in measured.values()]
     if kinds == ["trajectory"] and known is None:  # with launches of its own, all can be shared
         (label, one), *_ = measured.items()
         first = next(iter((reference or {}).values()), None)
-        whole = replace(how, effects=effects, radiation=radiation, reference=first, heldout=heldout)
+        whole = replace(
+            options, effects=effects, radiation=radiation, reference=first, heldout=heldout
+        )
         parts, before = [part_of(label, one, whole)], list[Part]()
         hypotheses = list(parts[0].hypotheses or ())
         chosen = list(parts[0].problem.places)
-        how = replace(whole, places=parts[0].problem.places)
+        options = replace(whole, places=parts[0].problem.places)
     else:
         chosen = _chosen(ring, effects, "turn_by_turn" in kinds)
         places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
-        how = replace(how, places=places)
-        parts = [with_silent(ring, _named(label, one, how), one) for label, one in measured.items()]
-        plain = replace(how, holdout=0.0)
+        options = replace(options, places=places)
+        parts = [
+            with_silent(ring, _named(label, one, options), one) for label, one in measured.items()
+        ]
+        plain = replace(options, holdout=0.0)
         before = [_named(label, one, plain) for label, one in (reference or {}).items()]
         hypotheses = _seen(ring, chosen, parts)
     problem = replace(
-        stacked(parts, before, how), rare=rare(ring, chosen),
+        stacked(parts, before, options), rare=rare(ring, chosen),
         fixed=() if known is None else known.causes,
     )  # fmt: skip
     search = Search(
@@ -154,7 +158,7 @@ def diagnose_together(
         parts = [replace(part, problem=learnt) for part, learnt in own]
     progress("report")
     return _report(
-        ring, parts, problem, sought_out.explanation, small, how,
+        ring, parts, problem, sought_out.explanation, small, options,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
             "options": {
@@ -168,9 +172,9 @@ def diagnose_together(
     )  # fmt: skip
 
 
-def _named(label: str, measured: Measured, how: How) -> Part:
+def _named(label: str, measured: Measured, options: PartOptions) -> Part:
     try:
-        return part_of(label, measured, how)
+        return part_of(label, measured, options)
     except MeasurementError as error:
         raise MeasurementError(f"{label}: {error}") from error
 
@@ -203,10 +207,10 @@ def _report(
     problem: CombinedProblem,
     found: Explanation,
     small: FittedErrors | None,
-    how: How,
+    options: PartOptions,
     made: Mapping[str, Any],
 ) -> Diagnosis:
-    judgement = how.judgement
+    judgement = options.judgement
     found = finished(_by_ring(ring, problem, found))
     result = found.fit
     # what counts turns late reads nothing in the first ones
@@ -276,7 +280,7 @@ def _report(
             judgement,
         ),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(corrected)},
-        next=_next(ring, found, parts, how, problem.fixed),
+        next=_next(ring, found, parts, options, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),
         warnings=tuple(dict.fromkeys(warnings)),
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
@@ -295,17 +299,21 @@ def _report(
 
 
 def _next(
-    ring: Ring, found: Explanation, parts: Sequence[Part], how: How, fixed: tuple[Cause, ...]
+    ring: Ring,
+    found: Explanation,
+    parts: Sequence[Part],
+    options: PartOptions,
+    fixed: tuple[Cause, ...],
 ) -> NextMeasurement | None:
     """The recommended next measurement: of first turns one more shot, else another kind."""
     one = parts[0].problem
     if len(parts) > 1 or not isinstance(one, FirstTurns):
-        return next_kind(ring, found, [part.kind for part in parts], how, fixed)
-    pair = leading(ring, found, how.judgement.mass)
+        return next_kind(ring, found, [part.kind for part in parts], options, fixed)
+    pair = leading(ring, found, options.judgement.mass)
     if pair is None:
         return None
     try:
-        return next_measurement(ring, one.data, *pair, one.model.assembly.known, how.seed)
+        return next_measurement(ring, one.data, *pair, one.model.assembly.known, options.seed)
     except TmlatticeError:
         log.warning("no next measurement could be found", exc_info=True)
     return None

@@ -128,8 +128,8 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
         for mode, line in enumerate(modes):
             if line is None:
                 continue
-            louder = noise_at(fit, line, quiet)
-            if louder > MAX_SIDE_NOISE:
+            louder = noise_at(fit, line, quiet, planes)
+            if louder.mean() > MAX_SIDE_NOISE:
                 _warn(warnings, shot, IMPURE.format(mode + 1))
             mirrored = near is not None and near[mode] % 1 > 0.5
             turned = np.conj if mirrored else np.asarray
