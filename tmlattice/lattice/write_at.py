@@ -46,9 +46,9 @@ def write(ring: Ring, path: Path) -> tuple[str, ...]:
     """
     from at.load.json import save_json
 
-    lattice, told = made(ring)
+    lattice, lacks = made(ring)
     save_json(lattice, str(path))
-    return told
+    return lacks
 
 
 def made(ring: Ring) -> tuple[Any, tuple[str, ...]]:
