@@ -45,6 +45,10 @@ ERRORS = 4.0
 """Stated errors that an amount may be from the truth."""
 PULLS = 2.0
 """Largest rms of the misses of fitted small errors over their stated errors."""
+FALLS = 0.5
+"""Share of the residual of held-out correctors that small errors which are fitted may leave."""
+NOISE = 3.0
+"""Chi-square of a reading below which that residual is noise."""
 MANY_OF = 8
 """Numbers above which they have an rms."""
 ANY = frozenset({"identified", "ambiguous", "localised", "distributed"})
@@ -218,7 +222,10 @@ def _of_small_errors(own: Scenario, result: Any) -> list[str]:
         amount = true.get((cause.effect, cause.element))
         if amount is not None and sigma:
             missed.setdefault(cause.effect, []).append((cause.amount - amount, sigma, amount))
-    faults = []
+    first, last = result.steps[0], result.steps[-1]
+    explained = last.heldout_rms_in_plane < FALLS * first.heldout_rms_in_plane
+    noise = last.heldout_chi2_per_dof < NOISE
+    faults = [] if explained or noise else ["held-out readings are not explained"]
     for effect, rows in missed.items():
         off, sigma, amount = np.transpose(rows)
         if effect in FITTED and len(rows) > MANY_OF and np.std(off / sigma) > PULLS:
