@@ -9,7 +9,7 @@ as well.
 The rings are the built-in one, the tests' small ring, those that accelerator-toolbox ships, and
 with TMLATTICE_DATA public decks and the lattices of measured rings. A machine whose errors leave no
 beam has no measurement and is not counted. Rows are appended to FILE (one JSON object a line), and
-rows that FILE holds already are not measured again; `--table` prints the counts of FILE alone.
+rows that FILE holds already are not measured again.
 
     python benchmarks/healthy.py --rings small thomx --seeds 0 1 2 --out healthy.jsonl
 """
@@ -24,10 +24,10 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections import Counter
 from pathlib import Path
 
 import machine_data
+from tables import false_alarm, markdown, of_healthy
 
 from tmlattice import diagnose, load_ring, simulate
 from tmlattice.challenge.make import evenly
@@ -125,29 +125,6 @@ def one(ring, name: str, kind: str, errors: str, seed: int) -> dict:
     return row | {"seconds": round(time.process_time() - begun, 1)}
 
 
-def alarm(row: dict) -> bool:
-    """Whether something was found where nothing is."""
-    return bool(row.get("found")) or (row["verdict"], row["errors"]) == ("distributed", "none")
-
-
-def table(rows: list[dict]) -> str:
-    """False alarms of cases that were diagnosed, by ring and kind of measurement."""
-    kinds = [(errors, kind) for errors in ERRORS for kind in KINDS]
-    heads = [f"{kind.replace('_', ' ')}, {errors}" for errors, kind in kinds]
-    lines = [["ring", *heads], ["---"] * (len(kinds) + 1)]
-    for name in [*dict.fromkeys(row["ring"] for row in rows), "all"]:
-        line = [name]
-        for errors, kind in kinds:
-            own = [r for r in rows if name in (r["ring"], "all")
-                   and (r["errors"], r["kind"]) == (errors, kind)]  # fmt: skip
-            done = [r for r in own if r["verdict"] not in ("no beam", "refused", "traceback")]
-            others = Counter(r["verdict"] for r in own if r not in done)
-            said = [f"{sum(map(alarm, done))} of {len(done)}"] if done else []
-            line.append(", ".join(said + [f"{n} {verdict}" for verdict, n in others.items()]))
-        lines.append(line)
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def main() -> None:
     """Measure, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -156,14 +133,13 @@ def main() -> None:
     parser.add_argument("--errors", nargs="*", default=ERRORS, choices=ERRORS)
     parser.add_argument("--seeds", nargs="*", type=int, default=[0])
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--table", action="store_true")
     chosen = parser.parse_args()
     logging.getLogger("tmlattice").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
     there = chosen.out.read_text(encoding="utf-8").splitlines() if chosen.out.is_file() else []
     rows = [json.loads(line) for line in there]
     done = {(r["ring"], r["kind"], r["errors"], r["seed"]) for r in rows}
-    for name in [] if chosen.table else chosen.rings:
+    for name in chosen.rings:
         asked = [(name, kind, errors, seed) for kind in chosen.kinds for errors in chosen.errors
                  for seed in chosen.seeds]  # fmt: skip
         todo = [case for case in asked if case not in done]
@@ -179,10 +155,8 @@ def main() -> None:
             rows.append(row)
             with chosen.out.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
-            print(("ALARM " if alarm(row) else "") + json.dumps(row)[:400], flush=True)
-    print(table(rows))
-    counted = [r for r in rows if r["verdict"] not in ("no beam", "refused", "traceback")]
-    print(f"false alarms: {sum(map(alarm, counted))} of {len(counted)}")
+            print(("ALARM " if false_alarm(row) else "") + json.dumps(row)[:400], flush=True)
+    print(markdown(of_healthy(rows)))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
-"""Whether stated errors hold: `python benchmarks/stated_errors.py [--seeds 4] [--out FILE]`.
+"""Whether stated errors hold: `python benchmarks/stated_errors.py --out FILE [--seeds 4]`.
 
 Orbit responses of small rings with usual errors, AT as the machine. One quadrupole, at random,
 has an error of 3 % where the others of its family scatter by 0.1 %. For every fitted number of the
-hierarchical fit with a known truth the pull is (amount - truth) / stated error. The JSON has, for
-each ring, the rms pull of all numbers, of those that the data determine and of the others, the
-pulls of the faulty quadrupole, and the largest pulls. Errors that make a closed orbit are left out,
-for a machine corrects it; `--orbit` has them too: of the gradients that an orbit of millimetres
-makes in sextupoles the hierarchical fit has no model.
+hierarchical fit with a known truth the pull is (amount - truth) / stated error. A row of FILE (one
+JSON object a line, a machine each) has all pulls by effect, each with its share from the data, the
+faulty quadrupole's number, and the largest pulls; rows that FILE holds already are not measured
+again. Errors that make a closed orbit are left out, for a machine corrects it; `--orbit` has them
+too: of the gradients that an orbit of millimetres makes in sextupoles the hierarchical fit has no
+model.
 
 Rings come from the tests, from accelerator-toolbox, and from TMLATTICE_DATA if it is there.
 """
@@ -22,6 +23,7 @@ from pathlib import Path
 
 import machine_data
 import numpy as np
+from tables import markdown, of_stated_errors
 
 from tmlattice import Cause, Ring, diagnose, load_ring
 from tmlattice.diagnosis import Diagnosis
@@ -94,12 +96,26 @@ def study(case: Case, seed: int, orbit: bool) -> dict:
     ).measured
     begun = time.process_time()
     found = diagnose(ring, measured, seed=seed)
-    row = pulls(found, causes)
+    numbers = pulls(found, causes)
+    by_effect: dict[str, list] = {}
+    for own in numbers:
+        pair = [round(own["pull"], 3), round(own.get("share_from_data", 1.0), 3)]
+        by_effect.setdefault(own["effect"], []).append(pair)
+    largest = sorted(numbers, key=lambda own: -abs(own["pull"]))[:3]
+    gradients = [own for own in numbers if own["effect"] == "quadrupole_gradient"]
     return {
-        "ring": case.name, "seed": seed, "faulty": faulty, "verdict": found.verdict,
+        "ring": case.name, "orbit": orbit, "seed": seed, "verdict": found.verdict,
         "findings": [f"{f.effect} {f.element}" for f in found.findings],
-        "seconds": time.process_time() - begun, "numbers": row,
+        "faulty": [short(own) for own in gradients if own["element"] == faulty],
+        "largest": [short(own) for own in largest], "pulls": by_effect,
+        "seconds": round(time.process_time() - begun, 1),
     }  # fmt: skip
+
+
+def short(own: dict) -> dict:
+    """A number's entries that a reader needs."""
+    keys = ("effect", "element", "truth", "amount", "amount_sigma", "share_from_data", "pull")
+    return {key: own.get(key) for key in keys}
 
 
 def pulls(found: Diagnosis, causes: list[Cause]) -> list[dict]:
@@ -118,74 +134,32 @@ def pulls(found: Diagnosis, causes: list[Cause]) -> list[dict]:
     return rows
 
 
-def rms(values: list[float]) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if values else None
-
-
-def summary(rows: list[dict]) -> dict:
-    """Over the machines of one ring."""
-    numbers = [own for row in rows for own in row["numbers"]]
-    faulty = [
-        own for row in rows for own in row["numbers"]
-        if own["element"] == row["faulty"] and own["effect"] == "quadrupole_gradient"
-    ]  # fmt: skip
-    gradients = [own for own in numbers if own["effect"] == "quadrupole_gradient"]
-
-    def of(some: list[dict], clear: bool | None = None) -> float | None:
-        return rms([
-            own["pull"] for own in some
-            if clear is None or (own.get("share_from_data", 1.0) >= 0.5) == clear
-        ])  # fmt: skip
-
-    return {
-        "machines": len(rows),
-        "numbers": len(numbers),
-        "rms_pull": of(numbers),
-        "rms_pull_determined": of(numbers, True),
-        "rms_pull_not_determined": of(numbers, False),
-        "rms_pull_gradients": of(gradients),
-        "rms_pull_by_effect": {
-            name: of([own for own in numbers if own["effect"] == name])
-            for name in dict.fromkeys(own["effect"] for own in numbers)
-        },
-        "faulty": [
-            {key: own.get(key) for key in
-             ("element", "truth", "amount", "amount_sigma", "share_from_data", "pull")}
-            for own in faulty
-        ],
-        "largest_pull": max((abs(own["pull"]) for own in numbers), default=None),
-        "largest_pulls": [
-            {key: own.get(key) for key in ("effect", "element", "truth", "amount", "amount_sigma",
-                                           "share_from_data", "pull")}
-            for own in sorted(numbers, key=lambda own: -abs(own["pull"]))[:5]
-        ],
-        "seconds": float(np.median([row["seconds"] for row in rows])),
-    }  # fmt: skip
-
-
 def main() -> None:
+    """Measure, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*")
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--orbit", action="store_true")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
     chosen = parser.parse_args()
     logging.getLogger("tmlattice").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
-    found = {}
+    there = chosen.out.read_text(encoding="utf-8").splitlines() if chosen.out.is_file() else []
+    rows = [json.loads(line) for line in there]
+    done = {(row["ring"], row["orbit"], row["seed"]) for row in rows}
     for case in cases():
         if chosen.names and case.name not in chosen.names:
             continue
-        seeds = range(chosen.first, chosen.first + chosen.seeds)
-        rows = [study(case, seed, chosen.orbit) for seed in seeds]
-        found[case.name] = summary(rows) | {
-            "verdicts": [row["verdict"] for row in rows],
-            "findings": [row["findings"] for row in rows],
-        }
-        print(case.name, json.dumps(found[case.name]), flush=True)
-        if chosen.out:
-            chosen.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        for seed in range(chosen.first, chosen.first + chosen.seeds):
+            if (case.name, chosen.orbit, seed) in done:
+                continue
+            row = study(case, seed, chosen.orbit)
+            rows.append(row)
+            with chosen.out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+            print(json.dumps({key: row[key] for key in row if key != "pulls"}), flush=True)
+    print(markdown(of_stated_errors(rows)))
 
 
 if __name__ == "__main__":

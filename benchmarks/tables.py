@@ -11,6 +11,7 @@ import platform
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +19,19 @@ import numpy as np
 FOLDER = Path(__file__).parent.parent / "docs" / "results"
 PLACE = re.compile(r"(<!-- table (\w+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 GPU = (
-    ("a turn of 100,000 particles (mean of ten)", "track 100000, a turn of ten",
-     "torch loop 100000, one turn"),
-    ("a turn of 1,000,000 particles (mean of ten)", "track 1000000, a turn of ten",
-     "torch loop 1000000, one turn"),
+    ("a turn of 100,000 particles (mean of ten)", "4-D: track 100000, a turn of ten",
+     "4-D: torch loop 100000, one turn", None),
+    ("a turn of 1,000,000 particles (mean of ten)", "4-D: track 1000000, a turn of ten",
+     "4-D: torch loop 1000000, one turn", None),
     ("the same, design (65 % of its layers are linear)",
-     "track 1000000, the design, a turn of ten", None),
-    ("training step, 100,000 launches, 246 BPMs, all gradients", "training step 100000",
-     "torch loop, training step 100000"),
-    ("the same with the symplectic penalty", "training step 100000, with penalty", None),
+     "4-D: track 1000000, the design, a turn of ten", None,
+     "4-D: Xsuite 1000000, the design, one turn"),
+    ("training step, 100,000 launches, 246 BPMs, all gradients", "4-D: training step 100000",
+     "4-D: torch loop, training step 100000", None),
+    ("the same with the symplectic penalty", "4-D: training step 100000, with penalty", None, None),
+    ("six dimensions: a turn of 1,000,000 particles", "6-D: track 1000000, a turn of ten",
+     "6-D: torch loop 1000000, one turn", None),
+    ("six dimensions: training step, 100,000 launches", "6-D: training step 100000", None, None),
 )  # fmt: skip
 OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling")
 BLIND = {"tool": "`diagnose`", "oracle": "oracle", "omp": "matching pursuit", "lasso": "LASSO",
@@ -35,11 +40,11 @@ BANDS = {"above 20": "20 and more", "10-20": "10 to 20", "5-10": "5 to 10"}
 
 
 def of_gpu(stored):
-    """Kernels and torch loop of `gpu.py`."""
-    yield ["H100, times in ms", "kernels", "torch loop", "ratio"]
-    for words, ours, plain in GPU:
-        both = (stored[plain], stored[plain] / stored[ours]) if plain else ()
-        yield [words, f"{stored[ours]:.3g}", *(f"{v:.0f}" for v in both), *[""] * (2 - len(both))]
+    """Kernels, torch loop and Xsuite of `gpu.py`."""
+    yield ["H100, times in ms", "kernels", "torch loop (ratio)", "Xsuite (ratio)"]
+    for words, ours, *others in GPU:
+        beside = [f"{stored[o]:.0f} ({stored[o] / stored[ours]:.0f})" if o else "" for o in others]
+        yield [words, f"{stored[ours]:.3g}", *beside]
 
 
 def of_corrections(machines):
@@ -81,11 +86,80 @@ def of_score(scored):
             yield [text, *(f"{100 * found[name][rate]['share']:.1f} %" for name in BLIND)]
 
 
+def false_alarm(row):
+    """Whether something was found in a machine of `healthy.py`."""
+    return bool(row.get("found")) or (row["verdict"], row["errors"]) == ("distributed", "none")
+
+
+def of_healthy(rows):
+    """False alarms of `healthy.py` by ring and kind of measurement, where there is a diagnosis."""
+    kinds = list(dict.fromkeys((row["errors"], row["kind"]) for row in rows))
+    yield ["ring", *(f"{kind.replace('_', ' ')}, {errors}" for errors, kind in kinds)]
+    for name in [*dict.fromkeys(row["ring"] for row in rows), "all"]:
+        line = [name]
+        for errors, kind in kinds:
+            own = [r for r in rows if name in (r["ring"], "all")
+                   and (r["errors"], r["kind"]) == (errors, kind)]  # fmt: skip
+            done = [r for r in own if r["verdict"] not in ("no beam", "refused", "traceback")]
+            others = Counter(r["verdict"] for r in own if r not in done)
+            cells = [f"{sum(map(false_alarm, done))} of {len(done)}"] if done else []
+            line.append(", ".join(cells + [f"{n} {verdict}" for verdict, n in others.items()]))
+        yield line
+
+
+def of_turns(rows):
+    """Counts of `turns_amplitude.py` by ring, fault and amplitude, of what was not refused."""
+    amplitudes = sorted({row["amplitude"] for row in rows})
+    yield ["ring", "quadrupole", *(f"{1e3 * own:g} mm" for own in amplitudes)]
+    for name, fault in dict.fromkeys((row["ring"], row["fault"]) for row in rows):
+        line = [name, f"{100 * fault:g} %: named" if fault else "right: false alarms"]
+        for amplitude in amplitudes:
+            case = name, fault, amplitude
+            own = [r for r in rows if (r["ring"], r["fault"], r["amplitude"]) == case]
+            done = [r for r in own if r["verdict"] not in ("refused", "error")]
+            count = sum(r["right"] if fault else r["verdict"] != "none" for r in done)
+            cells = [f"{count} of {len(done)}"] if done else []
+            cells += [f"{len(own) - len(done)} refused"] if len(done) < len(own) else []
+            line.append(", ".join(cells))
+        yield line
+
+
+def of_stated_errors(rows):
+    """The rms pulls of `stated_errors.py`, by ring."""
+
+    def rms(values):
+        return f"{np.sqrt(np.mean(np.square(values))):.2f}" if values else ""
+
+    yield ["ring", "machines", "numbers", "all", "determined by the data", "not determined",
+           "gradients", "faulty quadrupole", "its largest pull"]  # fmt: skip
+    for name in [*dict.fromkeys(row["ring"] for row in rows), "all"]:
+        some = [row for row in rows if name in (row["ring"], "all")]
+        pairs = [pair for row in some for own in row["pulls"].values() for pair in own]
+        faulty = [own["pull"] for row in some for own in row["faulty"]]
+        yield [
+            name, str(len(some)), f"{len(pairs):,}", rms([pull for pull, _ in pairs]),
+            rms([pull for pull, share in pairs if share >= 0.5]),
+            rms([pull for pull, share in pairs if share < 0.5]),
+            rms([pull for row in some for pull, _ in row["pulls"]["quadrupole_gradient"]]),
+            rms(faulty), f"{max(map(abs, faulty), default=0):.1f}",
+        ]  # fmt: skip
+
+
 SOURCES = {
+    "healthy.jsonl": of_healthy,
+    "turns_amplitude.jsonl": of_turns,
+    "stated_errors.jsonl": of_stated_errors,
     "gpu_raw.json": of_gpu,
     "correct_studies.jsonl": of_corrections,
     "blind_score.json": of_score,
 }
+
+
+def markdown(rows):
+    """Rows of cells as a table."""
+    head, *others = ["| " + " | ".join(row) + " |" for row in rows]
+    line = "|---" * (head.count(" | ") + 1) + "|"
+    return "\n".join([head, line, *others])
 
 
 def filled(text):
@@ -99,9 +173,7 @@ def filled(text):
             if stored["source"].endswith(".jsonl"):
                 source = f"[{','.join(source.splitlines())}]"
             rows = SOURCES[stored["source"]](json.loads(source))
-        head, *others = ["| " + " | ".join(row) + " |" for row in rows]
-        line = "|---" * (head.count(" | ") + 1) + "|"
-        return "\n".join([place[1], head, line, *others, place[3]])
+        return f"{place[1]}\n{markdown(rows)}\n{place[3]}"
 
     return PLACE.sub(made, text)
 

@@ -62,18 +62,17 @@ def effects() -> str:
 
 def assumptions() -> str:
     """What may be assumed of data, in its own order."""
-    from tmlattice.measurement.assume import ASSUMPTIONS
+    from tmlattice.measurement.assume import ASSUMPTIONS, WORDS
 
     rows = [
         [
             f"`{name}`",
             own.words,
-            "yes" if own.trajectory else "",
-            "yes" if own.response else "",
+            ", ".join(WORDS[kind].partition(" ")[2] for kind in own.kinds),
         ]
         for name, own in ASSUMPTIONS.items()
     ]
-    return table(["--assume", "what is written down wrongly", "first turns", "responses"], rows)
+    return table(["--assume", "what is written down wrongly", "of"], rows)
 
 
 ROOT = Path(__file__).parent.parent

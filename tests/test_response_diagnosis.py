@@ -61,6 +61,15 @@ def fitted(ring, measured, seed=1):
     return fit_steps(data, split_columns(data, 0.2, np.random.default_rng(seed))).state
 
 
+def test_the_only_corrector_of_a_plane_is_fitted(small_ring, measured):
+    data = response_data(small_ring, measured)
+    alone = [p == "x" for p in measured.planes]
+    assert sum(alone) == 1
+    for seed in range(20):
+        split = split_columns(data, 0.3, np.random.default_rng(seed))
+        assert not (split.held | split.inner)[:-1][alone].any()
+
+
 @pytest.fixture(scope="module")
 def measured(small_ring):
     simulation = simulate_response(

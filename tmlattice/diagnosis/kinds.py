@@ -14,10 +14,9 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.model import Model
 from tmlattice.beam.rf import rf_of
 from tmlattice.beam.stored import StoredBeam
-from tmlattice.diagnosis.data_checks import corrected_data, data_checks
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks, raise_if_wrong
 from tmlattice.diagnosis.prepare import batch, noise_of, prepare
-from tmlattice.diagnosis.stored_data_checks import raise_if_wrong
-from tmlattice.errors import MeasurementError, TmlatticeError
+from tmlattice.errors import TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
@@ -225,11 +224,7 @@ def _of_stored(
     """A kind of a stored beam; with `shots`, some are held out if there are enough of them."""
 
     def made(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
-        if options.assume:
-            raise MeasurementError(
-                f"'{options.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
-                "correct the data themselves"
-            )
+        measured = corrected_data(options.ring, measured, options.assume)
         held = None
         ids = list(measured.shots) if shots else []
         count = round(options.holdout * len(ids))

@@ -77,7 +77,7 @@ def diagnose_together(
     measured: Mapping[str, Measured],
     *,
     reference: Mapping[str, Any] | None = None,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     known: DistributedErrors | None = None,
     holdout: float = 0.33,
     heldout: Measurement | None = None,
@@ -137,7 +137,9 @@ def diagnose_together(
         problem, hypotheses, max_effects, seed=seed, progress=progress,
         unnamed=all(part.kind != "orbit_response" for part in parts),
     )  # fmt: skip
-    usual = background_rms({"all": None})
+    usual = background_rms("all")
+    if isinstance(background, str):
+        background = {background: None}
     sizes = usual if background is None else background_rms(background)
     everywhere = [(name, place) for name in sizes for place in find(name).places(ring)]
     learn = background is None

@@ -217,7 +217,7 @@ class Diagnosis(Speaks):
         compared: blocks of readings with their prediction by the result.
         correlations: pairs of amounts that the data hardly separate.
         covariance: of the amounts of the causes, [cause, cause]; None where none is stated, as of
-            a change between two orbit responses and of a diagnosis that was loaded. See `tables`.
+            many changes between two orbit responses, and after loading. See `tables`.
         devices: what the control system calls elements, by their names.
         supports: how much of each cause comes from the data, the same length; empty where all do,
             because their priors are log-uniform.

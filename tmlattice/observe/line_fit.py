@@ -257,8 +257,9 @@ def floor(fit: LineFit) -> Array:
     return np.asarray(np.sqrt(np.median(power, axis=1) / np.log(2) / mean))
 
 
-def noise_at(fit: LineFit, line: int, quiet: Array) -> float:
-    """Noise at a line over that at all frequencies and turns, at least 1; of the typical signal.
+def noise_at(fit: LineFit, line: int, quiet: Array, planes: NDArray[np.int64]) -> Array:
+    """Noise at a line over that at all frequencies and turns, at least 1; of the typical signal of
+    each plane, [signal]. Lines near this one may be in one plane alone.
 
     A line is measured in the turns in which its envelope is large, near its frequency.
 
@@ -266,17 +267,22 @@ def noise_at(fit: LineFit, line: int, quiet: Array) -> float:
         fit: the lines.
         line: index of the line.
         quiet: noise at all frequencies, [signal].
+        planes: of each signal, [signal].
     """
     turns = fit.envelope.shape[1]
     envelope = np.abs(fit.envelope[line])
     power = np.abs(np.fft.rfft(fit.residual * envelope)) ** 2
-    scale = np.maximum(quiet**2 * (envelope**2).sum(), 1e-300)
+    power /= np.maximum(quiet**2 * (envelope**2).sum(), 1e-300)[:, None]
     wide = round(2 * turns * (envelope**4).sum() / (envelope**2).sum() ** 2)
     away = np.abs(np.arange(power.shape[1]) - round(fit.frequency[line] * turns))
     away[0] = turns  # the offset
     parts = [away <= wide, (away > wide) & (away <= wide + turns // 16)]
-    density = [np.median(power[:, part] / scale[:, None], axis=0) for part in parts if part.any()]
-    return float(np.sqrt(max(1.0, *[own.mean() / np.log(2) for own in density])))
+    found = np.ones(len(planes))
+    for plane in set(planes.tolist()):
+        typical = np.median(power[planes == plane], axis=0) / np.log(2)
+        near = [typical[part].mean() for part in parts if part.any()]
+        found[planes == plane] = np.sqrt(max(1.0, *near))
+    return found
 
 
 def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:

@@ -16,13 +16,15 @@ Amplitude dependence of betatron lines: shifts of tunes and of ratios between mo
 and octupoles shift the tunes by the square of the amplitude; so does the longer path of an
 oscillation where cavities hold the energy. The phases between monitors, and with them the lines,
 shift by as much. The design is tracked from the measured amplitudes, and its turns are analysed by
-the same `lines` as the measured ones. The shift is the difference from a small oscillation. Its
-next order, in the fourth power of the amplitude, is the shift less twice that at half the action.
+the same `lines` as the measured ones. The shift is the difference from a small oscillation. It has
+a part by the action of each mode, which may compensate one another; each has an error of its own.
+Its next order, in the fourth power of the amplitude, is the shift less twice that at half the
+action.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +53,7 @@ FLOOR = 1e-4
 monitors."""
 
 
-LINES = -4
+LINES = -6
 """End of the lines among the data of a shot: see `ManyTurns`."""
 AT_ONCE = 256
 """Changes of modes in memory: 4 MB for 246 monitors."""
@@ -64,12 +66,12 @@ TURNS = (256, 1024)
 the second hold some periods of the synchrotron motion that a longer path starts."""
 MAX_CORRECTION = 0.5
 """Largest correction of a kick, as a share of it."""
-SMALL = 1e-2
-"""Amplitude of a small oscillation, as a share of the measured one."""
+SCALES = np.array([(1.0, 1.0), (0.5**0.5, 0.5**0.5), (1.0, 0.5**0.5), (1e-2, 1e-2)])
+"""Tracked amplitudes of the modes, as shares of the measured ones; the last are small."""
 SHARE = 0.1
-"""rms error of a shift, as a share of it. BPM gains that are all wrong by 5 % make as much of the
-action; a beta beat of a few per cent does of the sextupoles' effect. The maps also lack a third
-order of bends: 13 % of the shift in ThomX, 6 % in the Australian Synchrotron."""
+"""rms error of a shift by one action, as a share of it. BPM gains that are all wrong by 5 % make
+as much of the action; a beta beat of a few per cent does of the sextupoles' effect. The maps also
+lack a third order of bends: 13 % of the shift in ThomX, 6 % in the Australian Synchrotron."""
 CONVERGED = 0.5
 """Largest next order of a shift, as a share of it, for which its series is used."""
 SEEN = 1e-3
@@ -81,9 +83,10 @@ class Shift:
     """Shift of the lines of each shot by its amplitude.
 
     Attributes:
-        modes: change of the modes' vectors at the monitors, [shot, monitor, 2, mode].
-        tunes: change of Q, [shot, mode].
-        error: relative rms error of both, common to all monitors, [shot, mode].
+        modes: change of the modes' vectors at the monitors by the action of each mode, [shot,
+            action, monitor, 2, mode].
+        tunes: change of Q, [shot, action, mode].
+        error: relative rms error of both, common to all monitors, [shot, action, mode].
         mode_error, tune_error: rms of the next order: of the lines, m, independent between
             monitors, [shot, monitor, 2, mode], and of the tunes, [shot, mode].
         too_large: shots whose amplitude second-order maps do not describe, [shot].
@@ -99,9 +102,11 @@ class Shift:
     @classmethod
     def none(cls, shots: int, monitors: int) -> "Shift":
         """Return no shift."""
-        modes, two = np.zeros((shots, monitors, 2, 2)), np.zeros((shots, 2))
-        none = np.zeros(shots, dtype=np.bool_)
-        return cls(modes.astype(np.complex128), two.copy(), two + SHARE, modes, two.copy(), none)
+        modes, two = np.zeros((shots, 2, monitors, 2, 2)), np.zeros((shots, 2))
+        return cls(
+            modes.astype(np.complex128), np.zeros((shots, 2, 2)), np.full((shots, 2, 2), SHARE),
+            modes[:, 0], two, np.zeros(shots, dtype=np.bool_),
+        )  # fmt: skip
 
 
 def shift_of(ring: Ring, beams: Sequence[StoredBeam], found: Lines, at: Array) -> Shift:
@@ -142,9 +147,10 @@ def _spread(found: Lines, shots: Sequence[int]) -> Array:
 
 def _tracked(
     ring: Ring, beam: StoredBeam, wanted: ComplexArray, turns: int, at: Array
-) -> tuple[ComplexArray, Array, Flags]:
-    """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes [shot, mode], and
-    whether the beam survived [shot], for amplitudes [shot, mode] of which the last is small."""
+) -> tuple[ComplexArray, Array, Array, Flags]:
+    """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes and actions [shot,
+    mode], and whether the beam survived [shot], for about these amplitudes [shot, mode], of which
+    the last is small."""
     way, maps = nonlinear_turn(beam.model.layers), beam.model.maps
     names = tuple(monitor.name for monitor in ring.monitors)
 
@@ -161,7 +167,7 @@ def _tracked(
     ratio = wanted / np.where(unit == 0, np.nan, unit)
     good = np.abs(ratio - 1) < MAX_CORRECTION
     unit, found, kept = seen(wanted * np.where(good, ratio, 1.0), turns)
-    return found.amplitude / unit[:, None, None], found.tune, kept
+    return found.amplitude / unit[:, None, None], found.tune, np.abs(unit) ** 2, kept
 
 
 def _fill(
@@ -171,32 +177,52 @@ def _fill(
     """Write the shift by amplitudes [shot, mode] of some shots."""
     spread = _spread(found, shots)
     size = amplitude * np.sqrt(spread.mean(axis=2))
-    scales = (1.0, np.sqrt(0.5), SMALL)
     turns = int(np.clip(found.turns[shots].max(), *TURNS))
-    wanted = np.concatenate([scale * size for scale in scales])
-    both = _tracked(ring, beam, wanted, turns, at)
-    modes, tunes, kept = (own.reshape(len(scales), len(shots), *own.shape[1:]) for own in both)
-    whole, half = (modes[i] - modes[2] for i in (0, 1))
-    tune, tune_half = ((tunes[i] - tunes[2] + 0.5) % 1.0 - 0.5 for i in (0, 1))
-    beyond, beyond_tune = whole - 2 * half, tune - 2 * tune_half
+    wanted = np.concatenate([scale * size for scale in SCALES])
+    every = _tracked(ring, beam, wanted, turns, at)
+    modes, tunes, actions, kept = (own.reshape(len(SCALES), len(shots), *own.shape[1:])
+                                   for own in every)  # fmt: skip
+    whole, half, first = (modes[i] - modes[-1] for i in range(3))
+    tune, tune_half, tune_first = ((tunes[i] - tunes[-1] + 0.5) % 1.0 - 0.5 for i in range(3))
+    # tracked actions over the measured ones; a mode that was not kicked makes no shift
+    alone = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0)])[:, None]
+    over = np.where(size == 0, alone, actions[:3] / np.maximum(np.abs(size) ** 2, 1e-300))
+    (a, b), (c, d) = over[0].T, over[2].T
+    inverse = np.array([(d, -b), (-c, a)]) / np.where(a * d == b * c, np.nan, a * d - b * c)
+
+    def parted(whole: Any, half: Any, first: Any) -> tuple[Any, Any]:
+        """The shift by each action, [shot, action, ...], and its next order."""
+        parts = np.einsum("ars,rs...->sa...", inverse, np.stack([whole, first]))
+        return parts, 2 * (np.einsum("sa,sa...->s...", over[1], parts) - half)
+
+    parts, beyond = parted(whole, half, first)
+    tune_parts, beyond_tune = parted(tune, tune_half, tune_first)
+    whole = parts.sum(axis=1)
 
     def rms(change: ComplexArray) -> Array:
-        """Relative to the modes, [shot, mode]."""
-        squares = (np.abs(change) ** 2).sum(axis=(1, 2))
+        """Relative to the modes, [..., mode]."""
+        squares = (np.abs(change) ** 2).sum(axis=(-3, -2))
         return np.asarray(np.sqrt(squares / (np.abs(beam.modes) ** 2).sum(axis=(0, 1))))
 
     # a mode without a line was not kicked, or its plane was not measured
-    there = np.isfinite(rms(whole) + rms(half) + tune) & (size != 0)
+    of_parts = rms(parts)
+    there = np.isfinite(of_parts.sum(axis=1) + rms(half) + tune_parts.sum(axis=1)) & (size != 0)
     large = there & (rms(whole) > SEEN)
     share = np.where(large, rms(beyond) / np.maximum(rms(whole), 1e-300), 0.0)
-    shift.modes[shots] = np.where(there[:, None, None], whole, 0.0)
-    shift.tunes[shots] = np.where(there, tune, 0.0)
+    shift.modes[shots] = np.where(there[:, None, None, None], parts, 0.0)
+    shift.tunes[shots] = np.where(there[:, None], tune_parts, 0.0)
     # an action with an error of SHARE makes twice that of its square
     more = np.where(there[:, None, None], np.abs(beyond * amplitude[:, None, None]), 0.0)
     shift.mode_error[shots] = 2 * SHARE * more
     shift.tune_error[shots] = 2 * SHARE * np.where(there, np.abs(beyond_tune), 0.0)
     decohered = (spread[..., 0] - spread[..., 1]) / np.maximum(spread.sum(axis=2), 1e-300)
-    shift.error[shots] = np.sqrt(SHARE**2 + decohered**2 + (2 * SHARE * share) ** 2)
+    # a small part is what terms of the usual size leave of one another
+    seen = there[:, None]
+    squares = np.where(seen, of_parts, 0.0) ** 2
+    usual = np.sqrt(squares.sum(axis=2, keepdims=True) / np.maximum(seen.sum(axis=2), 1)[..., None])
+    terms = SHARE * np.fmax(usual / np.maximum(of_parts, 1e-300), 1.0)
+    own = np.sqrt(terms**2 + (decohered**2 + (2 * SHARE * share) ** 2)[:, None])
+    shift.error[shots] = np.where(seen, own, SHARE)
     shift.too_large[shots] = ~kept.all(axis=0) | (share > CONVERGED).any(axis=1)
 
 
@@ -309,10 +335,11 @@ class TurnsMetric(StoredMetric):
 
 @dataclass(frozen=True, kw_only=True)
 class ManyTurns(Stored):
-    """Lines [shot, (monitor, plane, mode, re and im), then two errors of shifts, two tunes]; m, 1.
+    """Lines [shot, (monitor, plane, mode, re and im), then errors of shifts (mode, action), two
+    tunes]; m, 1.
 
-    Nuisances are re and im of the complex amplitude of each shot and mode, and the relative error
-    of its shift, [shot, 2, 3]. The errors of shifts are read as 0.
+    Nuisances are re and im of the complex amplitude of each shot and mode, and the relative errors
+    of its shifts by both actions, [shot, mode, 4]. The errors of shifts are read as 0.
 
     Attributes:
         shift: by the amplitude of each shot.
@@ -356,7 +383,7 @@ class ManyTurns(Stored):
         """Amplitudes that fit the known ring."""
         shots = len(self.values)
         view = self.view(self.fixed)
-        nothing = np.zeros((shots, 2, 3))
+        nothing = np.zeros((shots, 2, 4))
         slopes = self.as_rows(self.directions(view, nothing)).T
         left = self.as_rows(self.values - self.read(view, nothing))
         solved = np.linalg.lstsq(slopes, left, rcond=None)[0]
@@ -378,19 +405,19 @@ class ManyTurns(Stored):
 
     def shown(self, view: Beams, nuisances: Array) -> list[Moved]:
         """Return the states, shifted by the amplitude."""
-        own = zip(view.beams, self.shift.modes, self.shift.tunes, nuisances, strict=True)
+        by_action = zip(self.shift.modes, self.shift.tunes, 1 + nuisances[..., 2:], strict=True)
         return [
             replace(
-                beam.shown, modes=beam.modes + (1 + of_shot[:, 2]) * modes,
-                tunes=beam.tunes + (1 + of_shot[:, 2]) * tunes,
+                beam.shown, modes=beam.modes + np.einsum("ka,ampk->mpk", by, modes),
+                tunes=beam.tunes + np.einsum("ka,ak->k", by, tunes),
             )
-            for beam, modes, tunes, of_shot in own
+            for beam, (modes, tunes, by) in zip(view.beams, by_action, strict=True)
         ]  # fmt: skip
 
     def read(self, view: Beams, nuisances: Array) -> Array:
         """Predicted readings with the errors of the shifts."""
         readings = super().read(view, nuisances)
-        readings[:, LINES:-2] = nuisances[..., 2]
+        readings[:, LINES:-2] = nuisances[..., 2:].reshape(len(readings), -1)
         return readings
 
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
@@ -399,7 +426,7 @@ class ManyTurns(Stored):
         seen = np.ascontiguousarray(stacked(states, "modes") * size[:, None, None, :])
         flat = seen.view(float).reshape(*seen.shape[:-3], -1)
         tunes = stacked(states, "tunes")
-        return np.concatenate([flat, np.zeros_like(tunes), tunes], axis=-1)
+        return np.concatenate([flat, np.zeros_like(tunes), np.zeros_like(tunes), tunes], axis=-1)
 
     def directions(self, view: Beams, nuisances: Array) -> Array:
         """Directions of the amplitudes in the lines, and of the shifts in lines and tunes."""
@@ -407,21 +434,27 @@ class ManyTurns(Stored):
         ones[..., :2] = 1.0, 0.0
         shots = len(ones)
         at_one = self.read(view, ones)
-        more = ones + np.array([0.0, 0.0, 1.0])
-        of_shift = self.read(view, more) - at_one
-        # [shot, , mode, re and im]
-        lines, shifted = (own[:, :LINES].reshape(shots, -1, 2, 2) for own in (at_one, of_shift))
+        lines = at_one[:, :LINES].reshape(shots, -1, 2, 2)  # [shot, , mode, re and im]
         size = nuisances[..., 0] + 1j * nuisances[..., 1]
-        out = np.zeros((shots, 2, 3, shots, lines.shape[1], 2, 2))
-        rest = np.zeros((shots, 2, 3, shots, 4))
+        out = np.zeros((shots, 2, 4, shots, lines.shape[1], 2, 2))
+        rest = np.zeros((shots, 2, 4, shots, -LINES))
+        for action in range(2):
+            more = ones.copy()
+            more[..., 2 + action] += 1.0
+            of_shift = self.read(view, more) - at_one
+            by = of_shift[:, :LINES].reshape(lines.shape)
+            moved = (by[..., 0] + 1j * by[..., 1]) * size[:, None]
+            for shot in range(shots):
+                for mode in range(2):
+                    own = moved[shot, :, mode]
+                    out[shot, mode, 2 + action, shot, :, mode] = np.stack([own.real, own.imag], 1)
+                    here = [2 * mode + action, 4 + mode]
+                    rest[shot, mode, 2 + action, shot, here] = of_shift[shot, LINES:][here]
         for shot in range(shots):
             for mode in range(2):
-                own, by = lines[shot, :, mode], shifted[shot, :, mode]
+                own = lines[shot, :, mode]
                 out[shot, mode, 0, shot, :, mode] = own
                 out[shot, mode, 1, shot, :, mode] = np.stack([-own[:, 1], own[:, 0]], axis=1)
-                moved = (by[:, 0] + 1j * by[:, 1]) * size[shot, mode]
-                out[shot, mode, 2, shot, :, mode] = np.stack([moved.real, moved.imag], axis=1)
-                rest[shot, mode, 2, shot, mode::2] = of_shift[shot, LINES:][mode::2]
         flat = out.reshape(nuisances.size, shots, -1)
         return np.concatenate([flat, rest.reshape(nuisances.size, shots, -1)], axis=2)
 
@@ -446,13 +479,13 @@ def many_turns(
     names = [monitor.name for monitor in ring.monitors]
     settings: tuple[Settings, ...] = measured.settings or ({},) * len(measured.shots)
     count, shots = len(names), len(measured.shots)
-    shape = (shots, 8 * count + 4)
+    shape = (shots, 8 * count - LINES)
     blank = ManyTurns(
         ring=ring,
         states=tuple((one, rf_of(one)) for one in settings),
         values=np.zeros(shape),
         sigma=np.ones(shape),
-        read_by=np.tile(np.append(np.repeat(np.arange(count), 8), [-1] * 4), (shots, 1)),
+        read_by=np.tile(np.append(np.repeat(np.arange(count), 8), [-1] * -LINES), (shots, 1)),
         used=np.zeros(shape, dtype=bool),
         places=places,
         shift=Shift.none(shots, count),
@@ -469,9 +502,9 @@ def many_turns(
     error = np.sqrt(found.error**2 + (FLOOR * size) ** 2 + shift.mode_error**2).reshape(shots, -1)
     both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
     # shift errors are common to all shots: their mean is known no better than one
-    known = shift.error * np.sqrt(shots)
+    known = shift.error.swapaxes(1, 2).reshape(shots, -1) * np.sqrt(shots)
     tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
-    data = np.concatenate([both.reshape(shots, -1), np.zeros((shots, 2)), tunes], axis=1)
+    data = np.concatenate([both.reshape(shots, -1), np.zeros((shots, 4)), tunes], axis=1)
     tune_error = np.sqrt(found.tune_error**2 + TUNE**2 + shift.tune_error**2)
     errors = np.concatenate([np.repeat(error, 2, axis=1), known, tune_error], axis=1)
     there = np.isfinite(data) & np.isfinite(errors)

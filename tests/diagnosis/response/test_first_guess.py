@@ -14,8 +14,8 @@ from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine.response import simulate_response
+from tmlattice.observe.compared import ANOTHER, OfResponse
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors
 from tmlattice.observe.split import split_columns
 
 NOISE = 2e-8
@@ -57,7 +57,7 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
 def test_a_far_lattice_is_no_wrong_sign_and_no_other_ring(small_ring):
     """ALS with 3 % on its largest family: y was said to be reversed, or the ring to be another."""
     data = measured(small_ring, 0.02, 0.06)
-    assert ResponseGlobalErrors(small_ring, data).misfit(()).max() > ANOTHER
+    assert OfResponse(small_ring, data).misfit().max() > ANOTHER
     (check,) = check_data(small_ring, data).reported
     assert check.status == "note"
     assert "is far from the ring that was measured" in check.sentence
