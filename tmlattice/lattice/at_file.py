@@ -234,7 +234,9 @@ def _places(
     if isinstance(element, at.Corrector) and not _acts(element):
         return _correctors(element, family, mad)
     kind, source = _convert(element, family, mad, energy, left_out, tracker)
-    own = with_coils(element, family, source) if kind == "bend" else [(family, kind, source)]
+    own: list[Place] = [(family, kind, source)]
+    if kind == "bend":
+        own = with_coils(element, family, source)
     if kind not in ("matrix", "wiggler"):  # those are all that AT makes of the element
         own = _with_fringes(element, family, own, energy, tracker)
     return own
