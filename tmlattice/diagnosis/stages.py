@@ -259,7 +259,7 @@ def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stag
     amounts = np.array([cause.amount for cause in stage.static])
     there = chain_factors(known, amounts)[:, None] * signatures_of(other, point, known.hypotheses)
     there = known.correlated(known.rms[:, None] * there)
-    here = explained.projection.out(among.white(among.rows))
+    here = explained.projection.out(among.white_rows)
     rows = there.T @ here
     unknown = there.T @ there - rows @ rows.T
     slopes = [explained.slopes.get((c.effect, c.element)) for c in stage.causes]

@@ -149,6 +149,11 @@ class MarginalProblem(Problem):
         return self.inner.as_rows(self.spread)
 
     @cached_property
+    def white_rows(self) -> Array:
+        """The errors' signatures in whitened rows, [error, row]."""
+        return self.white(self.rows)
+
+    @cached_property
     def _shifted(self) -> Array | float:
         return self.inner.as_rows(self.shift) if isinstance(self.shift, np.ndarray) else self.shift
 
@@ -270,7 +275,7 @@ class DistributedProblem(MarginalProblem):
 
     def learnt(self, explained: Fit) -> DistributedErrors:
         """Distribution of the errors given an explanation."""
-        seen = explained.projection.out(self.white(self.rows))
+        seen = explained.projection.out(self.white_rows)
         share, directions = np.linalg.eigh(seen @ seen.T)
         big = share > MIN_SHARE
         return self.known.updated(self.estimate(explained.clean), share[big], directions[:, big].T)
