@@ -283,6 +283,8 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
         elif not np.nan_to_num(given).any():
             said.append(f"{name} is zero everywhere, and is left out")
             given = np.zeros(0)
+        elif name == "Eta" and (zeros := np.count_nonzero(given == 0)):
+            said.append(f"{zeros} numbers of Eta are zero: they were not measured")
         data[name] = np.where(given == 0, np.nan, given)
 
 
