@@ -25,7 +25,7 @@ from tmlattice import TaylorNetwork, load_ring
 from tmlattice.errors import BeamLostError
 from tmlattice.fitting.adam import fit_adam
 from tmlattice.harmonics import tunes
-from tmlattice.lattice.write import write_ring
+from tmlattice.lattice.write import save_ring
 from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.measurement import Measurement
 from tmlattice.network import symplectic_penalty
@@ -221,7 +221,7 @@ class Run:
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "petra3.xsuite.json"
-            write_ring(load_ring("petra3"), path)
+            save_ring(load_ring("petra3"), path)
             line = xtrack.load(str(path))
         begun = time.perf_counter()
         context = xobjects.ContextCupy()

@@ -30,7 +30,7 @@ from tmlattice.errors import (
 )
 from tmlattice.files import write_json
 from tmlattice.inference.distributed import DistributedErrors
-from tmlattice.lattice import save_ring, write_ring
+from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import quiet_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
@@ -330,7 +330,7 @@ def test_statements_set_the_strengths(small_ring, wrong, tmp_path):
     found = correct(machine, goal=small_ring, knobs=every[:1] + every[2:], targets=NO_ORBIT)
     alone = replace(found, settings=tuple(s for s in found.settings if s.knob.name != "QF"))
     family = replace(found, settings=tuple(s for s in found.settings if s.knob.name == "QF"))
-    write_ring(small_ring, tmp_path / "design.at.json")
+    save_ring(small_ring, tmp_path / "design.at.json")
     for own in (alone, family):
         with quiet_at():
             ring = at.load_lattice(tmp_path / "design.at.json")

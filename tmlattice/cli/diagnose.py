@@ -215,7 +215,7 @@ def diagnose(
             tell("figures")
             write_files(result, folder, document, correction)
         write(document)
-        written = _write_rings(result, known, lattice_out, corrected_out)
+        written = _save_rings(result, known, lattice_out, corrected_out)
         if folder and reading:
             _write_weights(reading, folder)
     _print(result, correction, out, json_file, written)
@@ -292,7 +292,7 @@ def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Corr
     return None if found.refused else found
 
 
-def _write_rings(
+def _save_rings(
     result: "Diagnosis",
     known: "DistributedErrors | None",
     lattice_out: Path | None,
@@ -301,7 +301,7 @@ def _write_rings(
     """The estimated ring and the corrected ring: the files, with what they do not hold."""
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
     from tmlattice.files import output_file, write_json
-    from tmlattice.lattice import write_ring
+    from tmlattice.lattice import save_ring
     from tmlattice.observe.calibration import write_calibration
     from tmlattice.report.action_texts import by_hand_text
 
@@ -309,7 +309,7 @@ def _write_rings(
     if lattice_out:
         ring = result.as_found
         ring = ring if known is None else replace(ring, model=ESTIMATED)
-        written[str(lattice_out)] = write_ring(ring, lattice_out)
+        written[str(lattice_out)] = save_ring(ring, lattice_out)
         beside = calibration_beside(lattice_out)
         if result.calibration or result.by_steps:
             amounts = zip(result.causes, result.errors, strict=True)
@@ -328,7 +328,7 @@ def _write_rings(
             written[str(beside)] = ()
     if corrected_out:
         ring, by_hand = result.repair()
-        told = write_ring(ring, corrected_out)
+        told = save_ring(ring, corrected_out)
         more = by_hand_text(result.ring, by_hand)
         written[str(corrected_out)] = (*told, more) if more else told
     return written
@@ -346,7 +346,7 @@ def _check_out(ring: "Ring", option: str, path: Path) -> None:
     from tempfile import TemporaryDirectory
 
     from tmlattice.files import check_writable
-    from tmlattice.lattice import write_ring
+    from tmlattice.lattice import save_ring
     from tmlattice.lattice.write import SUFFIXES, knows
 
     if not knows(path):
@@ -354,7 +354,7 @@ def _check_out(ring: "Ring", option: str, path: Path) -> None:
     for file in (path, calibration_beside(path)):
         check_writable(file)
     with TemporaryDirectory() as folder:
-        write_ring(ring, Path(folder) / path.name)
+        save_ring(ring, Path(folder) / path.name)
 
 
 def calibration_beside(lattice: Path) -> Path:

@@ -178,7 +178,8 @@ def chosen_knobs(
 def check_distinct(where: str, knobs: Iterable[Knob]) -> None:
     """Raise a MeasurementError if two knobs have one name, or change the same strength of a magnet:
     the new setting of each would undo the other's."""
-    names, owners = set(), {}
+    names: set[str] = set()
+    owners: dict[tuple[str | None, str], str] = {}
     for knob in knobs:
         if knob.name in names:
             raise MeasurementError(f"{where}: the knob '{plain(knob.name, 40)}' occurs twice")
@@ -205,11 +206,13 @@ def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:
         ChoiceError: another kind.
     """
     made = {
-        "supplies": lambda: _supplies(ring),
-        "quadrupoles": lambda: _each(ring, "quadrupole"),
+        "supplies": lambda: _grouped(ring, "quadrupole", _supplies(ring)),
+        "quadrupoles": lambda: _grouped(ring, "quadrupole", {}),
         "skew_quadrupoles": lambda: _skew(ring),
         "correctors": lambda: _correctors(ring),
-        "sextupoles": lambda: _sextupoles(ring),
+        "sextupoles": lambda: _grouped(
+            ring, "sextupole", {e.name: e.family for e in ring.elements if e.kind == "sextupole"}
+        ),
         "rf": lambda: [_knob("rf", "rf", (), rf_of(ring).frequency(ring))],
     }
     chosen = list(("supplies", "skew_quadrupoles", "correctors") if kinds is None else kinds)
@@ -228,30 +231,31 @@ def _upright(ring: Ring, name: str) -> bool:
     return abs(abs(ring[name].tilt) - math.pi / 4) > 0.1
 
 
-def _supplies(ring: Ring) -> list[Knob]:
-    """Knobs by family or equal design strength; quadrupoles of no family one by one."""
+def _grouped(ring: Ring, kind: str, owner: Mapping[str, str]) -> list[Knob]:
+    """Knobs of powered magnets, those of one owner together, and alone without one."""
+    strength = KINDS[kind].strength
+    groups: dict[str, list[str]] = {name: [] for name in owner.values()}
+    for own in magnets(ring, (kind,)):
+        members = [piece.name for piece in own if getattr(piece, strength)]
+        if members and (kind != "quadrupole" or _upright(ring, members[0])):
+            groups.setdefault(owner.get(own[0].name, own[0].name), []).extend(members)
+    return [
+        _knob(name, kind, tuple(members), getattr(ring[members[0]], strength))
+        for name, members in groups.items()
+        if members
+    ]
+
+
+def _supplies(ring: Ring) -> dict[str, str]:
+    """Owners of quadrupoles: families, or those of equal design strength."""
     names = [pieces[0].name for pieces in magnets(ring, ("quadrupole",), powered=True)]
     kinds, belongs = supplied_alike(ring)
-    knobs, taken = [], set()
+    owner: dict[str, str] = {}
     for kind, column in zip(kinds, belongs.T, strict=True):
-        own = [names[i] for i in np.flatnonzero(column) if _upright(ring, names[i])]
-        taken |= set(own)
-        members = tuple(piece for name in own for piece in ring.pieces(name) if ring[piece].k1)
-        families = {ring[member].family for member in members}
-        if members:
-            name = families.pop() if len(families) == 1 else kind
-            knobs.append(_knob(name, "quadrupole", members, ring[members[0]].k1))
-    return knobs + [knob for knob in _each(ring, "quadrupole") if knob.name not in taken]
-
-
-def _each(ring: Ring, kind: str) -> list[Knob]:
-    strength = KINDS[kind].strength
-    found = []
-    for own in magnets(ring, (kind,)):
-        members = tuple(piece.name for piece in own if getattr(piece, strength))
-        if members and (kind != "quadrupole" or _upright(ring, members[0])):
-            found.append(_knob(own[0].name, kind, members, getattr(ring[members[0]], strength)))
-    return found
+        own = [names[i] for i in np.flatnonzero(column)]
+        families = {ring[name].family for name in own}
+        owner |= dict.fromkeys(own, families.pop() if len(families) == 1 else kind)
+    return owner
 
 
 def _skew(ring: Ring) -> list[Knob]:
@@ -268,16 +272,6 @@ def _correctors(ring: Ring) -> list[Knob]:
         _knob(e.name, e.kind, (e.name,), e.angle)
         for e in ring.elements
         if e.kind in ("hcorrector", "vcorrector")
-    ]
-
-
-def _sextupoles(ring: Ring) -> list[Knob]:
-    families: dict[str, list[Knob]] = {}
-    for knob in _each(ring, "sextupole"):
-        families.setdefault(ring[knob.name].family, []).append(knob)
-    return [
-        replace(own[0], name=family, members=tuple(m for knob in own for m in knob.members))
-        for family, own in families.items()
     ]
 
 

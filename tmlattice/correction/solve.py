@@ -40,8 +40,8 @@ MIN_FALL = 1e-3
 """Fall of the expected square, relative and in squares of the tolerances, that ends the search."""
 MAX_HALVINGS = 6
 """Halvings, at most, of a step that does not lower the expected square."""
-MAX_EXCESS = 2e-3
-"""Excess over the smallest expected square that is allowed for fewer knobs: relative (0.1 % in
+MAX_EXCESS = 5e-4, 2e-3
+"""Excess over the smallest expected square that is allowed for fewer knobs: relative (0.025 % in
 rms), and in squares of the tolerances."""
 SIGMAS, MIN_SHARE = 3.0, 0.1
 """Standard deviations by which a correction is expected to make the ring better; and the smallest
@@ -322,7 +322,8 @@ def fewest(point: Point, square: float) -> list[int]:
 
 def nearly(square: float, least: float) -> bool:
     """Return whether an expected square is as good as the smallest one."""
-    return square <= (1 + MAX_EXCESS) * least + MAX_EXCESS
+    relative, beyond = MAX_EXCESS
+    return square <= (1 + relative) * least + beyond
 
 
 def shortened(begin: Point, end: Point) -> tuple[Point, float]:

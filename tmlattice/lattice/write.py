@@ -1,6 +1,6 @@
 """Rings in the formats of other packages: files by their suffix, and objects.
 
->>> lacks = write_ring(ring, "estimated.at.json")       # what the file does not hold
+>>> lacks = save_ring(ring, "estimated.at.json")       # what the file does not hold
 >>> lattice = ring.to_at()                              # warns of what AT does not hold
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from tmlattice.errors import LatticeError, MissingPackageError
 from tmlattice.files import output_file
-from tmlattice.lattice.json_file import save_ring
+from tmlattice.lattice.json_file import save_json
 from tmlattice.lattice.plain import plain
 from tmlattice.lattice.ring import Ring
 
@@ -31,7 +31,7 @@ SUFFIXES = (
 )
 
 
-def write_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
+def save_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
     """Write a ring in the format that the suffix names, whole or not at all.
 
     `.json` is the package's own file, and holds everything. `.at.json` is AT's (`at.load_lattice`),
@@ -52,7 +52,7 @@ def write_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
     path = Path(path)
     name = path.name.lower()
     if name.endswith(".json") and not name.endswith((".at.json", ".xsuite.json")):
-        save_ring(ring, path)
+        save_json(ring, path)
         return ()
     module = _module(name)
     if module is None:
@@ -108,7 +108,7 @@ def to_xtrack(ring: Ring) -> Any:
     except ImportError as error:
         raise MissingPackageError(
             "to_xtrack needs the package 'xtrack', which is not installed: `pip install xsuite` "
-            "brings it; write_ring(ring, 'ring.xsuite.json') does without"
+            "brings it; save_ring(ring, 'ring.xsuite.json') does without"
         ) from error
     content = _object(ring, "Xsuite", ".xsuite.json")
     return xtrack.Line.from_dict(content, with_progress=False)

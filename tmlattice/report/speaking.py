@@ -101,7 +101,10 @@ def render(
             text = report_text(diagnosis) + "\n"
             (temporary / "report.txt").write_text(text, encoding="utf-8")
         (temporary / "report.html").write_text(html, encoding="utf-8")
-    return diagnosis or correction
+    if diagnosis is not None:
+        return diagnosis
+    assert correction is not None
+    return correction
 
 
 def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path:
