@@ -260,7 +260,7 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
             data["M"] = np.full(shape, np.nan)
             data["M"][np.ix_(rows, columns)] = M
             said.append("M has the rows and columns of the good lists alone")
-    if np.shape(data.get("M", ())) == shape:
+    if (M := _array(data.get("M"))) is not None and M.shape == shape:
         _unread(data, x, _count(correctors, "H", "CM"), said)
     for name in ("Eta", "BPMSTD"):
         given = _array(data.get(name))
