@@ -23,7 +23,7 @@ SCALARS = ("RF", "DeltaRF", "CavityFrequency", "CavityHarmNumber", "Energy")
 HIGHEST_ENERGY = 250.0
 """GeV, of an electron ring; a number above it is in MeV, and above 1e5 in eV."""
 LEAST_KICK = 3e-4
-"""mrad; such a step moves the beam by some micrometres, and nobody measures a response with it."""
+"""mrad; such a step moves the beam by micrometres, too little for a response."""
 LEAST_NOISE = 5e-6
 """mm; no BPM has less, so it is stated in m."""
 HIGHEST_M = 1e3
@@ -260,7 +260,7 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
             data["M"] = np.full(shape, np.nan)
             data["M"][np.ix_(rows, columns)] = M
             said.append("M has the rows and columns of the good lists alone")
-    if np.shape(data.get("M")) == shape:
+    if (M := _array(data.get("M"))) is not None and M.shape == shape:
         _unread(data, x, _count(correctors, "H", "CM"), said)
     for name in ("Eta", "BPMSTD"):
         given = _array(data.get(name))
@@ -283,6 +283,8 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
         elif not np.nan_to_num(given).any():
             said.append(f"{name} is zero everywhere, and is left out")
             given = np.zeros(0)
+        elif name == "Eta" and (zeros := np.count_nonzero(given == 0)):
+            said.append(f"{zeros} numbers of Eta are zero: they were not measured")
         data[name] = np.where(given == 0, np.nan, given)
 
 
