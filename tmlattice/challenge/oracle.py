@@ -17,7 +17,7 @@ from tmlattice.challenge.kinds import CHANGES, problem_of_case
 from tmlattice.effects import Cause, find, modelled
 from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.newton import Fit, fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan, scan
 
@@ -113,10 +113,15 @@ def refitted(case: Case, truth: Truth, given: Sequence[Cause] = ()) -> Refitted:
         if whole:
             guess = best_start(problem, start, hypotheses[h])
         again = fit(problem, [guess], start.nuisances)
-        least = 0.0 if one_sign[h] else -find(name).largest
-        if again.good and least <= again.causes[0].amount <= find(name).largest:
-            statistic[h] = start.chi2 - again.chi2
-            amount[h] = again.causes[0].amount
+        if not again.good:
+            continue
+        most = find(name).largest
+        size = float(np.clip(again.causes[0].amount, 0.0 if one_sign[h] else -most, most))
+        chi2 = again.chi2
+        if size != again.causes[0].amount:  # at the largest fault
+            chi2 = fit_nuisances(problem, [Cause(name, place, size)], again.nuisances).chi2
+        if np.isfinite(chi2):
+            statistic[h], amount[h] = start.chi2 - chi2, size
     return Refitted(problem, start, seen, statistic, amount)
 
 
