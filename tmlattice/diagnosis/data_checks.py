@@ -240,7 +240,8 @@ def _sensible(data: Some) -> Some:
     """The data without readings that no beam gives, which would make a unit look wrong."""
     if isinstance(data, TuneReading) or not signals.too_large(read_of(data)).any():
         return data
-    return with_read(data, lambda own: np.where(np.abs(own) > LARGEST_READING, np.nan, own))
+    kept: Some = with_read(data, lambda own: np.where(np.abs(own) > LARGEST_READING, np.nan, own))
+    return kept
 
 
 def _options(names: Iterable[str]) -> str:

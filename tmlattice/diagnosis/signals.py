@@ -139,7 +139,7 @@ def not_reached(silent: Flags) -> Flags:
 def too_large(values: Array) -> Flags:
     """Which readings are larger than those of any beam, where the others are in metres."""
     typical = np.median(np.abs(values[np.isfinite(values)]))  # else the unit of all is wrong
-    return (np.abs(values) > LARGEST_READING) & (typical < SENSIBLE)
+    return np.asarray((np.abs(values) > LARGEST_READING) & (typical < SENSIBLE))
 
 
 def one_plane(unread: str) -> str:
