@@ -39,9 +39,9 @@ from tmlattice.measurement import (
     TuneReading,
     TurnByTurn,
 )
-from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of, with_read
 from tmlattice.measurement.lost_beam import beam_lost
-from tmlattice.measurement.monitors import Names
+from tmlattice.measurement.monitors import LARGEST_READING, Names
 from tmlattice.measurement.stored_files import KINDS as STORED
 from tmlattice.observe.compared import ANOTHER, Compared, OfResponse, compared
 from tmlattice.observe.global_errors import CERTAIN, OfTurns, Search, Verdict
@@ -130,7 +130,7 @@ def check_data(
     return Checkup(kind, tuple(checks), provenance)
 
 
-_REPORTED = ("energy", "copied monitors", "lost beam", GLOBAL, "launches")
+_REPORTED = ("energy", "large readings", "copied monitors", "lost beam", GLOBAL, "launches")
 """Notes that the diagnosis does not find by itself."""
 
 
@@ -236,6 +236,14 @@ def _sentence(searched: Search, verdict: Verdict) -> Check:
     return make(GLOBAL, text, before=chi2[0], after=chi2[1], assume=verdict.names)
 
 
+def _sensible(data: Some) -> Some:
+    """The data without readings that no beam gives, which would make a unit look wrong."""
+    if isinstance(data, TuneReading) or not signals.too_large(read_of(data)).any():
+        return data
+    kept: Some = with_read(data, lambda own: np.where(np.abs(own) > LARGEST_READING, np.nan, own))
+    return kept
+
+
 def _options(names: Iterable[str]) -> str:
     return " ".join(f"--assume {name}" for name in names)
 
@@ -254,7 +262,7 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
-    errors, checked = _global(OfTurns(ring, data, known))
+    errors, checked = _global(OfTurns(ring, _sensible(data), known))
     passes, found = checked.found(checked.data)
     if lost_too := _no_beam(ring, checked, passes, found):
         return [*checks, *errors, *lost_too]
@@ -418,7 +426,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
     if any(check.status == "wrong" for check in checks):
         return checks
     try:
-        search = compared(ring, data, problem)
+        search = compared(ring, _sensible(data), problem)
         checks += [note("lines", sentence) for sentence in search.warnings]
         checks += [fine("tunes", sentence) for sentence in search.tunes]
         errors, checked = _global(search)

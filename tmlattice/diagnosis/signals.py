@@ -136,6 +136,12 @@ def not_reached(silent: Flags) -> Flags:
     return np.asarray(run & (run.sum() >= CUT))
 
 
+def too_large(values: Array) -> Flags:
+    """Which readings are larger than those of any beam, where the others are in metres."""
+    typical = np.median(np.abs(values[np.isfinite(values)]))  # else the unit of all is wrong
+    return np.asarray((np.abs(values) > LARGEST_READING) & (typical < SENSIBLE))
+
+
 def one_plane(unread: str) -> str:
     """The message about a plane without readings."""
     return (
@@ -164,15 +170,15 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     if not np.count_nonzero(values[there]):
         text = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen monitors", text)]
-    large = np.abs(values) > LARGEST_READING
-    if large.any() and np.median(np.abs(values[there])) < SENSIBLE:  # else their unit is wrong
+    checks = []
+    large = too_large(values)
+    if large.any():
         own = some([names[m] for m in np.flatnonzero(large.any(axis=(0, 2))).tolist()])
         text = (
             f"{large.sum()} of {there.sum()} readings are above {LARGEST_READING} m, of {own}: no "
             "beam reads that; leave them out (NaN, or an empty field)"
         )
-        return [wrong("large readings", text)]
-    checks = []
+        checks.append(note("large readings", text))
     checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own

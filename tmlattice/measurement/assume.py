@@ -128,8 +128,8 @@ def read_of(data: Any) -> Array:
     return data.orbits if isinstance(data, Dispersion) else np.asarray(getattr(data, data.READ))
 
 
-def _read(data: Any, change: Callable[[Array], Array]) -> Any:
-    """With a change of everything that was read, [..., monitor, 2]."""
+def with_read(data: Any, change: Callable[[Array], Array]) -> Any:
+    """Return the data with a change of everything that was read, [..., monitor, 2]."""
     if isinstance(data, Dispersion):
         steps = (replace(own, orbit=change(np.asarray(own.orbit))) for own in data.steps)
         return _with(data, steps=tuple(steps))
@@ -142,11 +142,11 @@ def _read(data: Any, change: Callable[[Array], Array]) -> Any:
 
 
 def _sign(data: Any, x: float, y: float) -> Any:
-    return _read(data, lambda values: values * np.array([x, y]))
+    return with_read(data, lambda values: values * np.array([x, y]))
 
 
 def _unit(data: Any, factor: float) -> Any:
-    scaled = _read(data, lambda values: values * factor)
+    scaled = with_read(data, lambda values: values * factor)
     if data.noise is None:
         return scaled
     return _with(scaled, noise=_of_unit(data.noise, read_of(data), factor))
@@ -159,14 +159,14 @@ def _exchanged(data: Any) -> Any:
             for name, values in vars(data).items() if name.startswith(("tune", "chromaticity"))
         })  # fmt: skip
     noise = None if data.noise is None else data.noise[:, ::-1]
-    return _with(_read(data, lambda values: values[..., ::-1]), noise=noise)
+    return _with(with_read(data, lambda values: values[..., ::-1]), noise=noise)
 
 
 def _reordered(data: Any, order: Callable[[Sequence[str]], Order]) -> Any:
     """The readings of the monitor i are those that stand at order[i]."""
     at = order(data.monitors)
     noise = None if data.noise is None else data.noise[at]
-    return _with(_read(data, lambda values: values[..., at, :]), noise=noise)
+    return _with(with_read(data, lambda values: values[..., at, :]), noise=noise)
 
 
 def _shift(monitors: Sequence[str], by: int) -> Order:

@@ -107,7 +107,7 @@ class Compared(Search):
         """Columns as read, and as the design makes them, [column, monitor, 2], and the squares of
         the noise of their difference."""
 
-    def judged(self) -> list[Verdict]:
+    def improving(self) -> list[Verdict]:
         """Return the assumptions that improve the data far."""
         stated = self.misfit()
         found = []

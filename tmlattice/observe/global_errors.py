@@ -3,7 +3,7 @@
 >>> search = OfTurns(ring, measurement)
 >>> search.verdict()                    # the correction that improves the data far
 
-Each assumption (`measurement.assume`) is corrected in the data, and these are judged again, in
+Each assumption (`measurement.assume`) is corrected in the data, and these are scored again, in
 every kind of measurement by the same search. Of first turns the trajectories of all sections are
 fitted again. The score is their agreement with themselves, with the next section, and with the
 launches. Every term has its own scale, so that the section of a fault costs the logarithm of its
@@ -240,7 +240,7 @@ class Search:
         return [(name,) for name, own in ASSUMPTIONS.items() if isinstance(self.data, own.kinds)]
 
     @abstractmethod
-    def judged(self) -> list[Verdict]:
+    def improving(self) -> list[Verdict]:
         """Return the assumptions that improve the data far."""
 
     @abstractmethod
@@ -253,7 +253,7 @@ class Search:
 
     def verdict(self) -> Verdict | None:
         """Return the best assumption, if any improves the data far."""
-        found = self.judged()
+        found = self.improving()
         if not found:
             return None
         order = list(ASSUMPTIONS)
@@ -522,7 +522,7 @@ class OfTurns(Search):
             found += [own.level, _parts(passes, own)[0].level()]
         return max(float(np.nanmin(found)), 1e-12) if np.isfinite(found).any() else 1.0
 
-    def judged(self) -> list[Verdict]:
+    def improving(self) -> list[Verdict]:
         """Return the assumptions that improve the data far, and the best of them with others."""
         several = self.candidates()
         square = self.square([(), *several])
