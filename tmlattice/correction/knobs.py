@@ -178,7 +178,8 @@ def chosen_knobs(
 def check_distinct(where: str, knobs: Iterable[Knob]) -> None:
     """Raise a MeasurementError if two knobs have one name, or change the same strength of a magnet:
     the new setting of each would undo the other's."""
-    names, owners = set(), {}
+    names: set[str] = set()
+    owners: dict[tuple[str | None, str], str] = {}
     for knob in knobs:
         if knob.name in names:
             raise MeasurementError(f"{where}: the knob '{plain(knob.name, 40)}' occurs twice")
