@@ -162,15 +162,6 @@ def _small_errors(ring, seed):
     ]
 
 
-def test_a_fault_among_small_errors_by_turns_and_dispersion(small_ring):
-    truth = [*_small_errors(small_ring, 7), Cause("quadrupole_gradient", "QD::3", -0.03)]
-    both = {"turns": _turns(small_ring, truth), "dispersion": _dispersion(small_ring, truth)}
-    diagnosis = diagnose(small_ring, both)
-    assert ("quadrupole_gradient", "QD::3") in _found(diagnosis)
-    assert len(diagnosis.findings) == 1
-    assert 0.3 < diagnosis.priors["quadrupole_gradient"] / 1e-3 < 3
-
-
 def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring):
     """Four are set: the one that kicks three times too much made their family as large as itself;
     and once it was found the next look beside it lost it again."""
@@ -192,17 +183,6 @@ def test_what_is_sought_beside_a_doubt_makes_the_readings_likelier(small_ring):
         machine_seed=758855873,
     ).measured  # fmt: skip
     assert not diagnose(small_ring, orbit).findings
-
-
-def test_a_reference_cancels_what_was_there(small_ring):
-    small = _small_errors(small_ring, 11)
-    strong = Cause("corrector_kick_x", "v6", 1e-4)
-    before = {"orbit": _orbit(small_ring, small, 5)}
-    after = {"orbit": _orbit(small_ring, [*small, strong], 6)}
-    diagnosis = diagnose(small_ring, after, reference=before)
-    assert _found(diagnosis) == {("corrector_kick_x", "v6")}
-    same = diagnose(small_ring, after, reference=after)
-    assert not same.findings
 
 
 @pytest.mark.parametrize("make", [_orbit, _dispersion, _tunes, _turns])

@@ -1,7 +1,6 @@
 """How a fit ends is said, and where it has to be said: linear algebra and rings as referees."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +8,7 @@ import pytest
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.errors import BeamLostError
-from tmlattice.inference.newton import Outcome, _best_move, fit
-from tmlattice.inference.priors import AmountPrior, Student
-from tmlattice.inference.problem import Point
+from tmlattice.inference.newton import Outcome, fit
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 
@@ -82,13 +79,3 @@ def test_the_false_alarm_rate_acts_on_what_would_have_been_seen(small_ring):
     for effect, least in usual.sensitivity.items():
         assert strict.sensitivity[effect] > 1.2 * least
     assert strict.provenance["options"]["false_alarm"] == 1e-9
-
-
-def test_a_step_that_loses_the_beam_is_not_taken_even_from_a_start_that_cannot_be():
-    """Both cost infinity: an amount beyond the prior's bound, and no trajectory at all."""
-    amounts = AmountPrior(Student(0.3, np.inf), bound=0.1)
-    start = Point((Cause("quadrupole_gradient", "QD::5", 0.2),), np.zeros(0), {}, np.ones(1),
-                  None, np.zeros(0), None)  # fmt: skip
-    lost = replace(start, lost="the beam is lost")
-    problem = SimpleNamespace(amounts=amounts, at=lambda *_: lost, moved=lambda old, _: old)
-    assert _best_move(problem, start, np.zeros(1), np.zeros(0), np.inf) is None

@@ -310,9 +310,9 @@ def read_truth(folder: Path, name: str) -> Truth:
         MemoryError,
         BadZipFile,
     ) as error:
-        said = plain(str(error), 100)
+        reason = plain(str(error), 100)
         raise TmlatticeError(
-            f"the truth of case {name} in '{folder}' cannot be read ({said}); make it anew"
+            f"the truth of case {name} in '{folder}' cannot be read ({reason}); make it anew"
         ) from error
 
 

@@ -99,8 +99,10 @@ def refitted(case: Case, truth: Truth, given: Sequence[Cause] = ()) -> Refitted:
     statistic = 2 * amount * inner - amount**2 * seen.information
     power = np.array([find(n).power for n, _ in hypotheses])
     amount = np.sign(amount) * np.abs(amount) ** (1 / power)
-    order = np.argsort(-statistic)[:REFINED]
-    order = order[statistic[order] > statistic.max() - MAX_BEHIND]
+    # the linear scan errs by a share of the statistic itself where an effect is strong
+    behind = MAX_BEHIND + DEFAULT.drift * float(seen.statistic.max())
+    order = np.argsort(-seen.statistic)[:REFINED]
+    order = order[seen.statistic[order] > seen.statistic.max() - behind]
     everywhere = [h for h, (n, place) in enumerate(hypotheses) if place is None and find(n).curved]
     for h in dict.fromkeys((*order.tolist(), *everywhere)):
         name, place = hypotheses[h]

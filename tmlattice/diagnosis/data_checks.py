@@ -62,10 +62,10 @@ FAR = 100.0
 benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first BPMs change."""
-NOTHING_FROM, NO_BEAM, HALF = 2, 0.75, 0.5
-"""Sections at the end that follow no trajectory, from which on the beam was lost: swapped BPMs
-spoil one; the share of their readings that is left then, of noise 0.9; and the share that separates
-them from others."""
+NOTHING_FROM, SURE, NO_BEAM, HALF = 2, 4, 0.75, 0.5
+"""Sections at the end that follow no trajectory, from which on the beam may be lost, and is: a few
+swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9; and the share
+that separates them from others."""
 SECTIONS = 4
 """Fewest passes that determine the usual misfit."""
 SPOILT = 3.0
@@ -112,9 +112,10 @@ def check_data(
     if few is None:
         names = [monitor.name for monitor in ring.monitors]
         data = assume(in_beam_order(data, names), assumed, names)
-        first = isinstance(data, Measurement)
-        known = expected_radiation(ring) if radiation and first else ()
-        checks += _of_first_turns(ring, data, known) if first else _of_compared(ring, data)
+        if isinstance(data, Measurement):
+            checks += _of_first_turns(ring, data, expected_radiation(ring) if radiation else ())
+        else:
+            checks += _of_compared(ring, data)
     else:
         checks.append(few)
     plain = "trajectory" if isinstance(data, Measurement) else "orbit_response"
@@ -300,7 +301,8 @@ def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
     if not (NOTHING_FROM <= len(behind) < len(read) and left > NO_BEAM):
         return []
     first = ring[checked.data.monitors[found.owner[behind[0], 0]]]
-    return [wrong(
+    make = wrong if len(behind) >= SURE else note
+    return [make(
         "lost beam",
         f"from {first.name} (s = {first.s:.2f} m) on the readings follow no trajectory in any "
         "shot, and before they do: the beam was lost, or these BPMs have other names; leave their "
@@ -407,6 +409,8 @@ def _spikes(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
 # --- what is compared with the design's -----------------------------------------------------------
 def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[Check]:
     checks: list[Check] = []
+    if isinstance(data, TurnByTurn):
+        data = beam_lost(data).without
     if not isinstance(data, TuneReading):
         values = read_of(data).reshape(-1, len(data.monitors), 2)
         moved = isinstance(data, OrbitResponse | TurnByTurn)

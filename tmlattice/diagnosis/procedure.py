@@ -2,8 +2,8 @@
 
 >>> diagnose_together(ring, {"kick": turns, "orbit": orbit, "injection": first_turns})
 
-Rows are stacked; causes are shared, nuisances are each measurement's own (see `strategy` for the
-steps). A reference of each kind has the earlier errors.
+Rows are stacked; causes are shared, nuisances are each measurement's own (see `selection`
+for the steps). A reference of each kind has the earlier errors.
 """
 
 import logging
@@ -29,6 +29,7 @@ from tmlattice.diagnosis.next_kind import leading, next_kind
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.selection import freedom, select, select_changes
 from tmlattice.diagnosis.stages import (
     held_out,
     held_out_shots,
@@ -40,7 +41,6 @@ from tmlattice.diagnosis.stages import (
     trajectory_view,
     views_of,
 )
-from tmlattice.diagnosis.strategy import freedom, sought, sought_since
 from tmlattice.diagnosis.support import correlations_of
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.diagnosis.views import JointView
@@ -145,12 +145,12 @@ def diagnose_together(
     learn = background is None
     noisy = any(part.estimated for part in parts)
     if problem.alone:
-        sought_out = sought(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
+        selected = select(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
     else:
         first, _ = problem.reference(problem.first)
         earlier = replace(search, problem=first, hypotheses=_seen(ring, modelled(), parts))
-        sought_out = sought_since(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
-    small = sought_out.small
+        selected = select_changes(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
+    small = selected.distributed
     if noisy and problem.alone and small is not None:  # with the noise that was learnt
         assert isinstance(small.plain, CombinedProblem)
         problem = small.plain
@@ -158,7 +158,7 @@ def diagnose_together(
         parts = [replace(part, problem=learnt) for part, learnt in own]
     progress("report")
     return _report(
-        ring, parts, problem, sought_out.explanation, small, options,
+        ring, parts, problem, selected.explanation, small, options,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
             "options": {

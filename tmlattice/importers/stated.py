@@ -46,9 +46,9 @@ class Stated:
             others: of the lattice, which the data need not have.
 
         Raises:
-            UnknownNameError: a pattern of no monitor.
+            UnknownNameError: a pattern of no monitor, and of no name that is stated.
         """
-        found = []
+        found, others = [], [*others, *self.names]
         for pattern in self.bad:
             like = [
                 own for own, device in {**dict.fromkeys(others, ""), **monitors}.items()

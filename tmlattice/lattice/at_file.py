@@ -82,24 +82,24 @@ def read_at(
     if path.suffix.lower() == ".mat":
         check_mat(path)
     try:
-        with quiet_at() as told, nothing_run(), TemporaryDirectory() as folder:
+        with quiet_at() as caught, nothing_run(), TemporaryDirectory() as folder:
             source = path
             if path.suffix.lower() == ".m":
                 source = Path(folder) / path.name
                 source.write_text(_list_of_m(path))
             lattice = at.load_lattice(str(source), **options)
-            for said in (str(warning.message) for warning in told):
-                if "skipped" in said or "Unknown class" in said:
-                    raise LatticeError(f"AT's reader leaves an element out: {said}")
+            for message in (str(warning.message) for warning in caught):
+                if "skipped" in message or "Unknown class" in message:
+                    raise LatticeError(f"AT's reader leaves an element out: {message}")
     except Exception as error:  # each of AT's readers fails in its own way
-        said = plain(str(error), 300) or type(error).__name__
-        if "energy is not defined" in said:
+        message = plain(str(error), 300) or type(error).__name__
+        if "energy is not defined" in message:
             raise LatticeError(f"'{path}' states no beam energy; give energy= (GeV)") from error
         advice = "save it with AT's save_lattice, or name its variable with sequence="
         if isinstance(error, LatticeError):
             advice = "correct it"
         raise LatticeError(
-            f"'{path}' cannot be read as an AT lattice ({said}); {advice}"
+            f"'{path}' cannot be read as an AT lattice ({message}); {advice}"
         ) from error
     return ring_from_at(lattice, name, energy)
 
@@ -132,10 +132,10 @@ def _list_of_m(path: Path) -> str:
 @contextmanager
 def quiet_at() -> Iterator[list[warnings.WarningMessage]]:
     """What AT warns of stays in the log: it is about AT's tracking, or about words of a file."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        yield told
-    for warning in told:
+        yield caught
+    for warning in caught:
         log.info("AT: %s", warning.message)
 
 
@@ -234,7 +234,9 @@ def _places(
     if isinstance(element, at.Corrector) and not _acts(element):
         return _correctors(element, family, mad)
     kind, source = _convert(element, family, mad, energy, left_out, tracker)
-    own = with_coils(element, family, source) if kind == "bend" else [(family, kind, source)]
+    own: list[Place] = [(family, kind, source)]
+    if kind == "bend":
+        own = with_coils(element, family, source)
     if kind not in ("matrix", "wiggler"):  # those are all that AT makes of the element
         own = _with_fringes(element, family, own, energy, tracker)
     return own

@@ -1037,7 +1037,8 @@ class _Reader:
 
 _NOT_IN_TWISS: dict[str, tuple[str, ...]] = {
     "sbend": ("k0s", "k1s", "knl", "ksl"),
-    **dict.fromkeys(("quadrupole", "sextupole", "octupole", "solenoid"), ("knl", "ksl")),
+    "quadrupole": ("k0", "knl", "ksl"),
+    **dict.fromkeys(("sextupole", "octupole", "solenoid"), ("knl", "ksl")),
 }
 """What MAD-X's TWISS leaves out of thick magnets: it is for PTC and MAKETHIN."""
 _REFERENCE = {"entry": 0.5, "exit": -0.5}

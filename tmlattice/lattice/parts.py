@@ -509,5 +509,10 @@ def _matrix(part: Part, ring: Ring) -> Place:
     source.r = r
     if "b" in part.values:
         source.b = np.asarray(part.values["b"], dtype=float).reshape(6, 1)
+        if source.b[5, 0]:
+            raise LatticeError(
+                f"the matrix '{plain(part.name, 60)}' changes the energy in every turn, which is "
+                "not modelled; set that to 0"
+            )
     kind: Kind = "solenoid" if part.keyword == "solenoid" else "matrix"
     return part.name, "wiggler" if "wig" in part.name.casefold() else kind, source

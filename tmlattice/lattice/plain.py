@@ -50,13 +50,15 @@ def plain(ring: Ring, holds: Holds = lambda element: ()) -> tuple[Ring, tuple[st
         holds: which of an element's errors the writer writes itself.
     """
     changed: dict[int, Element] = {}
-    told: dict[str, list[str]] = {}
+    affected: dict[str, list[str]] = {}
     for place, element in enumerate(ring.elements):
         if element.errors != NO_ERRORS:
             changed[place], lacks = _plain(element, holds(element))
             for what in lacks:
-                told.setdefault(what, []).append(element.name)
-    return ring.with_elements(changed), tuple(w.replace("{}", _some(n)) for w, n in told.items())
+                affected.setdefault(what, []).append(element.name)
+    return ring.with_elements(changed), tuple(
+        w.replace("{}", _some(n)) for w, n in affected.items()
+    )
 
 
 def error_fields(element: Element) -> tuple[complex, complex]:
@@ -183,7 +185,7 @@ def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]
     left: dict[str, Any] = {
         name: value for name, value in vars(errors).items() if value != getattr(NO_ERRORS, name)
     }
-    told = []
+    lacks = []
     bare = replace(element, errors=NO_ERRORS, source=element.data or element.source)
     if element.kind in ("hcorrector", "vcorrector"):
         bare = _corrector(bare, errors)
@@ -194,7 +196,7 @@ def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]
             left.pop(name, None)
     if element.kind == "quadrupole" and element.length and (errors.k1l or errors.k1sl):
         bare = _quadrupole(bare, errors)
-        told.append("thin gradients in the middle of {} are written as fields of their bodies")
+        lacks.append("thin gradients in the middle of {} are written as fields of their bodies")
         for name in ("k1l", "k1sl"):
             left.pop(name, None)
     if element.kind in _TURNS and "roll" in left and "roll" not in held:
@@ -210,8 +212,8 @@ def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]
         for name in ("k1l", "k1sl", "entrance_k1l", "entrance", "middle"):
             left.pop(name, None)
     kept = {name: left.pop(name) for name in [*left] if name in held}
-    told += [f"{name} of {{}} cannot be written; the package's own JSON holds it" for name in left]
-    return replace(bare, errors=replace(NO_ERRORS, **kept)), told
+    lacks += [f"{name} of {{}} cannot be written; the package's own JSON holds it" for name in left]
+    return replace(bare, errors=replace(NO_ERRORS, **kept)), lacks
 
 
 def _quadrupole(element: Element, errors: Errors) -> Element:

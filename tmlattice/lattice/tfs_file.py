@@ -55,8 +55,8 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     try:
         table = tfs.read(str(path))
     except Exception as error:  # its own errors, and pandas'
-        said = " ".join(str(error).split())
-        raise LatticeError(f"'{path}' cannot be read as a table of MAD-X ({said})") from error
+        reason = " ".join(str(error).split())
+        raise LatticeError(f"'{path}' cannot be read as a table of MAD-X ({reason})") from error
     table.columns = [str(column).upper() for column in table.columns]
     missing = [column for column in NEEDED if column not in table.columns]
     if missing:

@@ -46,9 +46,9 @@ def write(ring: Ring, path: Path) -> tuple[str, ...]:
     """
     from at.load.json import save_json
 
-    lattice, told = made(ring)
+    lattice, lacks = made(ring)
     save_json(lattice, str(path))
-    return told
+    return lacks
 
 
 def made(ring: Ring) -> tuple[Any, tuple[str, ...]]:
@@ -128,6 +128,8 @@ def _polynoms(element: Element, part: Part | None) -> tuple[Array, Array]:
     """PolynomA and PolynomB, the fields of the element's errors included."""
     total = np.zeros(4, dtype=complex) if part is None else strengths(part)
     total[:2] += np.array(error_fields(element)) / (element.length or 1.0)
+    highest = max(np.flatnonzero(total), default=0)  # AT tracks every order that is there
+    total = total[: max(highest, 2) + 1]
     return total.imag, total.real
 
 

@@ -52,9 +52,9 @@ def holds(element: Element) -> tuple[str, ...]:
 
 def write(ring: Ring, path: Path) -> tuple[str, ...]:
     """Write plain elements; what it lacks. See `made`."""
-    text, told = made(ring)
+    text, lacks = made(ring)
     path.write_text(text, encoding="utf-8")
-    return told
+    return lacks
 
 
 def made(ring: Ring, calibration: Iterable[Any] = ()) -> tuple[str, tuple[str, ...]]:
@@ -72,7 +72,7 @@ def made(ring: Ring, calibration: Iterable[Any] = ()) -> tuple[str, tuple[str, .
     back = [e.name for e in ring.elements if e.length < -ROUNDING]
     if back:
         left_out[f"MAD-X takes no sequence that goes back, as this one at {first_of(back)}"] += 1
-    told = [f"{what} ({count} elements)" for what, count in left_out.items()]
+    lacks = [f"{what} ({count} elements)" for what, count in left_out.items()]
     particle = "ELECTRON" if ring.radiates else "PROTON"
     if not ring.radiates and abs(ring.mass / PROTON_GEV - 1) > 1e-6:
         particle = f"ION, MASS={_number(ring.mass)}, CHARGE=1"
@@ -99,11 +99,11 @@ def made(ring: Ring, calibration: Iterable[Any] = ()) -> tuple[str, tuple[str, .
             given = f"{READING[cause.effect]}={_number(cause.amount)}"
             read.setdefault(places[cause.element], []).append(given)
         else:
-            told.append(f"{cause.effect} of {cause.element} cannot be written")
+            lacks.append(f"{cause.effect} of {cause.element} cannot be written")
     for place, errors in read.items():
         content += ["SELECT, FLAG=ERROR, CLEAR;", f"SELECT, FLAG=ERROR, RANGE={place};",
                     f"EALIGN, {', '.join(errors)};"]  # fmt: skip
-    return "\n".join([*content, ""]), (*told, *names)
+    return "\n".join([*content, ""]), (*lacks, *names)
 
 
 def _number(value: float) -> str:

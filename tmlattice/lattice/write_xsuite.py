@@ -43,9 +43,9 @@ def holds(element: Element) -> tuple[str, ...]:
 
 def write(ring: Ring, path: Path) -> tuple[str, ...]:
     """Write plain elements as the JSON of a line; what it lacks. See `made`."""
-    content, told = made(ring)
+    content, lacks = made(ring)
     write_json(path, content)
-    return told
+    return lacks
 
 
 def made(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -73,8 +73,8 @@ def made(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
         },
         "_extra_config": steering,
     }
-    told = (f"{what} ({count} elements)" for what, count in left_out.items())
-    return content, (*told, *names)
+    lacks = (f"{what} ({count} elements)" for what, count in left_out.items())
+    return content, (*lacks, *names)
 
 
 ORDER = {"quadrupole": 1, "sextupole": 2, "octupole": 3}

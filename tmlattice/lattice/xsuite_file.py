@@ -137,13 +137,13 @@ def ring_of_content(
         content: the dictionary.
         name, sequence, energy: see `read_xsuite`.
     """
-    beside: Mapping[str, Any] = {}
+    outer: Mapping[str, Any] = {}
     if isinstance(content.get("line"), dict):
-        content, beside = content["line"], content
+        content, outer = content["line"], content
     line = content
     if isinstance(content.get("lines"), dict):
         line = content["lines"][chosen(path, list(content["lines"]), sequence)]
-    mass, charge, stated = _particle(line, content, beside)
+    mass, charge, stated = _particle(line, content, outer)
     if energy is None and stated is None:
         raise LatticeError(f"'{path}' has no reference particle; give energy= (GeV)")
     energy = float(stated or 0.0) if energy is None else energy

@@ -37,8 +37,8 @@ class LostBeam(Generic[Data]):
     """Where the signals of a measurement end.
 
     Attributes:
-        without: the measurement with the readings after that NaN, and with those of a plane that is
-            one constant.
+        without: the measurement with the readings after that NaN, and with those of a plane, or of
+            a turn, that is one constant.
         first: the first reading without signal, turn * monitors + monitor, [shot]; the number of
             readings where the signal goes on to the end.
         last: the last reading with a signal before that, [shot]; -1 where there is none.
@@ -77,11 +77,12 @@ def beam_lost(data: Data) -> LostBeam[Data]:
     first = np.minimum(first, _frozen_from(flat, there))
     after = np.arange(count) >= first[:, None]
     if not (after[..., None] & there).any():
-        return LostBeam(data, np.full(shots, count, dtype=np.intp), np.full(shots, count - 1))
+        none = np.full(shots, count, dtype=np.intp)
+        return LostBeam(_turns(data), none, np.full(shots, count - 1))
     kept = there & ~after[..., None]
     last = np.where(kept.any(axis=2), np.arange(count), -1).max(axis=1)
     readings = np.where(kept, flat, np.nan).reshape(data.readings.shape)
-    return LostBeam(replace(data, readings=readings), first, last)
+    return LostBeam(_turns(replace(data, readings=readings)), first, last)
 
 
 def _planes(data: Data) -> Data:
@@ -91,10 +92,27 @@ def _planes(data: Data) -> Data:
     """
     values = [own[np.isfinite(own)] for own in np.moveaxis(data.readings, 3, 0)]
     constant = [len(own) > 1 and not np.ptp(own) for own in values]
-    exact = data.noise is not None and not np.nan_to_num(data.noise, nan=1.0).all()
-    if exact or sum(constant) != 1 or not all(len(own) for own in values):
+    if _exact(data) or sum(constant) != 1 or not all(len(own) for own in values):
         return data
     return replace(data, readings=np.where(constant, np.nan, data.readings))
+
+
+def _turns(data: Data) -> Data:
+    """Without turns in which all BPMs read one constant, where other turns of the shot are none."""
+    there = np.isfinite(data.readings)
+    high = np.where(there, data.readings, -np.inf).max(axis=2)
+    low = np.where(there, data.readings, np.inf).min(axis=2)
+    read = there.any(axis=(2, 3)) & (there.any(axis=3).sum(axis=2) >= FEWEST)
+    constant = read & ((high == low) | ~there.any(axis=2)).all(axis=2)
+    constant &= (read & ~constant).any(axis=1, keepdims=True)
+    if _exact(data) or not constant.any():
+        return data
+    return replace(data, readings=np.where(constant[..., None, None], np.nan, data.readings))
+
+
+def _exact(data: Data) -> bool:
+    """Whether readings have no noise, and so may repeat."""
+    return data.noise is not None and not np.nan_to_num(data.noise, nan=1.0).all()
 
 
 def _constant_from(readings: Array, there: Flags) -> int:

@@ -26,6 +26,7 @@ from tmlattice.measurement.assume import assume, read_of
 from tmlattice.measurement.shots import FEWEST
 from tmlattice.observe.global_errors import Names, Search, Verdict
 from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.response_data import read as read_rf
 from tmlattice.observe.sections import mean_pass
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
@@ -191,7 +192,7 @@ class OfResponse(Compared):
 
     def rf_scale(self) -> float:
         """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
-        if not self.stepped:
+        if not self.stepped or not read_rf(self.data):
             return float("nan")
         read, made, _ = self.pairs(self.data)
         return ratio(read[-1:], made[-1:])
@@ -214,15 +215,15 @@ class OfOrbits(Compared):
 
     def design(self, data: ClosedOrbit | Dispersion) -> Array:
         """Orbits [state, monitor, 2] of the design in the states of the data."""
-        own, key = self.data, repr(getattr(data, "settings", ()))
-        if isinstance(data, Dispersion) and isinstance(own, Dispersion):
-            pairs = zip(own.steps, data.steps, strict=True)
+        own: Any = self.data
+        make: Any = closed_orbits
+        if isinstance(data, Dispersion):
+            make, pairs = dispersion, zip(own.steps, data.steps, strict=True)
             own = replace(own, steps=tuple(replace(a, step=b.step) for a, b in pairs))
-            key = repr([step.step for step in own.steps])
-        elif isinstance(data, ClosedOrbit):
+        else:
             own = replace(own, settings=data.settings)
+        key = repr([step.step for step in own.steps] if make is dispersion else own.settings)
         if key not in self._designs:
-            make: Any = dispersion if isinstance(own, Dispersion) else closed_orbits
             problem = make(self.ring, own, dict.fromkeys(modelled(), 1.0))
             order = {name: i for i, name in enumerate(self.monitors)}
             at = [order[self.ring[name].name] for name in data.monitors]
@@ -237,7 +238,8 @@ class OfOrbits(Compared):
                 return np.full_like(read, np.nan), made, 0.0
             there = np.isfinite(read)
             read, made = (own - mean_pass(own, there) for own in (read, made))
-        return read, made, 2 * np.broadcast_to(np.nan_to_num(data.noise), read.shape) ** 2
+        noise = np.zeros(2) if data.noise is None else np.nan_to_num(data.noise)
+        return read, made, 2 * np.broadcast_to(noise, read.shape) ** 2
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""

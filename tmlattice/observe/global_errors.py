@@ -66,19 +66,6 @@ Names = tuple[str, ...]
 GAIN, CERTAIN = 12.0, 15.0
 """Log evidence above which a global error is reported, and above which it is certain: no healthy
 measurement of `benchmarks/data_checks.py` gains as much."""
-SHARE = 0.65
-"""Share of all changed terms that an assumption must improve: the section of a fault may gain much
-by chance, but then many others lose."""
-CLEAR, CLEAR_UNIT, AGAINST = 3.0, 30.0, 10.0
-"""Factors by which chi-square must fall: of sections or launches, at least; with a unit corrected;
-and of sections where launches contradict. Units are powers of a thousand."""
-RIGHT = 5.0
-"""Chi-square of correct launches."""
-FINE, FINE_GAIN = 0.1, 30.0
-"""Share of the orbit below which sections agree in any case, and log evidence that curvature, or a
-few corrector settings, must then gain."""
-
-
 ERRORS = 4.0
 """Independent numbers by which a fault changes what is read in a section, or at a joint, whatever
 the number of shots: a kick and a gradient in each plane."""
@@ -99,14 +86,12 @@ class Terms:
         levels, launch: chi-square per reading of the sections, and of the launches in the worse
             plane (NaN if none is stated): of all that was read, and of its changes from pass to
             pass, [2].
-        share: of the orbit that the sections leave: see `SectionFits`.
     """
 
     cost: Array
     blur: float
     levels: Array
     launch: Array
-    share: float
 
 
 @dataclass(frozen=True)
@@ -132,8 +117,8 @@ class Split:
 
     @classmethod
     def of(
-        cls, miss: Array, spread: Array, kicked: Array, there: Flags, freedom: Array,
-        errors: float = ERRORS,
+        cls, miss: Array, spread: Array, kicked: Array, there: Flags,
+        freedom: Array | NDArray[np.int64], errors: float = ERRORS,
     ) -> "Split":  # fmt: skip
         """Split mismatches.
 
@@ -278,30 +263,13 @@ class Search:
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
 
 
-def widely(stated: Terms, other: Terms) -> bool:
-    """Whether an assumption improves nearly all terms that it changes."""
-    a, b = stated.cost, other.cost
-    if len(a) != len(b):
-        return True
-    better, worse = np.maximum(a - b, 0).sum(), np.maximum(b - a, 0).sum()
-    return bool(better > SHARE * (better + worse))
-
-
-def believable(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict | None:
-    """The assumption, if the corrected terms are right, not only less wrong."""
+def _verdict(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict:
+    """An assumption with the chi-square that falls most."""
     pairs = []
     for one, then in ((stated.levels, other.levels), (stated.launch, other.launch)):
-        which = int(np.nan_to_num(one / np.maximum(then, 1e-12)).argmax())  # as it falls most
+        which = int(np.nan_to_num(one / np.maximum(then, 1e-12)).argmax())
         pairs.append((float(one[which]), float(then[which])))
-    (local, local_then), (launch, launch_then) = pairs
-    local_clears, launch_clears = local / max(local_then, 1e-12), launch / max(launch_then, 1e-12)
-    if launch_then > RIGHT and local_clears < AGAINST:  # false if no launch is stated
-        return None
-    unit = any("-in-" in name for name in names)
-    clear = CLEAR_UNIT if unit else CLEAR
-    curved = stated.share < FINE and not unit and gain > FINE_GAIN
-    if not (local_clears > clear or launch_clears > clear or curved):
-        return None
+    (local, local_then), (launch, _) = pairs
     # the sections may agree either way: then the launches decide
     of_launch = not local > 2 * local_then and bool(np.isfinite(launch))
     of = "chi-square per reading" + " of the launches" * of_launch
@@ -437,8 +405,8 @@ class OfTurns(Search):
             ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
         noise = np.log(ratio * np.sqrt(square)) / NOISE_WIDTH if data.noise is not None else 0.0
         orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
-        size = max(float(np.median((sections.kicked**2).sum(axis=2))), 1e-300)
-        kicks = KICKS / size
+        moved = (sections.kicked**2).sum(axis=2)  # none where nothing was read
+        kicks = KICKS / np.median(moved[moved > 0]) if moved.any() else KICKS[:1]
         parts = [own.cost(square, kicks) for own in (sections, *joints)]
         if launch is not None:  # in m and rad; the information of launches differs
             parts.append(np.maximum(launch.cost(1.0, square * kicks), 0.0))
@@ -450,7 +418,6 @@ class OfTurns(Search):
             blur,
             unit * np.array([found.level, sections.level()]),
             np.full(2, np.nan) if launch is None else np.array([_worse(each), launch.level(True)]),
-            found.share(passes),
         )
 
     def launches(self, square: float, tolerance: float) -> tuple[Array, Array]:
@@ -561,28 +528,24 @@ class OfTurns(Search):
         square = self.square([(), *several])
         stated = self.terms((), square)
 
-        def gains(some: Iterable[Names]) -> dict[Names, tuple[float, Terms]]:
-            """Of assumptions that improve nearly all terms that they change."""
-            made = {names: self.terms(names, square) for names in some if self._possible(names)}
-            return {
-                names: (float(stated.cost.sum() - other.cost.sum())
-                        - max(other.blur - stated.blur, 0.0), other)
-                for names, other in made.items() if widely(stated, other)
-            }  # fmt: skip
+        def gains(some: Iterable[Names]) -> list[Verdict]:
+            found = []
+            for names in filter(self._possible, some):
+                other = self.terms(names, square)
+                gain = float(stated.cost.sum() - other.cost.sum())
+                gain -= max(other.blur - stated.blur, 0.0)
+                found.append(_verdict(stated, other, names, gain))
+            return found
 
-        found = gains(several)
-        first = sorted(found, key=lambda names: found[names][0], reverse=True)
-        if not first or found[first[0]][0] < GAIN:
+        found = sorted(gains(several), key=lambda own: own.gain, reverse=True)
+        if not found or found[0].gain < GAIN:
             return []
         order = list(ASSUMPTIONS).index
-        found |= gains(sorted({
-            tuple(sorted({*one, *two}, key=order))
-            for one in first[:BEAM] for two in several if not _same_part(one[0], two[0])
+        found += gains(sorted({
+            tuple(sorted({*one.names, *two}, key=order))
+            for one in found[:BEAM] for two in several if not _same_part(one.names[0], two[0])
         } - set(several)))  # fmt: skip
-        verdicts = [
-            believable(stated, other, names, gain) for names, (gain, other) in found.items()
-        ]
-        return [own for own in verdicts if own and own.worth > GAIN]
+        return [own for own in found if own.worth > GAIN]
 
     def corrected(self, names: Names) -> Self:
         """Return the search with assumptions corrected in the data."""

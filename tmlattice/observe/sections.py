@@ -302,7 +302,7 @@ class Sections:
                 moved = steps[:, first[go] + step].after(way[:, go])
                 for name in ("c0", "c1", "c2"):
                     getattr(way, name)[:, go] = getattr(moved, name)
-        return seen, way, np.linalg.inv(before)[..., 1::2]
+        return seen, way, np.asarray(np.linalg.inv(before)[..., 1::2], dtype=float)
 
     def fit(self, passes: Passes) -> SectionFits:
         """Fit the trajectory of each section to its own readings."""

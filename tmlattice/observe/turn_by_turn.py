@@ -24,7 +24,7 @@ action.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,9 +147,10 @@ def _spread(found: Lines, shots: Sequence[int]) -> Array:
 
 def _tracked(
     ring: Ring, beam: StoredBeam, wanted: ComplexArray, turns: int, at: Array
-) -> tuple[ComplexArray, Array, Flags]:
-    """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes [shot, mode], and
-    whether the beam survived [shot], for amplitudes [shot, mode] of which the last is small."""
+) -> tuple[ComplexArray, Array, Array, Flags]:
+    """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes and actions [shot,
+    mode], and whether the beam survived [shot], for about these amplitudes [shot, mode], of which
+    the last is small."""
     way, maps = nonlinear_turn(beam.model.layers), beam.model.maps
     names = tuple(monitor.name for monitor in ring.monitors)
 
@@ -166,7 +167,7 @@ def _tracked(
     ratio = wanted / np.where(unit == 0, np.nan, unit)
     good = np.abs(ratio - 1) < MAX_CORRECTION
     unit, found, kept = seen(wanted * np.where(good, ratio, 1.0), turns)
-    return found.amplitude / unit[:, None, None], found.tune, kept
+    return found.amplitude / unit[:, None, None], found.tune, np.abs(unit) ** 2, kept
 
 
 def _fill(
@@ -178,14 +179,25 @@ def _fill(
     size = amplitude * np.sqrt(spread.mean(axis=2))
     turns = int(np.clip(found.turns[shots].max(), *TURNS))
     wanted = np.concatenate([scale * size for scale in SCALES])
-    both = _tracked(ring, beam, wanted, turns, at)
-    modes, tunes, kept = (own.reshape(len(SCALES), len(shots), *own.shape[1:]) for own in both)
+    every = _tracked(ring, beam, wanted, turns, at)
+    modes, tunes, actions, kept = (own.reshape(len(SCALES), len(shots), *own.shape[1:])
+                                   for own in every)  # fmt: skip
     whole, half, first = (modes[i] - modes[-1] for i in range(3))
     tune, tune_half, tune_first = ((tunes[i] - tunes[-1] + 0.5) % 1.0 - 0.5 for i in range(3))
-    beyond, beyond_tune = whole - 2 * half, tune - 2 * tune_half
-    # the first has half of the second action
-    parts = np.stack([2 * first - whole, 2 * (whole - first)], axis=1)
-    tune_parts = np.stack([2 * tune_first - tune, 2 * (tune - tune_first)], axis=1)
+    # tracked actions over the measured ones; a mode that was not kicked makes no shift
+    alone = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0)])[:, None]
+    over = np.where(size == 0, alone, actions[:3] / np.maximum(np.abs(size) ** 2, 1e-300))
+    (a, b), (c, d) = over[0].T, over[2].T
+    inverse = np.array([(d, -b), (-c, a)]) / np.where(a * d == b * c, np.nan, a * d - b * c)
+
+    def parted(whole: Any, half: Any, first: Any) -> tuple[Any, Any]:
+        """The shift by each action, [shot, action, ...], and its next order."""
+        parts = np.einsum("ars,rs...->sa...", inverse, np.stack([whole, first]))
+        return parts, 2 * (np.einsum("sa,sa...->s...", over[1], parts) - half)
+
+    parts, beyond = parted(whole, half, first)
+    tune_parts, beyond_tune = parted(tune, tune_half, tune_first)
+    whole = parts.sum(axis=1)
 
     def rms(change: ComplexArray) -> Array:
         """Relative to the modes, [..., mode]."""
@@ -194,7 +206,7 @@ def _fill(
 
     # a mode without a line was not kicked, or its plane was not measured
     of_parts = rms(parts)
-    there = np.isfinite(of_parts.sum(axis=1) + rms(half) + tune) & (size != 0)
+    there = np.isfinite(of_parts.sum(axis=1) + rms(half) + tune_parts.sum(axis=1)) & (size != 0)
     large = there & (rms(whole) > SEEN)
     share = np.where(large, rms(beyond) / np.maximum(rms(whole), 1e-300), 0.0)
     shift.modes[shots] = np.where(there[:, None, None, None], parts, 0.0)
