@@ -49,9 +49,9 @@ def of_gpu(stored):
 
 def of_corrections(machines):
     """Each study of `correct.py`: sums of squares in tolerances, medians over its machines."""
-    yield ["study", "machines", "before", "after", "oracle", "SVD", "LOCO",
-           "rms over the oracle's, median (worst)", "not worse than before", "68 % intervals: now",
-           "expected"]  # fmt: skip
+    yield ["study", "machines", "refused", "before", "after", "oracle", "SVD", "LOCO",
+           "rms over the oracle's, median (worst)", "not worse than before",
+           "not worse than LOCO", "68 % intervals: now", "expected"]  # fmt: skip
     for study in sorted({tuple(one["study"]) for one in machines}):
         own = [one for one in machines if tuple(one["study"]) == study]
         square = {m: np.array([one[m]["square"] for one in own if m in one])
@@ -67,9 +67,12 @@ def of_corrections(machines):
         ]  # fmt: skip
         yield [
             ", ".join(study).replace("_", " "), str(len(own)),
+            str(sum(bool(one["refused"]) for one in own)),
             *(f"{np.median(v):.3g}" if len(v) == len(own) else "" for v in square.values()),
             f"{np.median(ratio):.3f} ({ratio.max():.3f})",
             str(np.sum(square["tmlattice"] <= square["before"])),
+            str(sum(one["tmlattice"]["square"] <= one["loco"]["square"] for one in own))
+            if len(square["loco"]) else "",
             *(f"{100 * share:.0f} %" for share in hold),
         ]  # fmt: skip
 

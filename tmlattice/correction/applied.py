@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,19 +58,20 @@ def read_settings(path: Path, ring: Ring) -> list[tuple[Knob, float]]:
         MeasurementError, UnknownNameError: a table that cannot be read, or a device that the ring
             does not have.
     """
-    rows, new = [], []
+    rows: list[dict[str, Any]] = []
+    new: list[float] = []
     for row in csv.DictReader(text_of(path, MeasurementError).splitlines()):
         try:
             new.append(float(row.pop("new")))
             if not math.isfinite(new[-1]):
                 raise ValueError
-            rows.append({"knob": row.pop("device"), "present": float(row.pop("present"))} | row)
+            rows.append({**row, "knob": row.pop("device"), "present": float(row["present"])})
         except (KeyError, TypeError, ValueError):
             raise MeasurementError(
                 f"{path}: a row has no device, present or new; give the settings.csv of a "
                 f"correction (found: {plain(str(row), 80)})"
             ) from None
-        for derived in ("change", "gain"):
+        for derived in ("device", "change", "gain"):
             rows[-1].pop(derived, None)
     if not rows:
         raise MeasurementError(f"{path}: it contains no setting")

@@ -281,7 +281,7 @@ def bounded(matrix: Array, right: Array, low: Array, high: Array) -> Array:
         if not wrong.any():
             break
         held[wrong] = np.where(held, 0, np.where(x > high, 1, -1))[wrong]
-    return np.clip(x, low, high)
+    return np.asarray(np.clip(x, low, high))
 
 
 def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:

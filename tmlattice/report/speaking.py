@@ -83,28 +83,24 @@ def render(
         OutputError: it cannot be written.
     """
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
-    alone = (folder / CORRECTION_LATTICE).is_file() and not (folder / DOCUMENT).is_file()
-    diagnosis = None if alone else load(Diagnosis, path)
-    correction = None
-    if (folder / CORRECTION).is_file():
-        ring = diagnosis.ring if diagnosis else load_ring(folder / CORRECTION_LATTICE)
-        correction = read_correction(folder / CORRECTION, ring)
-    with output_folder(folder if out is None else Path(out)) as temporary:
-        if diagnosis is None:
-            assert correction is not None
+    place, correction = folder if out is None else Path(out), None
+    if (folder / CORRECTION_LATTICE).is_file() and not (folder / DOCUMENT).is_file():
+        correction = read_correction(folder / CORRECTION, load_ring(folder / CORRECTION_LATTICE))
+        with output_folder(place) as temporary:
             html = correction_page(correction, temporary)
-        else:
-            pictures = draw(diagnosis, temporary, correction)
-            drawn = {picture.name for picture in pictures}
-            pictures += [kept for kept in pictures_in(folder, diagnosis) if kept.name not in drawn]
-            html = page(diagnosis, pictures, correction=correction)
-            text = report_text(diagnosis) + "\n"
-            (temporary / "report.txt").write_text(text, encoding="utf-8")
+            (temporary / "report.html").write_text(html, encoding="utf-8")
+        return correction
+    diagnosis = load(Diagnosis, path)
+    if (folder / CORRECTION).is_file():
+        correction = read_correction(folder / CORRECTION, diagnosis.ring)
+    with output_folder(place) as temporary:
+        pictures = draw(diagnosis, temporary, correction)
+        drawn = {picture.name for picture in pictures}
+        pictures += [kept for kept in pictures_in(folder, diagnosis) if kept.name not in drawn]
+        html = page(diagnosis, pictures, correction=correction)
         (temporary / "report.html").write_text(html, encoding="utf-8")
-    if diagnosis is not None:
-        return diagnosis
-    assert correction is not None
-    return correction
+        (temporary / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
+    return diagnosis
 
 
 def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path:
