@@ -363,8 +363,8 @@ def main() -> None:
             continue
         try:
             row = {"study": study, **case(ring, seed, options)}
-        except TmlatticeError as error:
-            print(f"seed {seed}: {error}", flush=True)
+        except (TmlatticeError, ValueError) as error:
+            print(f"seed {seed}: {type(error).__name__}: {error}", flush=True)
             continue
         rows.append(row)
         print(f"seed {seed}: beta beating " + ", ".join(

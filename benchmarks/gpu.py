@@ -1,17 +1,19 @@
-"""Networks on a graphics card: the CPU's values, and speed beside a plain torch loop.
+"""Networks on a graphics card: the CPU's values, and speed beside a plain torch loop and Xsuite.
 
-    python benchmarks/gpu.py --reference FILE       # anywhere: what the CPU says, 5 MB
-    python benchmarks/gpu.py FILE [--out FOLDER]    # on the card; OCELOT is not needed
+    python benchmarks/gpu.py [--out FOLDER] [--without-xsuite]
 
-The weights are PETRA III's with a small random change of every coefficient: none is zero, as after
-a training step. Times are medians, by CUDA events, in ms. The whole takes a minute.
+The ring is petra3, in four and in six dimensions, with a small random change of every coefficient:
+none is zero, as after a training step. Times are medians, by CUDA events, in ms. Xsuite tracks the
+same ring as `.xsuite.json` on the same card, with CuPy; its kernel takes minutes to compile.
 """
 
 import argparse
+import importlib
 import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -19,43 +21,44 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from tmlattice import TaylorNetwork, load_ring
+from tmlattice.errors import BeamLostError
 from tmlattice.fitting.adam import fit_adam
 from tmlattice.harmonics import tunes
-from tmlattice.maps import RingMaps, TaylorMap
+from tmlattice.lattice.write import save_ring
+from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.measurement import Measurement
-from tmlattice.network import TaylorNetwork, symplectic_penalty
+from tmlattice.network import symplectic_penalty
 from tmlattice.network.reference import packed, plain_pass
 
 SHOTS = 200
 DEVICE = "cuda"
-ARRAYS = ("s", "W0", "W1", "W2", "s_monitors", "at", "R0", "R1", "R2")
+SIZE = (3e-4, 1e-5, 3e-4, 1e-5, 1e-3, 1e-4)
+"""Rms of a launch, of each coordinate: m, rad, m, rad, m, 1."""
 
 
-def network_of(file):
-    """The design in a reference file, and the change of every coefficient."""
-    closing = TaylorMap([file[f"closing{i}"] for i in range(3)])
-    names = {name: tuple(file[name].tolist()) for name in ("layers", "monitors")}
-    design = TaylorNetwork(RingMaps(**{k: file[k] for k in ARRAYS}, **names, closing=closing))
+def changed(design):
+    """The design with a change of every coefficient."""
     network = design.copy()
     rng = np.random.default_rng(1)
     with torch.no_grad():
         for weight, size in zip(network.parameters(), (1e-9, 1e-7, 1e-3), strict=True):
             weight.add_(size * torch.from_numpy(rng.standard_normal(tuple(weight.shape))))
-    return design, network
+    return network
 
 
-def measurement_of(file, network):
-    launch = np.zeros((5, 5))
-    launch[:, :4] = file["launch"][:5]
-    return Measurement(launch, file["read"][:, None], network.monitors)
+def launches(count, dimension, seed=2):
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(rng.standard_normal((count, dimension)) * SIZE[:dimension])
 
 
-def everything(network, file):
+def everything(network, design):
     """What is compared, as arrays on the CPU."""
-    device = network.W0.device
-    launch = torch.from_numpy(file["launch"]).to(device).requires_grad_()
-    pulls = torch.from_numpy(file["pulls"]).to(device)
+    device, n = network.W0.device, network.dimension
+    launch = launches(SHOTS, n).to(device).requires_grad_()
+    rng = np.random.default_rng(3)
     readings = network(launch, turns=2)
+    pulls = torch.from_numpy(rng.standard_normal(tuple(readings.shape))).to(device)
     names = ("launch", "W0", "W1", "W2")
     wanted = [launch, *network.parameters()]
     gradients = torch.autograd.grad((readings * pulls).sum(), wanted)
@@ -69,29 +72,25 @@ def everything(network, file):
     }
     found = {name: t.detach().cpu().numpy() for name, t in tensors.items()}
     found["one turn"] = network.track(launch, 1)[:, 1]
-    fit = fit_adam(network, measurement_of(file, network), epochs=10, progress=False)
-    found["losses of ten epochs of fine_tune"] = np.array(fit.loss)
+    still = launch.detach() * 0.1
+    found["255 turns of the design"] = design.track(still[:20], 255)
+    far = still[:5].clone()
+    far[3, 0] = 0.5
+    lost = network(far, on_lost="inf").detach().cpu().numpy()
+    found["readings beside a lost beam"] = np.where(np.isfinite(lost), lost, 1e3)
+    try:
+        network.track(far, 3)
+    except BeamLostError as error:
+        found["the lost beam's message"] = np.array([len(str(error))])
+    if n == 4:
+        whole = np.zeros((5, 5))
+        whole[:, :4] = launch[:5].detach().cpu().numpy()
+        read = design.readings(launch[:5])
+        read = np.asarray(read.detach().cpu() if isinstance(read, torch.Tensor) else read)
+        measured = Measurement(whole, read[:, None], network.monitors)
+        fit = fit_adam(network, measured, epochs=10, progress=False)
+        found["losses of ten epochs of fine_tune"] = np.array(fit.loss)
     return found
-
-
-def reference(path):
-    """Weights, launches, and what the CPU makes of them."""
-    from tmlattice import load_ring
-
-    maps = TaylorNetwork.from_ring(load_ring("petra3")).maps
-    rng = np.random.default_rng(2)
-    file = {name: getattr(maps, name) for name in ARRAYS}
-    file |= {f"closing{i}": c for i, c in enumerate(maps.closing.coefficients)}
-    file |= {"layers": np.array(maps.layers), "monitors": np.array(maps.monitors)}
-    file["launch"] = rng.standard_normal((SHOTS, 4)) * [3e-4, 1e-5, 3e-4, 1e-5]
-    file["pulls"] = rng.standard_normal((SHOTS, 2, len(maps.monitors), 2))
-    design, network = network_of(file)
-    file["read"] = design.readings(file["launch"][:5])
-    file |= {f"expected {name}": value for name, value in everything(network, file).items()}
-    still = design.track(file["launch"][:20] * 0.1, 255)
-    file["expected tunes of the design"] = tunes(still, method="fft").fraction
-    np.savez_compressed(path, **file)
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 def milliseconds(call, repeats=15):
@@ -113,68 +112,47 @@ def relative(got, expected):
 
 
 def plain_track(x, w):
-    i, j = torch.triu_indices(4, 4).to(DEVICE)
+    n = x.shape[1]
+    i, j = torch.triu_indices(n, n).to(DEVICE)
     for layer in w:
-        x = layer[:, 0] + x @ layer[:, 1:5].T + (x[:, i] * x[:, j]) @ layer[:, 5:].T
+        linear, second = layer[:, 1 : n + 1], layer[:, n + 1 :]
+        x = layer[:, 0] + x @ linear.T + (x[:, i] * x[:, j]) @ second.T
     return x
 
 
 class Run:
-    def __init__(self, path, out):
-        from tmlattice.network import cuda
-
-        self.cuda, self.out = cuda, out
+    def __init__(self, out, dimension):
+        self.out, self.dimension = out, dimension
         self.begun = time.perf_counter()
         self.result = {}
-        self.file = dict(np.load(path))
-        self.design, self.network = (n.to(DEVICE) for n in network_of(self.file))
+        self.on_cpu = TaylorNetwork.from_ring(load_ring("petra3"), dimension)
+        self.design = self.on_cpu.copy().to(DEVICE)
+        self.network = changed(self.on_cpu).to(DEVICE)
 
     def say(self, name, value):
+        name = f"{self.dimension}-D: {name}"
         self.result[name] = value
         print(f"[{time.perf_counter() - self.begun:6.1f} s] {name}: {value}", flush=True)
-        (self.out / "gpu.json").write_text(json.dumps(self.result, indent=1))
 
-    def choose(self, kernel, what, options, call):
-        """Each configuration's time; the fastest is kept."""
-        times = {}
-        for option in options:
-            self.cuda.CONFIGURATION[kernel] = option
-            try:
-                times[json.dumps(option)] = round(milliseconds(call, 7), 3)
-            except Exception as error:
-                times[json.dumps(option)] = str(error)[:80]
-        numbers = {k: v for k, v in times.items() if isinstance(v, float)}
-        best = min(numbers, key=numbers.get)
-        self.cuda.CONFIGURATION[kernel] = json.loads(best)
-        self.say(f"{kernel}, {what}", times)
-
-    def state(self):
+    def card(self):
         query = "name,driver_version,clocks.sm,clocks.max.sm,clocks.mem,power.draw,memory.total"
         seen = subprocess.run(["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
                               capture_output=True, text=True, check=False)  # fmt: skip
-        return seen.stdout.strip()
-
-    def card(self):
-        import triton
-
-        self.say("card", self.state())
-        self.say("versions", f"torch {torch.__version__}, triton {triton.__version__}")
+        self.say("card", seen.stdout.strip())
 
     def values(self):
-        before = everything(self.network, self.file)
-        for name, value in before.items():
-            self.say(f"{name}, relative to the CPU", relative(value, self.file["expected " + name]))
-        again = everything(self.network, self.file)
-        same = all((again[name] == value).all() for name, value in before.items())
-        self.say("repeats bit by bit", same)
-        still = self.design.track(self.file["launch"][:20] * 0.1, 255)
-        found = tunes(still, method="fft").fraction
-        self.say("tunes - CPU's", np.abs(found - self.file["expected tunes of the design"]).max())
+        expected = everything(changed(self.on_cpu), self.on_cpu)
+        self.say("devices", [str(n.W0.device) for n in (self.on_cpu, self.network, self.design)])
+        found = [everything(self.network, self.design) for _ in range(2)]
+        for name, value in found[0].items():
+            self.say(f"{name}, relative to the CPU", relative(value, expected[name]))
+        self.say("repeats bit by bit", all((found[1][k] == v).all() for k, v in found[0].items()))
+        turns = "255 turns of the design"
+        of_card, of_cpu = (tunes(x[turns], method="fft").fraction for x in (found[0], expected))
+        self.say("tunes - CPU's", float(np.abs(of_card - of_cpu).max()))
 
     def launches(self, count):
-        torch.manual_seed(count)
-        size = torch.tensor([3e-4, 1e-5, 3e-4, 1e-5], dtype=torch.float64, device=DEVICE)
-        return torch.randn(count, 4, dtype=torch.float64, device=DEVICE) * size
+        return launches(count, self.dimension, count).to(DEVICE)
 
     def turn(self, network):
         with torch.no_grad():
@@ -182,48 +160,24 @@ class Run:
             return torch.cat([weights, network._closing[None]])
 
     def tracking(self):
+        from tmlattice.network import cuda
+
         w, design = self.turn(self.network), self.turn(self.design)
-        options = [
-            {"BLOCK": b, "num_warps": n, "UNROLL": u, **({"maxnreg": r} if r else {})}
-            for b, n, u, r in TRACK
-        ]
         for count in (100_000, 1_000_000):
             x = self.launches(count)
-
-            def ten(layers, x=x):
-                return milliseconds(lambda: self.cuda.track(x, layers, 10), 3) / 10
-
-            self.choose("track", count, options, lambda x=x: self.cuda.track(x, w, 1))
-            self.say(f"track {count}, a turn of ten", ten(w))
-            self.cuda.track(x, w, 20)
-            self.say("card, at work", self.state())
-            self.say(f"track {count}, the design, a turn of ten", ten(design))
+            for name, layers in (("", w), (", the design", design)):
+                ten = milliseconds(lambda x=x, w=layers: cuda.track(x, w, 10), 3)
+                self.say(f"track {count}{name}, a turn of ten", ten / 10)
+            cuda.track(x, w, 20)
+            self.card()
             plain = milliseconds(lambda x=x: plain_track(x, w), 3)
             self.say(f"torch loop {count}, one turn", plain)
 
-    def parts(self, count=100_000):
-        """The parts of a training step, each alone."""
-        x, w = self.launches(count), self.turn(self.network)[:-1]
-        sweep = self.network.sweep()
-        curved = torch.ones(len(w), dtype=torch.int32, device=DEVICE)
-        readings = x.new_empty(len(sweep.r), 2, count)
-        states = x.new_empty(len(w) + 1, 4, count)
-        states[0] = x.T
-        adjoint = torch.randn_like(states)
-        ones = [{"BLOCK": b, "num_warps": n} for b, n in PASS]
-        self.choose("readings", count, ones, lambda: sweep.fill(w, curved, x.T.clone(), readings))
-        self.choose("states", count, ones, lambda: sweep.fill(w, curved, states))
-        pulls = readings.permute(2, 0, 1)
-        self.choose(
-            "reverse", count, ones, lambda: sweep.reverse(w, curved, states, pulls, adjoint)
-        )
-        options = [{"BLOCK": b, "num_warps": n, "PART": p} for b, n, p in SUMS]
-        self.choose("sums", count, options, lambda: self.cuda.sums(states, adjoint))
-
     def training(self, count=100_000):
         x, network = self.launches(count), self.network
+        generator = torch.Generator(DEVICE).manual_seed(4)
         target = 1e-4 * torch.randn(count, len(network.monitors), 2, dtype=torch.float64,
-                                    device=DEVICE)  # fmt: skip
+                                    device=DEVICE, generator=generator)  # fmt: skip
 
         def step(penalty):
             network.zero_grad()
@@ -255,29 +209,61 @@ class Run:
             begun = time.perf_counter()
             self.design.track(self.launches(count) * 0.1, turns, keep_lost=True)
             self.say(f"network.track, {count} x {turns}, s", time.perf_counter() - begun)
+        begun = time.perf_counter()
+        simulate_turns(load_ring("petra3"), turns=1000, particles=100_000, engine="network")
+        self.say("simulate_turns, 100000 x 1000, s", time.perf_counter() - begun)
 
+    def xsuite(self, turns=3):
+        """The design through Xsuite's own elements (exact drifts, thick magnets)."""
+        os.environ["XSUITE_ALLOW_KERNEL_COMPILATION"] = "1"
+        import xobjects
+        import xtrack
 
-TRACK = (
-    (128, 1, 1, 0), (128, 1, 2, 0), (128, 1, 4, 0), (256, 1, 1, 0), (256, 1, 2, 0),
-    (256, 1, 4, 0), (256, 1, 2, 168), (256, 2, 2, 0), (512, 2, 2, 0),
-)  # fmt: skip
-PASS = ((32, 1), (64, 1), (128, 1), (64, 2))
-SUMS = ((32, 1, 8192), (32, 1, 16384), (64, 2, 16384))
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "petra3.xsuite.json"
+            save_ring(load_ring("petra3"), path)
+            line = xtrack.load(str(path))
+        begun = time.perf_counter()
+        context = xobjects.ContextCupy()
+        line.build_tracker(_context=context)
+        reference = line.particle_ref
+        for count in (100_000, 1_000_000):
+            x = launches(count, 4, count).numpy().T
+            at = dict(zip(("x", "px", "y", "py"), x, strict=True))
+            particles = xtrack.Particles(
+                _context=context, mass0=reference.mass0, p0c=reference.p0c[0],
+                q0=reference.q0, **at,
+            )  # fmt: skip
+            if count == 100_000:
+                few = self.design.track(launches(count, 4, count)[:1000], 1, keep_lost=True)[:, 1]
+                line.track(particles, num_turns=1)
+                order = particles.particle_id.get().argsort()
+                got = np.stack([getattr(particles, c).get()[order][:1000] for c in at], axis=1)
+                self.say("Xsuite, seconds to compile", round(time.perf_counter() - begun, 1))
+                self.say("Xsuite, one turn, relative to the network's", relative(got, few))
+            spent = milliseconds(lambda p=particles: line.track(p, num_turns=turns), 3) / turns
+            self.say(f"Xsuite {count}, the design, one turn", spent)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--reference", action="store_true", help="write the file")
     parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", ".")))
+    parser.add_argument("--without-xsuite", action="store_true")
     options = parser.parse_args()
-    if options.reference:
-        reference(options.file)
-        return
-    run = Run(options.file, options.out)
-    for part in (run.card, run.values, run.tracking, run.parts, run.training, run.long):
-        part()
-    print(json.dumps(run.result))
+    triton = importlib.import_module("triton").__version__
+    result = {"versions": f"torch {torch.__version__}, triton {triton}"}
+    for dimension in (4, 6):
+        run = Run(options.out, dimension)
+        parts = [run.card, run.values, run.tracking, run.training]
+        if dimension == 4:
+            parts += [run.long] if options.without_xsuite else [run.long, run.xsuite]
+        for part in parts:
+            try:
+                part()
+            except Exception as error:  # the others' figures are worth their time on the card
+                run.say(f"{part.__name__} ended", repr(error))
+            result |= run.result
+            (options.out / "gpu.json").write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

@@ -19,15 +19,19 @@ import numpy as np
 FOLDER = Path(__file__).parent.parent / "docs" / "results"
 PLACE = re.compile(r"(<!-- table (\w+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 GPU = (
-    ("a turn of 100,000 particles (mean of ten)", "track 100000, a turn of ten",
-     "torch loop 100000, one turn"),
-    ("a turn of 1,000,000 particles (mean of ten)", "track 1000000, a turn of ten",
-     "torch loop 1000000, one turn"),
+    ("a turn of 100,000 particles (mean of ten)", "4-D: track 100000, a turn of ten",
+     "4-D: torch loop 100000, one turn", None),
+    ("a turn of 1,000,000 particles (mean of ten)", "4-D: track 1000000, a turn of ten",
+     "4-D: torch loop 1000000, one turn", None),
     ("the same, design (65 % of its layers are linear)",
-     "track 1000000, the design, a turn of ten", None),
-    ("training step, 100,000 launches, 246 BPMs, all gradients", "training step 100000",
-     "torch loop, training step 100000"),
-    ("the same with the symplectic penalty", "training step 100000, with penalty", None),
+     "4-D: track 1000000, the design, a turn of ten", None,
+     "4-D: Xsuite 1000000, the design, one turn"),
+    ("training step, 100,000 launches, 246 BPMs, all gradients", "4-D: training step 100000",
+     "4-D: torch loop, training step 100000", None),
+    ("the same with the symplectic penalty", "4-D: training step 100000, with penalty", None, None),
+    ("six dimensions: a turn of 1,000,000 particles", "6-D: track 1000000, a turn of ten",
+     "6-D: torch loop 1000000, one turn", None),
+    ("six dimensions: training step, 100,000 launches", "6-D: training step 100000", None, None),
 )  # fmt: skip
 OPTICS = ("beta_beating", "phase_advance", "dispersion", "tunes", "coupling")
 BLIND = {"tool": "`diagnose`", "oracle": "oracle", "omp": "matching pursuit", "lasso": "LASSO",
@@ -36,11 +40,11 @@ BANDS = {"above 20": "20 and more", "10-20": "10 to 20", "5-10": "5 to 10"}
 
 
 def of_gpu(stored):
-    """Kernels and torch loop of `gpu.py`."""
-    yield ["H100, times in ms", "kernels", "torch loop", "ratio"]
-    for words, ours, plain in GPU:
-        both = (stored[plain], stored[plain] / stored[ours]) if plain else ()
-        yield [words, f"{stored[ours]:.3g}", *(f"{v:.0f}" for v in both), *[""] * (2 - len(both))]
+    """Kernels, torch loop and Xsuite of `gpu.py`."""
+    yield ["H100, times in ms", "kernels", "torch loop (ratio)", "Xsuite (ratio)"]
+    for words, ours, *others in GPU:
+        beside = [f"{stored[o]:.0f} ({stored[o] / stored[ours]:.0f})" if o else "" for o in others]
+        yield [words, f"{stored[ours]:.3g}", *beside]
 
 
 def of_corrections(machines):

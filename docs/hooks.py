@@ -1,8 +1,9 @@
 """What the pages take from the package when they are built: the catalogue, what may be assumed of
 data, the schemas, example files, the packages and their imports.
 
-A page has `<!-- effects -->`, `<!-- assumptions -->`, `<!-- schema measurement -->`,
-`<!-- example trajectory -->` or `<!-- packages -->` where one is to be shown.
+A page has `<!-- effects -->`, `<!-- assumptions -->`, `<!-- statements -->`,
+`<!-- schema measurement -->`, `<!-- example trajectory -->` or `<!-- packages -->` where one is to
+be shown.
 """
 
 import ast
@@ -15,14 +16,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 MARK = re.compile(
-    r"^<!-- (effects|assumptions|schema|example|packages) ?([\w-]*) -->$", re.MULTILINE
+    r"^<!-- (effects|assumptions|statements|schema|example|packages) ?([\w-]*) -->$", re.MULTILINE
 )
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace the marks of a page."""
     made = {"effects": lambda _: effects(), "assumptions": lambda _: assumptions(),
-            "schema": schema, "example": example, "packages": lambda _: packages()}  # fmt: skip
+            "statements": lambda _: statements(), "schema": schema, "example": example,
+            "packages": lambda _: packages()}  # fmt: skip
     return MARK.sub(lambda mark: made[mark[1]](mark[2]), markdown)
 
 
@@ -62,18 +64,25 @@ def effects() -> str:
 
 def assumptions() -> str:
     """What may be assumed of data, in its own order."""
-    from tmlattice.measurement.assume import ASSUMPTIONS
+    from tmlattice.measurement.assume import ASSUMPTIONS, WORDS
 
     rows = [
         [
             f"`{name}`",
             own.words,
-            "yes" if own.trajectory else "",
-            "yes" if own.response else "",
+            ", ".join(WORDS[kind].partition(" ")[2] for kind in own.kinds),
         ]
         for name, own in ASSUMPTIONS.items()
     ]
-    return table(["--assume", "what is written down wrongly", "first turns", "responses"], rows)
+    return table(["--assume", "what is written down wrongly", "of"], rows)
+
+
+def statements() -> str:
+    """The report's sentences, and what each requires."""
+    from tmlattice.diagnosis.assessment import STATEMENTS
+
+    rows = [[one.topic, f"`{one.name}`", one.requires] for one in STATEMENTS]
+    return table(["topic", "sentence", "requires"], rows)
 
 
 ROOT = Path(__file__).parent.parent

@@ -15,6 +15,12 @@ else:
     _kept = tempfile.TemporaryDirectory(prefix="tmlattice-tests-")
     os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
 
+
+def pytest_collection_modifyitems(items):
+    """The file that takes longest first: processes end at the same time."""
+    items.sort(key=lambda item: item.path.name != "test_scenarios.py")
+
+
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 
 

@@ -18,7 +18,7 @@ from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
-from tmlattice.lattice import write_ring
+from tmlattice.lattice import save_ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -79,7 +79,7 @@ def change(small_ring, before, after):
 
 def with_names_of_their_own(ring, folder, form="{}_a{}"):
     """QF_a0 for QF::0: what MAD-X and many a laboratory call magnets."""
-    write_ring(ring, folder / "ring.json")
+    save_ring(ring, folder / "ring.json")
     document = json.loads((folder / "ring.json").read_text())
     known = document["definitions"]
     count = Counter()

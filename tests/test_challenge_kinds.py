@@ -14,8 +14,8 @@ from tmlattice.challenge import kinds, make, read_case, read_truth, run, score
 from tmlattice.challenge.case import Truth
 from tmlattice.challenge.draw import Draw
 from tmlattice.challenge.figures import summary
-from tmlattice.challenge.ideal import refitted
 from tmlattice.challenge.kinds import Ruler, problem_of
+from tmlattice.challenge.oracle import refitted
 from tmlattice.challenge.record import Places
 from tmlattice.challenge.score import row_of
 from tmlattice.effects import Cause

@@ -117,11 +117,11 @@ def test_half_and_half_is_the_whole(ring):
 
 
 def test_every_format_that_is_written_keeps_kinds_and_maps(ring, tmp_path):
-    from tmlattice.lattice.write import write_ring
+    from tmlattice.lattice.write import save_ring
     from tmlattice.maps import ring_matrix
 
     for name in ("ring.json", "ring.at.json", "ring.py"):
-        write_ring(ring, tmp_path / name)
+        save_ring(ring, tmp_path / name)
         again = load_ring(tmp_path / name)
         assert again.counts() == ring.counts(), name
         np.testing.assert_allclose(ring_matrix(again), ring_matrix(ring), rtol=0, atol=1e-12)

@@ -6,22 +6,31 @@ import re
 from dataclasses import replace
 
 import at
+import jsonschema
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from test_cli import schema
 
 from tmlattice import correct, diagnose, simulate, write_measurement
 from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
-from tmlattice.correction.applied import applied, read_settings
+from tmlattice.correction.applied import applied, read_settings, sentence
 from tmlattice.correction.estimate import estimate_with, read_estimate
 from tmlattice.correction.knobs import write_knobs
+from tmlattice.correction.result import read_correction
 from tmlattice.diagnosis.twin import known_document
 from tmlattice.effects import Cause, apply, find
-from tmlattice.errors import ChoiceError, MeasurementError, TmlatticeError, UnknownNameError
+from tmlattice.errors import (
+    ChoiceError,
+    MeasurementError,
+    TmlatticeError,
+    UnknownNameError,
+    UnstableRingError,
+)
 from tmlattice.files import write_json
 from tmlattice.inference.distributed import DistributedErrors
-from tmlattice.lattice import save_ring, write_ring
+from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import quiet_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
@@ -198,12 +207,25 @@ def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupol
     )  # fmt: skip
     assert found.settings == ()
     assert "No setting is changed" in found.refused
-    assert found.table().splitlines() == ["device,present,new,change,unit,low,high,gain"]
+    (head,) = found.table().splitlines()
+    assert head.startswith("device,present,new,change,unit,low,high,gain")
     assert found.before == found.after
     rng = np.random.default_rng(3)
     small = posterior(quadrupoles, 5e-3, 1e-4 * rng.standard_normal(len(quadrupoles)))
     hardly = correct(estimate_with(small_ring, small_ring, small), targets=["beta_beating"])
-    assert not hardly.settings or hardly.gain > hardly.gain_error
+    assert not hardly.settings or hardly.gain > 2 * hardly.gain_error
+
+
+def test_a_mean_that_stores_no_beam_is_shortened(small_ring, quadrupoles):
+    """The linear estimate of a ring that stores a beam goes too far."""
+    signs = [0.6 if name.startswith("QF") else -0.6 for name in quadrupoles]
+    with pytest.raises(UnstableRingError):
+        correct(apply(small_ring, [Cause("quadrupole_gradient", name, amount)
+                                   for name, amount in zip(quadrupoles, signs, strict=True)]),
+                goal=small_ring)  # fmt: skip
+    known = posterior(quadrupoles, 1e-3, np.array(signs))
+    found = correct(estimate_with(small_ring, small_ring, known), targets=["tunes"])
+    assert found.settings
 
 
 def test_a_dispersion_that_the_errors_make_is_counted_once(small_ring):
@@ -254,12 +276,12 @@ def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
     yaml = tmp_path / "knobs.yaml"
     yaml.write_text(
         "- {knob: QF, unit: A, present: 50, low: 45, high: 55, curve: '0:0 100:1.8'}\n"
-        "- {knob: pair, kind: quadrupole, members: [QF::1, QF::3]}\n"
+        "- {knob: pair, kind: quadrupole, members: [QD::1, QD::3]}\n"
     )
     first, second = read_knobs(yaml, small_ring)
     assert (first.low, first.high, first.unit) == (45.0, 55.0, "A")
     assert len(first.members) == 16
-    assert second.members == ("QF::1", "QF::3")
+    assert second.members == ("QD::1", "QD::3")
     assert first.bounds == pytest.approx((-0.1, 0.1))
 
 
@@ -272,6 +294,8 @@ def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
     ("- {knob: QF, step: much}", "not a number"),
     ("- {knob: QF, colour: red}", "unknown column"),
     ("- {knob: QF}\n- {knob: QF}", "occurs twice"),
+    ("- {knob: QF}\n- {knob: trim, members: QF::3}", "'QF::3' is a member of 'QF' and 'trim'"),
+    ("- {knob: trim, members: QF::3 QF::3}", "'QF::3' is a member of 'trim' and 'trim'"),
     ("- {knob: q, members: QF::1, kind: pump}", "no kind 'pump'"),
     ("knob: QF", "no list of knobs"),
 ])  # fmt: skip
@@ -293,6 +317,8 @@ def test_names_that_do_not_exist(small_ring, tmp_path):
         default_knobs(small_ring, ["pumps"])
     with pytest.raises(TmlatticeError, match="has no goal"):
         correct(small_ring)
+    with pytest.raises(MeasurementError, match="'QF::0' is a member of 'QF' and 'QF::0'"):
+        correct(small_ring, goal=small_ring, knobs=["supplies", "quadrupoles"])
 
 
 def test_statements_set_the_strengths(small_ring, wrong, tmp_path):
@@ -304,7 +330,7 @@ def test_statements_set_the_strengths(small_ring, wrong, tmp_path):
     found = correct(machine, goal=small_ring, knobs=every[:1] + every[2:], targets=NO_ORBIT)
     alone = replace(found, settings=tuple(s for s in found.settings if s.knob.name != "QF"))
     family = replace(found, settings=tuple(s for s in found.settings if s.knob.name == "QF"))
-    write_ring(small_ring, tmp_path / "design.at.json")
+    save_ring(small_ring, tmp_path / "design.at.json")
     for own in (alone, family):
         with quiet_at():
             ring = at.load_lattice(tmp_path / "design.at.json")
@@ -415,6 +441,10 @@ def test_diagnose_states_the_correction(small_ring, tmp_path):
     rows = {r["device"]: r for r in csv.DictReader((tmp_path / "out" / "settings.csv").open())}
     k1 = small_ring["QD::0"].k1
     assert float(rows["QD"]["new"]) == pytest.approx(k1 / 1.01, rel=1e-3)
+    redrawn = CliRunner().invoke(tmlattice, ["report", str(tmp_path / "out"), "--out",
+                                             str(tmp_path / "redrawn")])  # fmt: skip
+    assert redrawn.exit_code == 0, redrawn.output
+    assert '<h2 id="correction">' in (tmp_path / "redrawn" / "report.html").read_text()
     again = CliRunner().invoke(tmlattice, [
         "correct", str(tmp_path / "out"), "--design", str(tmp_path / "design.json"), "--json",
         str(tmp_path / "again.json"),
@@ -447,15 +477,76 @@ def test_applied_settings_have_a_calibration(small_ring, tmp_path):
                               engine="ocelot", progress=False, noise=1e-7).measured
             for amount in (0.0, 0.008)]  # fmt: skip
     found = diagnose(small_ring, made[1], reference=made[0])
-    (own,) = applied(found, read_settings(path))
+    (own,) = applied(found, read_settings(path, small_ring))
     assert own.asked == pytest.approx(0.01)
     assert own.ratio == pytest.approx(0.8, abs=max(0.01, 3 * own.ratio_error))
     assert own.ratio_error < 0.05
     with pytest.raises(MeasurementError, match="--reference"):
-        applied(diagnose(small_ring, made[1], effects=["quadrupole_gradient"]), {"QF": (1.0, 2.0)})
-    path.write_text("device,new\nQF,1\n")
-    with pytest.raises(MeasurementError, match="no device, present or new"):
-        read_settings(path)
+        applied(diagnose(small_ring, made[1], effects=["quadrupole_gradient"]), [])
+    kick = default_knobs(small_ring, ["correctors"])[0]
+    (other,) = applied(found, [(kick, 1e-5)])
+    assert other.error == np.inf
+    assert "does not determine it" in sentence(other)
+
+
+@pytest.mark.parametrize(("rows", "said"), [
+    ("device,new\nQF,1\n", "no device, present or new"),
+    ("device,present,new\n", "contains no setting"),
+    ("device,present,new\nQF,0.9,nan\n", "no device, present or new"),
+    ("device,present,new\nQF,0.9,0.91\nQX,0.9,0.91\n", "'QX'.*none of this name"),
+    ("device,present,new\nQF,0.9,0.91\nQF,0.9,0.91\n", "occurs twice"),
+])  # fmt: skip
+def test_settings_that_cannot_be_compared(small_ring, tmp_path, rows, said):
+    path = tmp_path / "settings.csv"
+    path.write_text(rows)
+    with pytest.raises(MeasurementError, match=said):
+        read_settings(path, small_ring)
+
+
+def test_settings_of_devices_of_a_table_come_back(small_ring, wrong, tmp_path):
+    """The written table states members and excitation curve: the lattice need not know the name."""
+    name = wrong[0].element
+    k1 = small_ring[name].k1
+    curve = ((0.0, 0.0), (100.0, k1), (200.0, 1.5 * k1))
+    knob = Knob("PS-7", "quadrupole", (name,), "A", 100.0, 90.0, 120.0, 0.25, curve, 0.01)
+    found = correct(apply(small_ring, wrong), goal=small_ring, knobs=[knob], targets=NO_ORBIT)
+    found.save(tmp_path)
+    ((own, new),) = read_settings(tmp_path / "settings.csv", small_ring)
+    assert replace(own, curve=()) == replace(knob, curve=())
+    np.testing.assert_allclose(own.curve, curve, rtol=1e-8)
+    assert own.amount(new) == pytest.approx(found.settings[0].amount, rel=1e-6)
+
+
+def test_a_reused_folder_holds_no_older_correction(small_ring, wrong, tmp_path):
+    data = simulate(small_ring, [wrong[0]], shots=3, seed=1, engine="ocelot").measurement()
+    found = diagnose(small_ring, data, effects=["quadrupole_gradient"])
+    correct(apply(small_ring, wrong), goal=small_ring).save(tmp_path / "out")
+    (tmp_path / "out" / "notes.txt").write_text("of another program")
+    found.save(tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert not [name for name in names if name.startswith(("settings.", "correction."))]
+    assert names >= {"notes.txt", "diagnosis.json", "report.html"}
+
+
+def test_a_report_of_a_correction_is_rendered_again(small_ring, wrong, tmp_path):
+    out = tmp_path / "out"
+    found = correct(apply(small_ring, wrong), goal=small_ring, knobs=["quadrupoles"])
+    found.save(out)
+    document = json.loads((out / "correction.json").read_text())
+    jsonschema.validate(document, schema("correction"))
+    page = (out / "report.html").read_text()
+    for name in ("report.html", "correction.png"):
+        (out / name).unlink()
+    done = CliRunner().invoke(tmlattice, ["report", str(out)])
+    assert done.exit_code == 0, done.output
+    assert (out / "report.html").read_text() == page
+    again = read_correction(out / "correction.json", small_ring)
+    assert again.report() == found.report()
+    assert again.snippet("madx") == found.snippet("madx")
+    document["settings"][0]["new"] = "much"
+    (out / "correction.json").write_text(json.dumps(document))
+    with pytest.raises(MeasurementError, match="much"):
+        read_correction(out / "correction.json", small_ring)
 
 
 def test_a_table_is_not_written_over(small_ring, tmp_path):

@@ -14,6 +14,7 @@ from test_walls import FILES, ORDER, PACKAGE, imported
 
 import tmlattice
 from tmlattice.cli.command import tmlattice as command
+from tmlattice.diagnosis.assessment import STATEMENTS
 from tmlattice.effects import CATALOGUE
 
 ROOT = Path(__file__).parent.parent
@@ -61,6 +62,11 @@ def test_every_effect_is_in_the_table(site):
     page = text(site, "effects")
     assert [name for name in CATALOGUE if f"<code>{name}</code>" not in page] == []
     assert page.count("<tr>") == len(CATALOGUE) + 1
+
+
+def test_every_sentence_of_a_report_is_in_the_table(site):
+    page = text(site, "diagnose")
+    assert [one.name for one in STATEMENTS if f"<code>{one.name}</code>" not in page] == []
 
 
 def test_every_command_and_option_is_on_the_page(site):

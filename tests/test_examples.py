@@ -13,7 +13,7 @@ from command import tmlattice
 from test_import import simulated  # noqa: F401  (a fixture)
 
 import tmlattice as package
-from tmlattice.lattice import save_ring, write_ring
+from tmlattice.lattice import save_ring
 
 DOCS = Path(__file__).parent.parent / "docs"
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
@@ -55,7 +55,7 @@ def place(small_ring, simulated, tmp_path_factory):  # noqa: F811
     """A folder with the files that the pages call the reader's own."""
     place = tmp_path_factory.mktemp("examples")
     save_ring(small_ring, place / "ring.json")
-    write_ring(small_ring, place / "small.at.json")
+    save_ring(small_ring, place / "small.at.json")
     lattice = at.load_json(str(place / "small.at.json"))
     for name in ("ring.mat", "my_ring.mat"):
         at.save_mat(lattice, str(place / name))

@@ -7,18 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from tmlattice import Measurement, TaylorNetwork, fine_tune, one_turn_optics
-from tmlattice.beam.strengths import ring_strengths
+from tmlattice import Cause, Measurement, TaylorNetwork, fine_tune, one_turn_optics
+from tmlattice.effects import apply
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.fitting.experiment import perturbed_ring
-from tmlattice.fitting.map_fit import TurnReadings
 from tmlattice.fitting.study import run_case
 from tmlattice.maps import ring_matrix
-from tmlattice.network import SymplecticNetwork
-from tmlattice.network.spaces import Generators, Strengths, tune_slopes
-from tmlattice.observe.data import first_turn
 from tmlattice.optics import matrix_tunes
 
 LAUNCH = np.array([[1e-4, 0, 1e-4, 0], [-1e-4, 1e-5, 5e-5, 0]])
@@ -188,82 +183,38 @@ def test_told_states_the_cramer_rao_bound(small_ring, small_network):
 # --- map ---
 
 
-SPACES = {
-    "generators": lambda ring, network: Generators(network),
-    "strengths": lambda ring, network: Strengths(network, ring, KINDS),
-}
+def test_map_is_ridge_regression_where_all_is_linear(small_ring, small_network):
+    """Against slopes by differences of whole rings, and normal equations."""
+    _, measurement = measured(small_ring, ["QD::5"], -0.002)
+    names = [e.name for e in small_ring.magnets if e.kind == "quadrupole" and e.k1]
+    slopes = [
+        np.ravel([perturbed(small_ring, name, side)(LAUNCH).detach().numpy() for side in (1, -1)])
+        for name in names
+    ]
+    J = np.array([row[: len(row) // 2] - row[len(row) // 2 :] for row in slopes]).T / 2e-3 / 1e-6
+    left = (measurement.readings[:, 0] - small_network(LAUNCH).detach().numpy()).ravel() / 1e-6
+    options = {"method": "map", "prior": "strengths", "scale": 0.1, "kinds": ("quadrupole",)}
+    fit = fine_tune(small_network, measurement, **options)
+    inverse = np.linalg.inv(J.T @ J + np.eye(len(names)) / 1e-3**2)
+    found = np.array([fit.changes[name] for name in names])
+    np.testing.assert_allclose(found[:, 0], inverse @ J.T @ left, atol=1e-6)
+    np.testing.assert_allclose(found[:, 1], np.sqrt(np.diag(inverse)), rtol=5e-3)
 
 
-@pytest.mark.parametrize("kind", SPACES)
-def test_products_of_the_dual_system_match_differences(small_ring, small_network, kind, rng):
-    """J, J P J^T and their products about amounts that are not zero, against moved networks."""
-    space = SPACES[kind](small_ring, small_network)
-    _, measurement = measured(small_ring, ["QD::5"], -0.02)
-    data = first_turn(small_network.monitors, measurement, None, [1e-6, 1e-7, 1e-6, 1e-7])
-    problem = TurnReadings(space, data, LAUNCH)
-    number = len(space.layer)
-    about = 0.3 * rng.standard_normal(number)
-    products = problem.slopes(about)
-    J = products.matrix
-    for j in rng.choice(number, 6, replace=False):
-        one = np.eye(1, number, j)[0]
-        # third order: 1e-4 of 1 %
-        slope = (problem.residual(about - one) - problem.residual(about + one)) / 2
-        np.testing.assert_allclose(J[:, j], slope, atol=1e-5 * np.abs(J).max())
-    variance = rng.uniform(0.1, 2.0, number)
-    full = (J * variance) @ J.T
-    np.testing.assert_allclose(products.kernel(variance), full, atol=1e-12 * full.max())
-    amounts = rng.standard_normal(number)
-    scale = np.abs(J @ amounts).max()
-    np.testing.assert_allclose(products.times(amounts), J @ amounts, atol=1e-11 * scale)
-    weights = rng.standard_normal(len(J))
-    back = J.T @ weights
-    np.testing.assert_allclose(products.transposed(weights), back, atol=1e-11 * np.abs(back).max())
+def perturbed(ring, name, side):
+    return TaylorNetwork.from_ring(perturbed_ring(ring, name, 1e-3 * side))
 
 
-def test_layers_between_the_nodes_match_ocelots_changed_magnets(petra3, rng):
-    """Chebyshev's polynomials against OCELOT itself, a quadrupole that changes its sign included;
-    rounding of OCELOT's own is 1e-14."""
-    known = ring_strengths(petra3, KINDS)
-    changes = rng.uniform(-1.5, 1.5, len(known.strengths))
-    weights, slopes = known.weights(changes), known.slopes(changes)
-    up, down = known.weights(changes + 1e-4), known.weights(changes - 1e-4)
-    for i in range(3):
-        np.testing.assert_allclose(slopes[i], (up[i] - down[i]) / 2e-4, atol=1e-9)
-    for j in range(0, len(changes), 17):
-        exact = known.strengths[j].weights(changes[j])
-        for mine, theirs in zip(weights, exact, strict=True):
-            np.testing.assert_allclose(mine[j], theirs, atol=5e-14)
-
-
-@pytest.mark.parametrize("kind", SPACES)
-def test_tune_slopes_match_differences(small_ring, small_network, kind):
-    space = SPACES[kind](small_ring, small_network)
-    about = np.zeros(len(space.layer))
-    slopes = tune_slopes(space, about)
-    strong = np.argsort(-np.abs(slopes).max(axis=0))[:40:13]
-    for j in strong:
-        tunes = []
-        for sign in (1, -1):
-            one = about.copy()
-            one[j] = sign * 0.1
-            space.put(one)
-            tunes.append(one_turn_optics(space.network).tunes)
-        np.testing.assert_allclose(slopes[:, j], (tunes[0] - tunes[1]) / 0.2, rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.parametrize("prior", ["faults", "strengths", "generators"])
+@pytest.mark.parametrize("prior", ["faults", "strengths"])
 def test_map_fits_and_stays_symplectic(small_ring, small_network, prior):
     machine, measurement = measured(small_ring, ["QD::5"], -0.02, noise=1e-7)
     fit = fine_tune(small_network, measurement, method="map", prior=prior)
-    assert isinstance(fit.network, SymplecticNetwork) == (prior == "generators")
     left = fit.network(LAUNCH).detach().numpy() - measurement.readings[:, 0]
     before = small_network(LAUNCH).detach().numpy() - measurement.readings[:, 0]
     assert np.sqrt(np.mean(left**2)) < 1.5e-7 < 0.2 * np.sqrt(np.mean(before**2))
     assert one_turn_optics(fit.network).growth == pytest.approx(1.0, abs=1e-9)
     away = fit.tunes - matrix_tunes(ring_matrix(machine))
-    if prior != "generators":  # one fault among all coefficients is no draw from that prior
-        assert (np.abs(away) < 4 * fit.tune_sigma).all()
+    assert (np.abs(away) < 4 * fit.tune_sigma).all()
 
 
 def test_map_with_tails_gives_one_magnet_the_fault(small_ring, small_network):
@@ -291,15 +242,11 @@ def test_map_without_noise_comes_through_the_nonlinear_model(petra3):
 def test_map_states_its_error_where_its_prior_is_true(small_ring, small_network):
     """Faults drawn from the prior itself: the pulls have the width 1."""
     rng = np.random.default_rng(3)
-    known = ring_strengths(small_ring, ("quadrupole",))
+    names = [e.name for e in small_ring.magnets if e.kind == "quadrupole" and e.k1]
     pulls = []
     for _ in range(25):
-        network = small_network.copy()
-        with torch.no_grad():
-            for strength in known.strengths:
-                W = strength.weights(2e-3 * rng.standard_normal())
-                for parameter, weight in zip(network.parameters(), W, strict=True):
-                    parameter[strength.layer] = torch.from_numpy(weight)
+        drawn = [Cause("quadrupole_gradient", n, 2e-3 * rng.standard_normal()) for n in names]
+        network = TaylorNetwork.from_ring(apply(small_ring, drawn))
         readings = network(LAUNCH).detach().numpy()
         readings = readings + 1e-6 * rng.standard_normal(readings.shape)
         exact = np.zeros_like(LAUNCH)

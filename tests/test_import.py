@@ -220,13 +220,13 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
         (lambda d: {"LocoMeasData_DeltaRF": -d["DeltaRF"]}, "--assume rf-reversed"),
         (lambda d: {"LocoMeasData_M": d["M"] * 1e-3}, "--assume kicks-in-mrad"),
         (lambda d: {"LocoMeasData_M": d["M"] * 1e3 / 2e2, "LocoMeasData_Eta": d["Eta"]},
-         "the response is not that of"),
+         "the data are not those of"),
         (lambda d: {"LocoMeasData_M": d["M"] / 2}, "--assume kicks-halved"),
         (lambda d: {"LocoMeasData_Eta": -d["Eta"], "LocoMeasData_M": np.concatenate(
             [-d["M"][:16], d["M"][16:]])}, "--assume x-reversed"),
         (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-exchanged"),
         (lambda d: {"LocoMeasData_M": d["M"][np.random.default_rng(1).permutation(len(d["M"]))]},
-         "the response is not that of"),
+         "the data are not those of"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 3, -1, 1)[:, None]},
          "single monitors of x have the sign against the others: 'bpm::3'"),
         (lambda d: {"LocoMeasData_M": d["M"][[*range(2), 5, 3, 4, 2, *range(6, 32)]]},
@@ -286,7 +286,7 @@ def test_lattice_before_the_fit(simulated, brought, tmp_path):
     variables["FitParameters"] = np.array(steps, dtype=object)
     found = brought(variables)
     assert (found.ring["qf::0"].k1, found.ring.model) == (pytest.approx(1.0), "lattice of the file")
-    assert any("not those of the fit's last iteration" in s for s in found.assumed)
+    assert any("those of no iteration of the fit" in s for s in found.assumed)
 
 
 def test_noise_that_no_file_gives_can_be_told(simulated, brought):

@@ -11,7 +11,7 @@ from tmlattice import Cause, diagnose, simulate, write_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import stages
-from tmlattice.diagnosis.kinds import How, part_of, stacked
+from tmlattice.diagnosis.kinds import PartOptions, part_of, stacked
 from tmlattice.diagnosis.twin import known_of
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import EffectError, MeasurementError
@@ -162,15 +162,6 @@ def _small_errors(ring, seed):
     ]
 
 
-def test_a_fault_among_small_errors_by_turns_and_dispersion(small_ring):
-    truth = [*_small_errors(small_ring, 7), Cause("quadrupole_gradient", "QD::3", -0.03)]
-    both = {"turns": _turns(small_ring, truth), "dispersion": _dispersion(small_ring, truth)}
-    diagnosis = diagnose(small_ring, both)
-    assert ("quadrupole_gradient", "QD::3") in _found(diagnosis)
-    assert len(diagnosis.findings) == 1
-    assert 0.3 < diagnosis.priors["quadrupole_gradient"] / 1e-3 < 3
-
-
 def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring):
     """Four are set: the one that kicks three times too much made their family as large as itself;
     and once it was found the next look beside it lost it again."""
@@ -192,17 +183,6 @@ def test_what_is_sought_beside_a_doubt_makes_the_readings_likelier(small_ring):
         machine_seed=758855873,
     ).measured  # fmt: skip
     assert not diagnose(small_ring, orbit).findings
-
-
-def test_a_reference_cancels_what_was_there(small_ring):
-    small = _small_errors(small_ring, 11)
-    strong = Cause("corrector_kick_x", "v6", 1e-4)
-    before = {"orbit": _orbit(small_ring, small, 5)}
-    after = {"orbit": _orbit(small_ring, [*small, strong], 6)}
-    diagnosis = diagnose(small_ring, after, reference=before)
-    assert _found(diagnosis) == {("corrector_kick_x", "v6")}
-    same = diagnose(small_ring, after, reference=after)
-    assert not same.findings
 
 
 @pytest.mark.parametrize("make", [_orbit, _dispersion, _tunes, _turns])
@@ -274,7 +254,7 @@ def test_readings_that_are_given_twice_are_refused(small_ring):
 def test_small_errors_that_leave_no_stored_beam_are_told(small_ring):
     """Half of them stood in the model that is shown, and nobody said so."""
     places = {"quadrupole_gradient": 1.0}
-    how = How(small_ring, places, DEFAULT)
+    how = PartOptions(small_ring, places, DEFAULT)
     problem = stacked([part_of("orbit", _orbit(small_ring, []), how)], [], how)
     far = tuple(Cause("quadrupole_gradient", f"QF::{i}", 0.9) for i in range(16))
     about = {(cause.effect, cause.element): 0.0 for cause in far}

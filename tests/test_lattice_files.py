@@ -128,6 +128,21 @@ ELEMENTS = {
     "shifted sextupole": at.Sextupole("s", 0.3, 25.0, NumIntSteps=400),
     "turned quadrupole": at.Quadrupole("q", 0.5, 0.8, NumIntSteps=400),
     "sheared sextupole": at.Sextupole("s", 0.3, 25.0, NumIntSteps=400),
+    "bend without its fringe field": at.Dipole(
+        "b", 1.2, 0.2, EntranceAngle=0.1, ExitAngle=0.07, FullGap=0.05, FringeInt1=0.5,
+        FringeInt2=0.5, FringeBendEntrance=0, FringeBendExit=0, NumIntSteps=400,
+    ),
+    "quadrupole with linear fringes": at.Quadrupole(
+        "q", 0.5, 0.8, FringeQuadEntrance=2, FringeQuadExit=2, NumIntSteps=400,
+        fringeIntM0=np.array([0.0, 3e-3, 1e-4, 0, 0]),
+        fringeIntP0=np.array([0.0, 3e-3, 1e-4, 0, 0]),
+    ),
+    "rolled quadrupole with one linear fringe": at.Quadrupole(
+        "q", 0.5, 0.8, FringeQuadExit=2, NumIntSteps=400,
+        fringeIntM0=np.array([0.0, 3e-3, 1e-4, 0, 0]),
+        fringeIntP0=np.array([0.0, 2e-3, 2e-4, 0, 0]),
+    ),
+    "rolled corrector": at.Corrector("h", 0.0, [2e-4, 0.0]),
 }  # fmt: skip
 offset = np.array([2e-4, 0, -3e-4, 0, 0, 0])
 for shifted in ("shifted quadrupole", "shifted sextupole"):
@@ -135,7 +150,7 @@ for shifted in ("shifted quadrupole", "shifted sextupole"):
 psi = 0.3
 turn = np.eye(6)
 turn[:4, :4] = np.kron([[np.cos(psi), np.sin(psi)], [-np.sin(psi), np.cos(psi)]], np.eye(2))
-for rolled in ("rolled quadrupole", "rolled sextupole with coils"):
+for rolled in (what for what in ELEMENTS if what.startswith("rolled")):
     ELEMENTS[rolled].R1, ELEMENTS[rolled].R2 = turn, turn.T
 ELEMENTS["turned quadrupole"].T1 = np.array([1e-4, -4e-4, -2e-4, 8e-4, 0, 0])  # yaw and pitch
 ELEMENTS["turned quadrupole"].T2 = np.array([1e-4, 4e-4, -2e-4, -8e-4, 0, 0])

@@ -154,6 +154,26 @@ def test_a_magnet_that_at_passes_as_a_drift_is_one(fields):
     assert_allclose(np.array(ring_tunes(ring)) % 1, at.get_tune(there), atol=1e-3)
 
 
+def test_a_linear_wiggler_focuses(bring):
+    """AT's class of it goes by its length: a drift."""
+
+    def change(v):
+        first = next(e for e in lattice(v) if e["FamName"] == "DR")
+        first.update(FamName="ID", PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)
+
+    plain, found = bring(lambda v: None).ring, bring(change)
+    own = next(e for e in found.ring.elements if e.family == "id")
+    assert own.kind == "wiggler"
+    made = elements()
+    first = next(e for e in made if e["FamName"] == "DR")
+    first.update(FamName="ID", PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)
+    there = at.Lattice([element_from_dict(dict(e), quiet=True) for e in made],
+                       energy=ENERGY * 1e9, periodicity=1)  # fmt: skip
+    tunes = at.get_tune(there.disable_6d(copy=True))
+    assert_allclose(np.array(ring_tunes(found.ring)) % 1, tunes, atol=1e-4)
+    assert abs(ring_tunes(found.ring)[1] - ring_tunes(plain)[1]) > 1e-3
+
+
 def test_tunes_that_are_not_ats_are_a_doubt(bring, monkeypatch):
     """Whatever is lost of a lattice moves the tunes."""
     assert not bring(lambda v: None).doubts

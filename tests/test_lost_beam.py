@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
+from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in
+from tmlattice.measurement import TurnByTurn
+from tmlattice.measurement.lost_beam import beam_lost
 
 FAULT = Cause("quadrupole_gradient", "QD::5", -0.2)
 LOST = 20
@@ -186,3 +189,24 @@ def test_a_sum_without_numbers_is_passed_over(small_ring, data, tmp_path):
     path = long_table(tmp_path / "r.csv", data, data.readings[:, 0], [["ok"] * 35] * 6, "sum")
     brought = bring_in([path], Options(ring=small_ring)).measurement
     np.testing.assert_allclose(brought.readings, data.readings, rtol=1e-9)
+
+
+def test_turns_of_a_stored_beam_that_was_lost(small_ring):
+    """Zeros behind a loss, and in a gap of whole turns, are no readings; a BPM that repeats its
+    reading is frozen."""
+    names = [monitor.name for monitor in small_ring.monitors]
+    read = 1e-3 * np.random.default_rng(1).standard_normal((2, 64, len(names), 2))
+    read[1, 40, 11:], read[1, 41:] = 0.0, 0.0
+    read[0, 20:23] = 0.0
+    turns = TurnByTurn(read, names, noise=2e-5)
+    lost = beam_lost(turns)
+    assert lost.shots.tolist() == [1]
+    assert divmod(int(lost.first[1]), len(names)) == (40, 11)
+    gone = np.isnan(lost.without.readings)
+    assert gone[0, 20:23].all()
+    assert gone.sum() == 2 * (3 * len(names) + 24 * len(names) - 11)
+    frozen = 1e-3 * np.random.default_rng(2).standard_normal((1, 64, len(names), 2))
+    frozen[0, 20:, 5] = 0.0
+    found = {c.name: c for c in signals.monitors(small_ring, names, frozen[0])}
+    assert found["frozen monitors"].status == "note"
+    assert names[5] in found["frozen monitors"].sentence

@@ -93,6 +93,9 @@ REFUSED = {
     "rotation": (
         with_element("y: yrotation, angle=1e-3, at=4.95;"), "YROTATION 'y' .* by its ANGLE"
     ),
+    "energy": (
+        with_element("w: matrix, kick6=1e-4, at=4.95;"), "matrix 'w' changes the energy in every"
+    ),
     "class": (with_element("w: wigglerx, at=4.95;"), "no element or command 'wigglerx' is known"),
     "attribute": (PLAIN + "qf, k1x=1;", "attribute K1X of QUADRUPOLE 'qf'"),
     "tapered magnet": (PLAIN + "qf, ktap=0.01;", "attribute KTAP of QUADRUPOLE 'qf'"),
@@ -102,7 +105,7 @@ REFUSED = {
         "'q' begins at 2.700000 m, before the end of 'qd' at 3.100000 m",
     ),
     "beyond": (
-        with_element("q: quadrupole, l=0.4, at=5.1;"), "L ends at 41.600000 m, before"
+        with_element("q: quadrupole, l=0.4, at=5.1;"), "its length ends at 41.600000 m, before"
     ),
     "particle": (
         PLAIN.replace("particle=electron", "particle=pb54"), "particle 'pb54' without a MASS"

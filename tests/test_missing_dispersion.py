@@ -31,8 +31,6 @@ from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response
-from tmlattice.maps import LayerMaps
-from tmlattice.maps.quadratic import Quadratic
 from tmlattice.observe.calibration import (
     calibrated_response,
     read_calibration,
@@ -296,54 +294,6 @@ def test_without_the_rf_nothing_is_said_of_it(small_ring):
     measured = simulated(small_ring, [], kick=1e-5, noise=2e-8, engine="ocelot")
     state = state_of(small_ring, replace(measured, rf=None), False)
     assert HYPOTHESES["dispersion"](state) is None
-
-
-@pytest.mark.parametrize("plane", [0, 1])
-def test_a_kick_that_a_particle_of_another_energy_misses(ring_kicking_x, monkeypatch, plane):
-    """Against a ring in whose maps it stands: a matrix that gives a kick of energy, and, for it is
-    symplectic, a way that is longer by the place: the RF's orbit, the dispersion at correctors, and
-    their orbits at a fixed frequency. To first order, without sextupoles."""
-    kick, linear = 1e-6, LayerMaps.map
-    missing = np.eye(6)
-    missing[2 * plane + 1, 5] = missing[4, 2 * plane] = -kick
-
-    def with_it(self, element):
-        known = linear(self, element)
-        if not element.name.startswith("wig"):
-            return known
-        return Quadratic(missing @ known.B, missing @ known.R, known.T)
-
-    models = []
-    for _ in range(2):
-        ring = ring_kicking_x("i % 2")
-        plain = ring.with_elements({
-            i: e.changed(k2=0.0) for i, e in enumerate(ring.elements) if e.kind == "sextupole"
-        })  # fmt: skip
-        models.append(ResponseModel(plain))
-        monkeypatch.setattr(LayerMaps, "map", with_it)
-    before, after = models
-    layer = next(i for i, e in enumerate(before.ring.magnets) if e.name.startswith("wig"))
-    monkeypatch.setattr("tmlattice.beam.kicks.kicking", lambda ring, plane: np.array([layer]))
-    columns = before.columns()
-    own = np.array(["xy".index(p) for p in columns.planes])
-
-    def close(found, actual):
-        assert np.std(actual) > 1e-10
-        assert found == pytest.approx(actual, abs=2e-3 * np.abs(actual).max())
-
-    rf = kick * dispersion_of_kicks(before, 1.0, plane)[:, 0]
-    close(rf, (after.rf_response() - before.rf_response())[:, plane])
-    there = [m.tangents[columns.layer + 1][:, 2 * plane] @ m.rf_start / m.rf_start[5]
-             for m in models]  # fmt: skip
-    at_correctors = kick * dispersion_behind(before, columns.layer, plane)[:, 0]
-    close(at_correctors, there[1] - there[0])
-    at_monitors = np.zeros((len(rf), 2))
-    at_monitors[:, plane] = rf / before.rf_start[5]
-    found = by_energy(before, columns.names, np.arange(len(rf)), at_monitors,
-                      np.where(own == plane, at_correctors, 0.0))  # fmt: skip
-    change = after.response() - before.response()
-    for kicked, read in ((0, 0),) if plane == 0 else ((0, 1), (1, 0)):
-        close(found[own == kicked][..., read], change[own == kicked][..., read])
 
 
 @pytest.mark.parametrize("plane", [0, 1])

@@ -13,7 +13,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice as command
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.data_checks import check_data
-from tmlattice.diagnosis.kinds import KINDS
+from tmlattice.diagnosis.kinds import KINDS, Kind
 from tmlattice.errors import MeasurementError
 from tmlattice.importers import write_imported
 from tmlattice.machine import simulate
@@ -54,7 +54,7 @@ def test_a_page_is_short_and_names_files_that_are_there(page):
 def scan(small_ring, monkeypatch):
     """Tunes at three RF frequencies by AT's tunes and chromaticities, of a weak quadrupole."""
     names = names_of("new_kind")
-    monkeypatch.setitem(KINDS, "tune_scan", (names["TuneScan"], names["tune_scan"]))
+    monkeypatch.setitem(KINDS, "tune_scan", Kind(names["TuneScan"], names["tune_scan"]))
     read = simulate_tunes(small_ring, [WEAK], noise=(0, 0)).measured
     frequency = np.array([-1e-5, 0, 1e-5])
     momentum = frequency * ResponseModel(small_ring).rf_start[5] / small_ring.beta

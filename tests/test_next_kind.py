@@ -10,8 +10,8 @@ import pytest
 from tmlattice import Cause, diagnose
 from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis import next_kind as module
-from tmlattice.diagnosis.kinds import How
-from tmlattice.diagnosis.next_kind import KINDS, minutes_of, next_kind
+from tmlattice.diagnosis.kinds import KINDS, PartOptions
+from tmlattice.diagnosis.next_kind import next_kind
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.report.action_texts import next_text
@@ -32,7 +32,7 @@ def tunes(small_ring):
 
 
 def how(**more):
-    return How(ring=None, places={}, judgement=DEFAULT, **more)
+    return PartOptions(ring=None, places={}, judgement=DEFAULT, **more)
 
 
 def test_what_is_proposed_parts_them(small_ring, tunes):
@@ -62,7 +62,7 @@ def test_it_is_told_in_text_and_json(tunes):
     jsonschema.validate(document, json.loads(schema.read_text()))
     told = document["next_measurement"]
     assert told["launch"] is None
-    assert told["minutes"] == minutes_of(diagnosis.ring, told["kind"])
+    assert told["minutes"] == KINDS[told["kind"]].minutes(diagnosis.ring)
 
 
 def test_the_dearer_of_two_that_part_alike_is_not_proposed(small_ring, tunes, monkeypatch):
@@ -70,8 +70,10 @@ def test_the_dearer_of_two_that_part_alike_is_not_proposed(small_ring, tunes, mo
     seen = {**how().__dict__, "ring": small_ring}
     ask = (small_ring, diagnosis.explanation)
     monkeypatch.setattr(module, "_separation", lambda problem, pair: 10.0)
-    assert next_kind(*ask, ["tunes"], How(**seen), ()).kind == "closed_orbit"
-    assert next_kind(*ask, ["tunes", "closed_orbit"], How(**seen), ()).kind == "turn_by_turn"
+    assert next_kind(*ask, ["tunes"], PartOptions(**seen), ()).kind == "closed_orbit"
+    assert (
+        next_kind(*ask, ["tunes", "closed_orbit"], PartOptions(**seen), ()).kind == "turn_by_turn"
+    )
 
 
 def test_nothing_is_proposed_that_gains_little(small_ring, tunes, monkeypatch):
@@ -100,7 +102,7 @@ def test_what_a_kind_cannot_see_it_does_not_part(small_ring, tunes):
                     (cause.effect, cause.element), replace(fit, point=point, covariance=known)
                 )
             )
-        separation = module._separation(KINDS[kind][0](small_ring, asked), tuple(pair))
+        separation = module._separation(KINDS[kind].proposal(small_ring, asked), tuple(pair))
         assert (separation > 10) is parts
         if parts:  # 200 um in one reading of 2 um
             assert separation == pytest.approx(100, rel=0.01)

@@ -20,7 +20,7 @@ import tmlattice
 from tmlattice import Cause, load_ring, twiss
 from tmlattice.effects import apply
 from tmlattice.errors import LatticeError, TmlatticeError, UnknownNameError
-from tmlattice.lattice import write_ring
+from tmlattice.lattice import save_ring
 from tmlattice.optics import matrix_tunes
 
 HERE = Path(__file__).parent / "lattices"
@@ -553,7 +553,7 @@ def test_xtrack_that_is_not_installed_is_one_sentence(small_ring, tmp_path, monk
     monkeypatch.setitem(sys.modules, "xtrack", None)
     with pytest.raises(TmlatticeError, match=r"xtrack.*not installed: `pip install xsuite`"):
         small_ring.to_xtrack()
-    assert write_ring(small_ring, tmp_path / "ring.xsuite.json") == ()
+    assert save_ring(small_ring, tmp_path / "ring.xsuite.json") == ()
     assert load_ring(tmp_path / "ring.xsuite.json").counts() == small_ring.counts()
 
 

@@ -19,7 +19,7 @@ from tmlattice.observe.calibration import (
     read_calibration,
     write_calibration,
 )
-from tmlattice.observe.response_errors import predict
+from tmlattice.observe.compared import OfResponse
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 CAUSES = [
@@ -44,7 +44,7 @@ def test_simulated_response_is_the_models(small_ring, engine):
     scale = np.abs(expected).max()
     close = {"ocelot": 1e-6, "at": 1e-3}[engine]  # the tunes differ by 1e-4: matrix wiggler, edges
     assert_allclose(measured.response / 1e-6, expected, atol=close * scale)
-    rf = predict(ResponseModel(small_ring), measured).rf.orbit
+    rf = OfResponse(small_ring, measured).pairs(measured)[1][-1]
     other = [i for i, m in enumerate(measured.monitors) if m not in ("last_a", "end_3")]
     assert_allclose(measured.rf.orbit[other], rf[other], atol=2e-3 * np.abs(rf).max())
 

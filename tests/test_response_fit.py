@@ -1,7 +1,5 @@
 """The block solver of the response's fit against dense normal equations, and known errors."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -12,11 +10,9 @@ from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response import rounds, stepwise
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.rounds import one_round
-from tmlattice.diagnosis.response.state import State, allow, begin
+from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
-from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.effects import Cause
-from tmlattice.errors import UnstableRingError
 from tmlattice.inference import normal as blocks
 from tmlattice.inference.normal import Normal, Slopes, normal_equations, solve
 from tmlattice.inference.priors import Group
@@ -135,21 +131,6 @@ def test_scale_of_the_prior_is_that_of_the_truth(rng, freedom):
     assert 0.8 < pull.std() < 1.2
 
 
-@pytest.mark.parametrize("astray", [False, True])
-def test_monitors_are_bad_against_the_others_and_not_all_at_once(rng, astray):
-    """Where most monitors answer nothing of the model it is the fit that is wrong: all had been set
-    aside, and none was left to judge (ALS 2008, a trial without its bends' gradients)."""
-    model, plane = rng.standard_normal((12, 9)), np.arange(12) % 2
-    orbits = model + 1e-3 * rng.standard_normal((12, 9))
-    orbits[:, 4] += rng.standard_normal(12)
-    if astray:
-        orbits = 0.05 * model
-    data = SimpleNamespace(pick=lambda array: array, orbits=orbits, plane=plane, shape=(12, 9))
-    state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
-    expected = np.full(9, True) if astray else np.arange(9) != 4
-    assert (good_monitors(state) == expected).all()
-
-
 def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
     """What the data leave to the priors (the scale of all correctors against that of all monitors)
     was said to be known, as soon as the one number that taught its size was small."""
@@ -173,16 +154,6 @@ def test_a_scale_that_fell_is_found_again(rng):
     ]
     assert_allclose(found, 0.01, rtol=0.4)
     assert_allclose(found, found[1], rtol=0.15)
-
-
-def test_what_is_not_read_in_one_plane_is_not_bad_in_the_other(rng):
-    """Siam: five monitors without y were left out altogether, with their good readings of x."""
-    model, plane = rng.standard_normal((12, 9)), np.arange(12) % 2
-    orbits = model + 1e-3 * rng.standard_normal((12, 9))
-    orbits[plane == 1, 4] = np.nan
-    data = SimpleNamespace(pick=lambda array: array, orbits=orbits, plane=plane, shape=(12, 9))
-    state = SimpleNamespace(data=data, at=SimpleNamespace(read=model), fitted=np.full(12, True))
-    assert good_monitors(state).all()
 
 
 @pytest.mark.parametrize("seed", [0, 3])
@@ -267,64 +238,6 @@ def test_a_device_focuses_and_a_change_of_one_may_do_less(small_ring):
         *_, (_, state) = one_by_one(begin(data, split), [STEPS[0], Trial((family,), 2, 0)])
         amounts.append(state.values["device"][family.places(data).index("d::95")])
     assert amounts == pytest.approx([0.0, -0.01, 0.01], rel=0.02, abs=0.0)
-
-
-def test_a_family_without_which_no_orbit_closes_is_needed(monkeypatch):
-    """It ended the diagnosis of a measured ring, whose dispersion ran away without gradients."""
-
-    def lost(state, trial):
-        raise UnstableRingError("no closed orbit")
-
-    monkeypatch.setattr(stepwise, "_quickly", lambda *_: ({"gradients": 1.0}, {"gradients": False}))
-    monkeypatch.setattr(stepwise, "_without", lost)
-    monkeypatch.setattr(stepwise, "evidence_of", lambda *_: None)
-    monkeypatch.setattr(stepwise, "_title", str)
-    data = SimpleNamespace(orbits=np.zeros((2, 2)))
-    state = SimpleNamespace(data=data, fitted=slice(None), good=None, independent=None)
-    assert stepwise._worth(state, ["gradients"], lambda stage: None) == ({"gradients": np.inf}, {})
-
-
-@pytest.mark.parametrize(
-    ("quickly", "settled", "judges", "worth"),
-    [
-        (50.0, -25.0, (0.14, 0.01), 50.0),  # the beam's energy at PETRA III
-        (5.0, 85.0, (0.14, 0.01), 85.0),
-        (50.0, -5000.0, (0.14, 0.01), -5000.0),
-        (50.0, -25.0, (0.005, 0.01), -25.0),
-        (50.0, 10.0, (-0.14, 0.01), -0.14),
-    ],
-)
-def test_judges_and_linear_evidence_outweigh_that_of_two_fits(
-    monkeypatch, quickly, settled, judges, worth
-):
-    """Fits that settle each by itself are twenty apart for nothing."""
-    logs = {"with": settled + stepwise.LEAST, "without": 0.0}
-    data, none = SimpleNamespace(orbits=np.zeros((100, 35))), np.zeros(100, dtype=bool)
-    split = SimpleNamespace(held=none, inner=none)
-    there, without = (State(data, split, None, name, np.ones(1, dtype=bool)) for name in logs)
-    monkeypatch.setattr(stepwise, "_quickly", lambda *_: ({"energy": quickly}, {"energy": False}))
-    monkeypatch.setattr(stepwise, "_without", lambda *_: without)
-    monkeypatch.setattr(
-        stepwise, "evidence_of", lambda own, *_: SimpleNamespace(log=logs[own.lacking])
-    )
-    monkeypatch.setattr(stepwise, "_of_rf", lambda *_: None)
-    monkeypatch.setattr(stepwise, "inner", lambda *_: None)
-    monkeypatch.setattr(stepwise, "lost", lambda *_: judges)
-    monkeypatch.setattr(stepwise, "_title", str)
-    monkeypatch.setattr(stepwise, "_asked", lambda _: True)
-    assert stepwise._worth(there, ["energy"], lambda stage: None)[0] == {"energy": worth}
-
-
-def test_a_jitter_is_looked_for_again_beside_itself(monkeypatch):
-    """The ring's errors had taken some of the first."""
-    found = [SimpleNamespace(orbits=orbits, sentence="") for orbits in (1, 2)]
-    monkeypatch.setattr(stepwise, "sought", lambda state: found[0 if state.jitter is None else 1])
-    monkeypatch.setattr(stepwise, "settle", lambda state: state)
-    monkeypatch.setattr(stepwise, "inner", lambda _: None)
-    monkeypatch.setattr(stepwise, "lost", lambda *_: (0.1, 0.01))
-    state, moving = stepwise._beside_jitter(State(*[None] * 5), lambda stage: None)
-    assert moving is not None
-    assert moving.orbits == state.jitter == 2
 
 
 @pytest.mark.parametrize(

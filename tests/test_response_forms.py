@@ -2,14 +2,12 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.missing_effects import control, weigh
@@ -17,7 +15,6 @@ from tmlattice.diagnosis.response.outlier_readings import without_gross
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.diagnosis.response.unlike_model import reversed_ones
 from tmlattice.effects import Cause
-from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
@@ -142,20 +139,6 @@ def test_fields_that_their_neighbours_shift_are_weighed_by_the_magnets_beside_th
     assert row.judgement == "helps"
     assert row.heldout_rms_in_plane < 0.7 * none.heldout_rms_in_plane
     assert row.amount * np.sqrt(row.parameters) == pytest.approx(0.02, rel=0.2)
-
-
-def test_no_causes_are_sought_of_kicks_beyond_all_measure(small_ring, whole, monkeypatch):
-    """A ring with all gradients 1 % off had its tunes mended by kicks of centimetres' orbit, for
-    100 s, before anything was fitted."""
-    data = response_data(small_ring, whole)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    seen = SimpleNamespace(
-        statistic=np.array([1e12]), amount=np.array([1e-2]), hypotheses=[("corrector_kick_x", "h1")]
-    )
-    monkeypatch.setattr(sparse, "scan", lambda *_, **__: seen)
-    monkeypatch.setattr(sparse, "_beyond", lambda *_: 1e12)
-    monkeypatch.setattr(sparse, "explain", lambda *_: pytest.fail("a search was begun"))
-    assert sparse.sparse_fit(data, split, None, 10, DEFAULT) is None
 
 
 def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_ring, whole, rng):

@@ -6,25 +6,15 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
-from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
-from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.outlier_readings import outlier_readings
-from tmlattice.diagnosis.response.outlier_steps import outlier_steps
 from tmlattice.diagnosis.response.set_aside import taken_back
-from tmlattice.diagnosis.response.spurious_kicks import spurious_kicks
-from tmlattice.diagnosis.response.state import begin
-from tmlattice.diagnosis.response.stepwise import fit_steps, one_by_one
+from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.diagnosis.response.swaps import (
     correctors_back,
     monitors_back,
-    swapped_monitors,
-    swaps,
 )
-from tmlattice.diagnosis.response.unlike_model import ODD, unlike_model
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
@@ -58,172 +48,6 @@ def error(state):
     truth = {name.casefold(): amount for name, amount in GRADIENTS.items()}
     known = [truth.get(name.casefold(), 0.0) for name in family.places(state.data)]
     return float(np.sqrt(np.mean((state.values["gradient"] - known) ** 2)))
-
-
-def test_single_readings_that_stick_out_count_little_and_are_named(small_ring, clean, rng):
-    """ALS: 1.5 % of the horizontal readings held 42 % of the chi-square."""
-    response = clean.response.copy()
-    held = split_columns(response_data(small_ring, clean), 0.2, np.random.default_rng(1)).held
-    columns = rng.choice(np.flatnonzero(~held[:-1]), 24)
-    monitors = response.shape[1]
-    places = np.append(np.full(2, 6), rng.permutation(2 * monitors)[:22] % monitors)
-    for c, m in zip(columns, places, strict=True):
-        response[c, m, int(clean.planes[c] == "y")] += 2e-7  # of a noise of 2e-8
-    best, state = (fitted(small_ring, one) for one in (clean, replace(clean, response=response)))
-    assert not outlier_readings(best)
-    assert error(state) < 1.05 * error(best)
-    (said,) = outlier_readings(state)
-    assert said.startswith("24 of ")
-    assert f"{clean.monitors[6]} (" in said
-
-
-def test_readings_that_went_wrong_are_left_out_by_the_fit_and_their_monitors_stay(
-    small_ring, clean, rng
-):
-    """LNLS with 40 of 1584 readings wrong by 0.2 mm: 34 um held out, three monitors set aside."""
-    response = clean.response.copy()
-    columns, monitors, _ = response.shape
-    places = rng.permutation(columns * monitors)[:12]
-    for place in places:
-        c, m = divmod(int(place), monitors)
-        response[c, m, int(clean.planes[c] == "y")] += 5e-6 * rng.choice([-1, 1])
-    data = response_data(small_ring, replace(clean, response=response))
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    fit = fit_steps(data, split, STEPS[:3])
-    (said,) = fit.messages
-    assert said.startswith("outlier readings, which differ from the fit by more than 20 times")
-    assert "rejected: 12" in said
-    assert np.isnan(fit.state.data.orbits).sum() == 12
-    assert fit.state.good.all()
-    assert fit.steps[-1].heldout_chi2_per_dof < 1.5
-    assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
-
-
-@pytest.mark.parametrize(("wrong", "alone"), [(3, True), (5, False)])
-def test_a_tenth_of_the_readings_that_a_step_has_are_no_single_ones(
-    small_ring, clean, wrong, alone
-):
-    """Of 35 readings in its own plane; the other plane was not read."""
-    response = clean.response.copy()
-    for c, plane in enumerate(clean.planes):
-        response[c, :, int(plane == "x")] = np.nan
-    response[4, ::7][:wrong, int(clean.planes[4] == "y")] += 5e-6
-    data = response_data(small_ring, replace(clean, response=response))
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    fit = fit_steps(data, split, STEPS[:3])
-    assert any(said.startswith("outlier readings") for said in fit.messages) == alone
-
-
-def lagging(response, planes, columns, late):
-    """Some monitors still average over the time before the step."""
-    response = response.copy()
-    for c in columns:
-        response[c, late, int(planes[c] == "y")] *= 0.85
-    return response
-
-
-def test_steps_that_some_monitors_read_too_early_are_left_out_and_named(small_ring, clean):
-    """ALS 2005: 90 of 121 monitors average, and at five steps had not done so to the end; held out,
-    one such step made 3.3 um of 1.5."""
-    names = clean.correctors
-    split = split_columns(response_data(small_ring, clean), 0.2, np.random.default_rng(1))
-    columns = [int(np.flatnonzero(own[:-1])[0]) for own in (split.held, split.inner)]
-    late = np.arange(0, clean.response.shape[1], 2)
-    wrong = replace(clean, response=lagging(clean.response, clean.planes, columns, late))
-    data = response_data(small_ring, wrong)
-    assert not fit_steps(data, split, [STEPS[0], STEPS[2]]).messages  # gains may break triples, too
-    fit = fit_steps(data, split, STEPS[:3])
-    (said,) = fit.messages
-    told_of = said.split("rejected: ")[1].split(";")[0].split(", ")
-    assert sorted(told_of) == sorted(names[c] for c in columns)
-    assert fit.steps[-1].heldout_chi2_per_dof < 1.5
-    assert not fit.state.split.held[columns].any()
-    assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
-
-
-def test_a_step_whose_calibration_was_a_wrong_guess_is_not_odd(small_ring, clean):
-    """Diamond, 68 % from its design: +153 %, with the third order of such a step."""
-    data = response_data(small_ring, clean)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    *_, (_, state) = one_by_one(begin(data, split), STEPS[:3])  # with gains
-    column = int(np.flatnonzero(state.fitted & (data.plane == 1))[0])
-    values = {name: own.copy() for name, own in state.values.items()}
-    values["calibration"][column] = 1.5
-    bent = np.zeros_like(data.orbits)
-    bent[column, ::2] = 0.3 * data.orbits[column, ::2]  # neighbours contradict each other
-    far = replace(state, at=Predicted(data, state.at.errors, bent)).moved(values)
-    assert inconsistent(far)[column]
-    assert [own.messages for own in outlier_steps(far)] == [(), ()]
-
-
-def test_a_kick_elsewhere_is_an_orbit(small_ring, clean):
-    """A step that moves a second corrector, one in another place, one of the other sign and one of
-    nothing: whatever the model makes of them, neighbours agree."""
-    data = response_data(small_ring, clean)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    y = [c for c, plane in enumerate(clean.planes) if plane == "y"]
-    response = clean.response.copy()
-    response[y[1]] += 0.3 * clean.response[y[6]]
-    response[y[2]] = clean.response[y[7]]
-    response[y[3]] *= -1
-    response[y[4]] = 0.0
-    moved = response_data(small_ring, replace(clean, response=response))
-    assert not inconsistent(fit_steps(moved, split, [STEPS[0], STEPS[2]]).state).any()
-
-
-def test_a_larger_step_is_not_odd(small_ring):
-    """What the model lacks grows with the step: monitors that mix their planes, not fitted here."""
-    mixing = [monitor.name for monitor in small_ring.monitors][::3]
-    causes = [Cause("monitor_coupling", name, 0.02 * (-1) ** i) for i, name in enumerate(mixing)]
-    measured = simulate_response(
-        small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=3,
-    ).measured  # fmt: skip
-    y = [c for c, plane in enumerate(measured.planes) if plane == "y"]
-    response, kicks = measured.response.copy(), np.array(measured.kicks)
-    for c in (y[2], y[9]):  # linear: as if it had been stepped so
-        response[c] *= 20
-        kicks[c] *= 20
-    data = response_data(small_ring, replace(measured, response=response, kicks=kicks))
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS - {"monitor_roll"}]
-    assert fit_steps(data, split, steps).messages == ()
-
-
-def test_a_step_with_another_kick_in_it_is_named_and_not_read_in_that_plane(small_ring, clean):
-    """PETRA III: 0.1 mrad of one corrector, and 3 urad in y a kilometre away."""
-    causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
-    causes.append(Cause("corrector_roll", "v9", 0.05))  # as large, and its own
-    measured = simulate_response(
-        small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=3,
-    ).measured  # fmt: skip
-    names = measured.correctors
-    horizontal = names[measured.planes.index("x")]
-    x, across, inside, source = (names.index(name) for name in (horizontal, "v2", "v4", "v7"))
-    response = measured.response.copy()
-    response[across, :, 0] += 0.05 * response[x, :, 0]
-    response[inside] += 0.1 * response[source]
-    data = response_data(small_ring, replace(measured, response=response))
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS]
-    fit = fit_steps(data, split, steps)
-    (said,) = fit.messages
-    assert all(f"{name} (" in said for name in ("v2", "v4"))
-    assert said.count(" µrad in ") == 2
-    readings = np.isfinite(fit.state.data.orbits[:-1]).any(axis=1)
-    assert readings[across].tolist() == [False, True]
-    assert readings[inside].tolist() == [False, False]
-    assert readings.sum() == 2 * len(names) - 3
-    # the kick that is told makes the orbit that was added, with its sign
-    whole = replace(fit.state, data=data, at=Predicted(data, fit.state.at.errors))
-    model, added = whole.at.model, 0.1 * measured.response[source, :, 1]
-    told = next(own for own in spurious_kicks(whole) if own.column == inside)
-    rows = model.reading_slopes[:, told.plane]
-    orbit = orbits_of_kicks(model, [told.layer], model.maps.at, rows, told.plane)[:, 0]
-    assert told.plane == 1
-    assert np.allclose(told.amount * orbit, added, atol=0.1 * np.abs(added).max())
-    assert error(fit.state) < 1.2 * error(fitted(small_ring, clean))
 
 
 def test_neighbours_that_were_set_aside_are_taken_back_where_they_are_sound(small_ring, clean, rng):
@@ -289,78 +113,9 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
         assert error(found(moved).state) > 10 * error(told.state)
 
 
-def test_noise_that_is_stated_too_low_is_told(small_ring, clean):
-    """SPEAR3: 0.18 µm in x are stated, and the readings show 0.5."""
-    low = replace(clean, noise=clean.noise * np.array([0.2, 1.0]))
-    (said,) = assumed_of(low, response_data(small_ring, low))
-    assert said.startswith("the noise in x")
-    assert not assumed_of(clean, response_data(small_ring, clean))
-
-
-def test_an_rf_orbit_that_no_monitor_read_is_left_out(small_ring, clean):
-    """Siam: the file has the design's dispersion, cell by cell the same to twelve digits."""
-    orbit = clean.rf.orbit.copy()
-    orbit[:, 0] = 1e-4 * np.array([1.0, np.pi, np.sqrt(2)])[np.arange(len(orbit)) % 3]
-    copied = replace(clean, rf=replace(clean.rf, orbit=orbit))
-    data = response_data(small_ring, copied)
-    assert np.isnan(data.orbits[-1]).all()
-    (said,) = assumed_of(copied, data)
-    assert "not measured" in said
-    assert np.isfinite(response_data(small_ring, clean).orbits[-1]).all()
-    coarse = replace(  # so are all readings, written down with few digits
-        copied, response=np.round(clean.response, 5), rf=replace(clean.rf, orbit=np.round(orbit, 5))
-    )
-    assert np.isfinite(response_data(small_ring, coarse).orbits[-1]).all()
-
-
-def test_exchanged_neighbours_are_named_and_put_right(small_ring, clean):
-    """Pohang: two columns seemed displaced by 1.2 and 1.3 m; 1.68 m lie between them."""
-    state = fitted(small_ring, clean)
-    assert swaps(state) == {}
-    pair = ("v5", "v6")
-    wrong = correctors_back(clean, [pair])
-    assert list(swaps(fitted(small_ring, wrong))) == [pair]
-    found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
-    assert any("v5 and v6" in said for said in found.warnings)
-    assert found.steps[-1].heldout_chi2_per_dof < 1.5
-
-
-def test_two_that_answer_as_others_should_are_no_strangers(small_ring, clean):
-    """A fit leaves more of them than of all others: that is enough to look at both. Two that are
-    odd, each in its own way, are not exchanged."""
-    wrong = correctors_back(clean, [("v5", "v7")])
-    odd = clean.response.copy()
-    odd[5] += 0.4 * odd[2]
-    odd[7] += 0.4 * odd[12]
-    for measured, pairs in ((wrong, [("v5", "v7")]), (replace(clean, response=odd), [])):
-        state = fitted(small_ring, measured)
-        assert unlike_model(state).correctors == ()
-        assert unlike_model(state, ODD).correctors == ("v5", "v7")
-        assert list(swaps(state, {"v5", "v7"})) == pairs
-
-
-def test_exchanged_monitors_are_named_and_put_right(small_ring, clean):
-    """Anywhere in the ring; without the names both had been left out as strangers. Where nothing is
-    exchanged, and of monitors that are not strangers, nothing is told."""
-    state = fitted(small_ring, clean)
-    assert swapped_monitors(state, clean.monitors) == {}
-    pair = (clean.monitors[4], clean.monitors[20])
-    wrong = monitors_back(clean, [pair])
-    assert not np.array_equal(wrong.rf.orbit, clean.rf.orbit)
-    (told_of,) = swapped_monitors(fitted(small_ring, wrong), clean.monitors)
-    assert sorted(told_of) == sorted(pair)
-    found = diagnose(small_ring, wrong, effects=["quadrupole_gradient", "corrector_calibration"])
-    assert any("monitors that respond each as the other one should" in s for s in found.warnings)
-    assert not any("resemble nothing" in said for said in found.warnings)
-    assert found.steps[-1].heldout_chi2_per_dof < 1.5
-
-
 EXCHANGED = {
     "neighbours": ("correctors", "v5", "v6"),
-    "far ones": ("correctors", "v5", "v9"),
-    "as if displaced": ("correctors", "v5", "v7"),
     "one of each plane": ("correctors", "generated_a", "v5"),
-    "about the lattice's first place": ("correctors", "v0", "v15"),
     "monitors": ("monitors", "end_1", "end_14"),
 }
 

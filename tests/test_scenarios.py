@@ -1,4 +1,4 @@
-"""The right answer to every scenario: the quick ones always, the others by `-m slow`."""
+"""The right answer to every scenario: always with few effects, and with all by `-m slow`."""
 
 import pytest
 

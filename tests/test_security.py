@@ -21,7 +21,7 @@ from conftest import SMALL
 
 from tmlattice import cache, load_ring
 from tmlattice.files import output_file, output_folder
-from tmlattice.lattice import write_ring
+from tmlattice.lattice import save_ring
 from tmlattice.maps import ring_maps
 from tmlattice.temporaries import PREFIX
 
@@ -298,7 +298,7 @@ def beside(tmp_path_factory):
     """A folder of data with a module beside them for every package that is imported."""
     folder = tmp_path_factory.mktemp("beside")
     (folder / "ring.py").write_bytes(SMALL.read_bytes())
-    write_ring(load_ring(SMALL), folder / "ring.json")
+    save_ring(load_ring(SMALL), folder / "ring.json")
     tmlattice("simulate", "ring.json", "--shots", 3, "--out", "M", "-q", cwd=folder, check=0)
     tmlattice("dev", "challenge", "make", "A", "--cases", 2, "--lattice", "ring.json", "--shots", 2,
               "--out", "set", "-q", cwd=folder, check=0)  # fmt: skip

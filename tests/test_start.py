@@ -16,7 +16,7 @@ from scipy import stats
 
 from tmlattice import cache, load_ring
 from tmlattice.inference import chi2
-from tmlattice.lattice import stored, write_ring
+from tmlattice.lattice import save_ring, stored
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import element_map, ring_maps
 
@@ -154,7 +154,7 @@ def test_a_kept_ring_is_the_ring_that_was_read(kept):
 def test_a_kept_ring_is_written_as_the_ring_that_was_read(kept, tmp_path):
     texts = []
     for name in ("read.py", "kept.py"):
-        assert write_ring(load_ring(kept), tmp_path / name) == ()
+        assert save_ring(load_ring(kept), tmp_path / name) == ()
         texts.append((tmp_path / name).read_text())
     assert texts[0] == texts[1]
 

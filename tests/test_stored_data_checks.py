@@ -52,9 +52,9 @@ def test_small_errors_are_nothing_global(small_ring, sound, kind):
 
 
 CHANGES = {
-    "planes are swapped": lambda values: values[..., ::-1],
-    "shifted by +1": lambda values: np.roll(values, 1, axis=-2),
-    "shifted by -2": lambda values: np.roll(values, -2, axis=-2),
+    "x and y are exchanged": lambda values: values[..., ::-1],
+    "1 place downstream": lambda values: np.roll(values, 1, axis=-2),
+    "2 places upstream": lambda values: np.roll(values, -2, axis=-2),
     "reverse order": lambda values: values[..., ::-1, :],
 }
 
@@ -71,9 +71,9 @@ def test_turns_that_are_numbered_backwards(small_ring, sound):
 
 def test_a_sign_a_unit_and_the_planes_of_a_dispersion(small_ring, sound):
     data = sound["dispersion"]
-    assert "swapped" in wrong_in(small_ring, step(data, lambda values: values[..., ::-1]))
-    assert "the sign" in wrong_in(small_ring, step(data, lambda values: -values))
-    assert "1000 times too small" in wrong_in(small_ring, step(data, lambda v: 1e-3 * v))
+    assert "exchanged" in wrong_in(small_ring, step(data, lambda values: values[..., ::-1]))
+    assert "wrong sign" in wrong_in(small_ring, step(data, lambda values: -values))
+    assert "a thousand times too small" in wrong_in(small_ring, step(data, lambda v: 1e-3 * v))
 
 
 def test_a_diagnosis_refuses_what_is_wrong_everywhere(small_ring, sound):
@@ -81,7 +81,7 @@ def test_a_diagnosis_refuses_what_is_wrong_everywhere(small_ring, sound):
         with pytest.raises(MeasurementError, match=re.escape(said)):
             diagnose(small_ring, turns(sound["turn_by_turn"], change))
     flipped = step(sound["dispersion"], lambda values: -values)
-    with pytest.raises(MeasurementError, match="dispersion: the sign"):
+    with pytest.raises(MeasurementError, match="dispersion: x has the wrong sign"):
         diagnose(small_ring, {"tunes": sound["tunes"], "dispersion": flipped})
 
 
@@ -108,19 +108,25 @@ def test_orbits_whose_correctors_were_set_tell_their_sign(small_ring):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda q: q[:, ::-1], "the tunes are swapped"),
-        (lambda q: 1 - q, "both are 1 - Q"),
+        (lambda q: q[:, ::-1], "x and y are exchanged"),
+        (lambda q: 1 - q, "both tunes are 1 - Q"),
         (lambda q: np.array([[1 - q[0, 0], q[0, 1]]]), "Qx is 1 - Qx"),
-        (lambda q: np.full((1, 2), 0.44), "not the ring's"),
+        (lambda q: np.full((1, 2), 0.44), "not those of"),
     ],
 )
 def test_tunes(small_ring, sound, change, said):
     assert said in wrong_in(small_ring, TuneReading(tune=change(sound["tunes"].tune)))
 
 
-def test_nothing_is_assumed_of_them(small_ring, sound):
-    with pytest.raises(MeasurementError, match="correct the data themselves"):
-        check_data(small_ring, sound["turn_by_turn"], assumed=["planes_exchanged"])
+def test_what_is_assumed_of_them_is_undone(small_ring, sound):
+    exchanged = turns(sound["turn_by_turn"], lambda values: values[..., ::-1])
+    assert check_data(small_ring, exchanged, assumed=["planes-exchanged"]).status != "wrong"
+    flipped = step(sound["dispersion"], lambda values: -values)
+    assert check_data(small_ring, flipped, assumed=["rf-reversed"]).status != "wrong"
+    folded = TuneReading(tune=1 - sound["tunes"].tune)
+    assert check_data(small_ring, folded, assumed=["tunes-folded"]).status != "wrong"
+    with pytest.raises(MeasurementError, match="no meaning for a dispersion measurement"):
+        check_data(small_ring, sound["dispersion"], assumed=["turns-backwards"])
 
 
 def test_the_command_checks_them(sound, tmp_path):

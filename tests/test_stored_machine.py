@@ -114,6 +114,34 @@ def test_lines_of_a_thousand_particles_that_decohere_are_at_modes(tiny):
     assert_allclose(found.tune[0], tunes, atol=3e-3)  # of the beam, not of its middle
 
 
+@pytest.mark.parametrize("cavity", [False, True])
+def test_a_beam_in_the_network_decoheres_as_in_at(tiny, with_cavity, cavity):
+    """With the cavity at the end of a turn instead of its start, other particles are ahead: the
+    spread, times the dispersion, is small there."""
+    options = {"turns": 64, "amplitude": 3e-4, "particles": 300, "noise": 0.0, "seed": 2}
+    options |= {"emittance": (1e-9, 1e-10), "spread": 1e-5 if cavity else 1e-3}
+    by_at, by_network = (
+        simulate_turns(with_cavity if cavity else tiny, UPRIGHT, engine=engine, **options)
+        for engine in ("at", "network")
+    )
+    expected, got = by_at.measured.readings[0], by_network.measured.readings[0]
+    if not cavity:
+        assert expected[40:].std() < 0.6 * expected[:5].std()  # it does decohere
+    assert np.sqrt(np.mean((got - expected) ** 2)) < 0.02 * expected[:20].std()
+
+
+def test_what_the_network_does_not_have_is_refused(tiny):
+    for options, message in (
+        ({"radiation": True}, "no radiation; take the engine 'at'"),
+        ({"settings": [FREQUENCY]}, "no settings; take the engine 'at'"),
+        ({"causes": [Cause("radiation_loss_bends", None, 1.0)]}, "no radiation"),
+    ):
+        with pytest.raises(TmlatticeError, match=message):
+            simulate_turns(tiny, **options, engine="network", turns=20)
+    with pytest.raises(TmlatticeError, match="no engine 'ocelot' here; there are at and network"):
+        simulate_turns(tiny, engine="ocelot", turns=20)
+
+
 @pytest.mark.parametrize("radiation", [False, True])
 @pytest.mark.parametrize("settings", [{}, FREQUENCY])
 def test_beam_that_is_not_kicked_stays_on_the_closed_orbit(with_cavity, settings, radiation):

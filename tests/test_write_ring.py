@@ -13,7 +13,7 @@ from tmlattice import Cause, load_ring, simulate
 from tmlattice.beam.chain import Chain
 from tmlattice.effects import apply
 from tmlattice.errors import LatticeError
-from tmlattice.lattice import write_ring
+from tmlattice.lattice import save_ring
 from tmlattice.lattice.ring import PROTON_GEV
 from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import write_measurement
@@ -38,7 +38,7 @@ def uneven(small_ring):
 
 @pytest.mark.parametrize("file", FORMATS)
 def test_ring_that_is_read_back_has_the_same_maps(uneven, file, tmp_path):
-    assert write_ring(uneven, tmp_path / file) == () or file.endswith(NUMBERED)
+    assert save_ring(uneven, tmp_path / file) == () or file.endswith(NUMBERED)
     back = load_ring(tmp_path / file)
     assert back.energy == uneven.energy
     assert [e.kind for e in back.elements] == [e.kind for e in uneven.elements]
@@ -54,7 +54,7 @@ def test_ring_that_is_read_back_has_the_same_maps(uneven, file, tmp_path):
 @pytest.mark.parametrize("file", FORMATS)
 def test_protons_are_as_fast_in_the_file(small_ring, file, tmp_path):
     ring = replace(small_ring, mass=PROTON_GEV)
-    write_ring(ring, tmp_path / file)
+    save_ring(ring, tmp_path / file)
     back = load_ring(tmp_path / file)
     # OCELOT's maps are told the energy of an electron that is as fast
     assert back.map_energy == pytest.approx(ring.map_energy, rel=1e-12)
@@ -65,7 +65,7 @@ def test_at_itself_finds_the_tunes_in_the_file(uneven, tmp_path):
     """AT tracks the file with its own elements: ten steps a magnet leave 2e-5."""
     import at
 
-    write_ring(uneven, tmp_path / "ring.at.json")
+    save_ring(uneven, tmp_path / "ring.at.json")
     lattice = at.load_lattice(str(tmp_path / "ring.at.json"))
     assert at.get_tune(lattice) == pytest.approx(ring_tunes(uneven), abs=5e-5)
 
@@ -91,7 +91,7 @@ def thin(tmp_path_factory):
 
 @pytest.mark.parametrize("file", FORMATS)
 def test_thin_bends_are_written(thin, file, tmp_path):
-    write_ring(thin, tmp_path / file)
+    save_ring(thin, tmp_path / file)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         back = load_ring(tmp_path / file)
@@ -120,7 +120,7 @@ def test_errors_that_a_format_can_say_are_written(small_ring, file, tmp_path):
         Cause("skew_gradient", "wig_1", 2e-3),
     ]
     ring = apply(small_ring, causes)
-    write_ring(ring, tmp_path / file)
+    save_ring(ring, tmp_path / file)
     back = load_ring(tmp_path / file)
     assert ring_tunes(back) == pytest.approx(ring_tunes(ring), abs=1e-9)
     orbits = [Chain.from_ring(r).closed_orbit()[0][-1] for r in (ring, back)]
@@ -134,14 +134,14 @@ def test_errors_that_a_format_has_no_place_for_are_told(small_ring, file, tmp_pa
         Cause("corrector_position", "v5", 0.02),
         Cause("gradient_absolute", "QD::5", 4e-3),
     ]
-    told = write_ring(apply(small_ring, causes), tmp_path / file)
+    told = save_ring(apply(small_ring, causes), tmp_path / file)
     assert any("ds of v5 cannot be written" in sentence for sentence in told)
     assert any("thin gradients in the middle of QD::5" in sentence for sentence in told)
     back = load_ring(tmp_path / file)
     magnet = small_ring["QD::5"]
     name = "qd..5" if file.endswith(NUMBERED) else "QD::5"
     assert back[name].k1 == pytest.approx(magnet.k1 + 4e-3 / magnet.length)
-    assert write_ring(apply(small_ring, causes), tmp_path / "own.json") == ()
+    assert save_ring(apply(small_ring, causes), tmp_path / "own.json") == ()
     assert load_ring(tmp_path / "own.json")["v5"].errors.ds == 0.02
 
 
@@ -153,7 +153,7 @@ def test_misalignments_are_written(small_ring, file, tmp_path):
         Cause("sextupole_offset_x", "sf::6", 5e-4),
     ]
     ring = apply(small_ring, causes)
-    write_ring(ring, tmp_path / file)
+    save_ring(ring, tmp_path / file)
     back = load_ring(tmp_path / file)
     orbits = [Chain.from_ring(r).closed_orbit()[0] for r in (ring, back)]
     assert np.abs(orbits[0]).max(0)[[0, 2]].min() > 1e-4
@@ -166,7 +166,7 @@ def test_skew_gradient_of_a_quadrupole_is_written_as_its_tilt(small_ring, tmp_pa
     causes = [Cause("skew_gradient", name, 1e-4) for name in ("QF::3", "QD::5", "QF::7", "QD::9")]
     causes.append(Cause("gradient_absolute", "QF::7", 2e-4))
     faulty = apply(ring, causes)
-    (told,) = write_ring(faulty, tmp_path / "ring.at.json")
+    (told,) = save_ring(faulty, tmp_path / "ring.at.json")
     assert "QF::3, QD::5, QF::7, QD::9 are written as fields of their bodies" in told
     back = load_ring(tmp_path / "ring.at.json")
     turns = [Chain.from_ring(r).one_turn_map()[1] for r in (ring, faulty, back)]
@@ -176,7 +176,7 @@ def test_skew_gradient_of_a_quadrupole_is_written_as_its_tilt(small_ring, tmp_pa
 
 def test_name_of_no_format_is_refused_before_anything_is_written(small_ring, tmp_path):
     with pytest.raises(LatticeError, match=r"\.at\.json"):
-        write_ring(small_ring, tmp_path / "ring.txt")
+        save_ring(small_ring, tmp_path / "ring.txt")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -214,7 +214,7 @@ def test_line_by_positions(tmp_path):
         ({"components": [{"name": "qf", "at": "1/0"}]}, "position '1/0' cannot be worked out"),
         ({"components": [{"name": "qf", "at": 0.2}, {"name": "qd", "at": 0.4}]}, "before the end"),
         ({"components": ["cell"]}, "a line contains itself"),
-        ({"l": 1.0}, "after the line's 1 m"),
+        ({"l": 1.0}, "its length ends at 1.000000 m"),
     ):
         changed = json.loads(json.dumps(deck["file"]))
         changed["lines"]["cell"]["composer"] = {**composer, **change}

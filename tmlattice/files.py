@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,12 +35,13 @@ def _refusal(path: Path, error: OSError) -> OutputError:
 
 
 @contextmanager
-def output_folder(folder: Path) -> Iterator[Path]:
+def output_folder(folder: Path, replaced: Collection[str] = ()) -> Iterator[Path]:
     """A temporary folder whose files stand in `folder` when all went well: all of them, or none.
 
     It is made at once, so that an unwritable place is known before the work and not after it. A
     folder that is there stays: its owner, its access, its other files, whoever writes them
-    meanwhile. The new files are moved into it under its lock, so that no two outputs mix.
+    meanwhile. The new files are moved into it under its lock, so that no two outputs mix. Older
+    files with names of `replaced` that are not among the new ones are removed.
 
     Raises:
         OutputError: the folder cannot be made or written.
@@ -57,15 +58,16 @@ def output_folder(folder: Path) -> Iterator[Path]:
     try:
         yield temporary
         with ThreadPoolExecutor(1) as other:  # Ctrl-C comes before the move or after it
-            other.submit(_put, temporary, folder).result()
+            other.submit(_put, temporary, folder, replaced).result()
     except OSError as error:
         raise _refusal(folder, error) from error
     finally:
         made.__exit__(None, None, None)
 
 
-def _put(temporary: Path, folder: Path) -> None:
+def _put(temporary: Path, folder: Path, replaced: Collection[str]) -> None:
     """Move a folder's files into another one; as a whole, where that is not there."""
+    older = {*replaced} - {path.name for path in temporary.iterdir()}
     folder.parent.mkdir(parents=True, exist_ok=True)
     if not folder.exists():
         try:
@@ -85,6 +87,8 @@ def _put(temporary: Path, folder: Path) -> None:
         os.rename(temporary, whole)
         try:
             move_files(whole, folder)
+            for name in older:
+                (folder / name).unlink(missing_ok=True)
         finally:
             shutil.rmtree(whole, ignore_errors=True)
 

@@ -1,7 +1,6 @@
 """How a fit ends is said, and where it has to be said: linear algebra and rings as referees."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +8,7 @@ import pytest
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.errors import BeamLostError
-from tmlattice.fitting.map_fit import most_probable
-from tmlattice.inference.newton import Outcome, _best_move, fit
-from tmlattice.inference.priors import AmountPrior, Student
-from tmlattice.inference.problem import Point
+from tmlattice.inference.newton import Outcome, fit
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 
@@ -83,71 +79,3 @@ def test_the_false_alarm_rate_acts_on_what_would_have_been_seen(small_ring):
     for effect, least in usual.sensitivity.items():
         assert strict.sensitivity[effect] > 1.2 * least
     assert strict.provenance["options"]["false_alarm"] == 1e-9
-
-
-def test_a_step_that_loses_the_beam_is_not_taken_even_from_a_start_that_cannot_be():
-    """Both cost infinity: an amount beyond the prior's bound, and no trajectory at all."""
-    amounts = AmountPrior(Student(0.3, np.inf), bound=0.1)
-    start = Point((Cause("quadrupole_gradient", "QD::5", 0.2),), np.zeros(0), {}, np.ones(1),
-                  None, np.zeros(0), None)  # fmt: skip
-    lost = replace(start, lost="the beam is lost")
-    problem = SimpleNamespace(amounts=amounts, at=lambda *_: lost, moved=lambda old, _: old)
-    assert _best_move(problem, start, np.zeros(1), np.zeros(0), np.inf) is None
-
-
-class Straight:
-    """Readings that are a matrix times the amounts."""
-
-    largest = np.inf
-
-    def __init__(self, J, measured, sigma):
-        self.J, self.measured, self.sigma = J, measured, np.full(len(measured), sigma)
-
-    def residual(self, amounts):
-        return self.measured - self.J @ amounts
-
-    def slopes(self, amounts):
-        return self
-
-    def times(self, amounts):
-        return self.J @ amounts
-
-    def transposed(self, rows):
-        return self.J.T @ rows
-
-    @property
-    def matrix(self):
-        return self.J
-
-    def kernel(self, variance):
-        return (self.J * variance) @ self.J.T
-
-    def nuisances(self, amounts):
-        return np.zeros((len(self.measured),) * 2)
-
-
-def test_most_probable_amounts_are_ridge_regression_where_all_is_linear(rng):
-    """The primal normal equations are the referee of the dual ones."""
-    J = rng.standard_normal((20, 50))
-    true = 0.3 * rng.standard_normal(50)
-    problem = Straight(J, J @ true + 0.1 * rng.standard_normal(20), 0.1)
-    found = most_probable(problem, Student(0.3, np.inf), np.zeros(50))
-    ridge = np.linalg.solve(J.T @ J / 0.1**2 + np.eye(50) / 0.3**2, J.T @ problem.measured / 0.1**2)
-    assert found.converged
-    np.testing.assert_allclose(found.amounts, ridge, atol=1e-9)
-
-
-def test_tails_leave_one_large_amount_where_it_is(rng):
-    """A Gauss of the same width shares it among columns that look like it."""
-    J = rng.standard_normal((40, 1)) + 0.3 * rng.standard_normal((40, 30))
-    true = np.zeros(30)
-    true[7] = 1.0
-    problem = Straight(J, J @ true + 1e-3 * rng.standard_normal(40), 1e-3)
-    largest = {}
-    for freedom in (1.0, np.inf):
-        amounts = most_probable(
-            problem, Student(1e-3, freedom), np.zeros(30), iterations=40
-        ).amounts
-        assert np.abs(amounts).argmax() == 7
-        largest[freedom] = np.abs(np.delete(amounts, 7)).max()
-    assert largest[1.0] < 0.05 * largest[np.inf]

@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose, simulate
-from tmlattice.beam.model import Model
 from tmlattice.inference import search as own
-from tmlattice.inference.alternatives import Detection
-from tmlattice.inference.newton import fit
-from tmlattice.inference.search import Option
-from tmlattice.observe.data import of_measurement
-from tmlattice.observe.first_turns import FirstTurns
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "fuzz"))
 from inputs import ring as ring_of_ten
@@ -61,22 +55,3 @@ def test_a_reading_of_a_metre_is_rejected_and_is_no_finding(ring, measured, look
     (row,) = found.outliers
     names = [one.name for one in ring.monitors]
     assert (row["shot"], names.index(row["monitor"]), row["plane"]) == (shot, monitor, "x")
-
-
-def test_a_search_ends_where_it_has_been(ring, measured, looks, monkeypatch):
-    """A choice that is taken and given back each time."""
-    data = of_measurement(ring, measured)
-    problem = FirstTurns(model=Model(ring, data.settings), data=data, places={})
-    seen = Detection(50.0, 20.0, 1e-9)
-
-    def options(search, state, look):
-        return [Option("monitor", "another", 10.0, seen, where=len(state.monitors))]
-
-    def revised(search, state, quick=False):
-        return replace(state, monitors={0: seen})
-
-    monkeypatch.setattr(own, "_options", options)
-    monkeypatch.setattr(own, "revised", revised)
-    found = own.explain(own.Search(problem, []), fit(problem, (), data.launches))
-    assert list(found.monitors) == [0]
-    assert len(looks) == 2

@@ -346,6 +346,7 @@ DECKS = {
     "dipedge he": deck(extra="de: dipedge, at=4.95, h=0.4, e1=0.1, he=0.3, hgap=0.02, fint=0.5;"),
     "bv srotation": deck(beam="beam, particle=electron, energy=3, bv=-1;\n",
         extra="q3: quadrupole, l=0.1, k1=0.3, at=4.8; sr: srotation, at=5.0, angle=0.02;"),
+    "quadrupole k0": deck(extra="q3: quadrupole, l=0.1, k1=0.3, k0=1e-3, at=4.95;"),
     "seqedit install after flatten": deck(before="q3: quadrupole, l=0.2, k1=0.5;\n",
         after="seqedit, sequence=ring; flatten; install, element=q3, at=5.0; endedit;\n"),
     **{f"seqedit move {how} of {refer}": BEAM + ELEMENTS

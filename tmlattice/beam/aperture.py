@@ -13,6 +13,13 @@ APERTURE = 1.0
 """m and rad: far outside any beam pipe, where second-order maps are meaningless."""
 
 
+def lost(states: Array) -> NDArray[np.bool_]:
+    """Whether states [..., n] are outside the aperture, or NaN, [...]. It does not bound tau, the
+    fifth of six coordinates: without RF the delay of a particle grows turn by turn."""
+    bounded = [i for i in range(states.shape[-1]) if i != 4]
+    return np.asarray(~np.all(np.abs(states[..., bounded]) < APERTURE, axis=-1))
+
+
 def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) -> None:
     """Raise where a trajectory of states [block, layer + 1, n, lane] has left the aperture.
 
@@ -22,8 +29,9 @@ def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) ->
     last = states[:, -1]
     if np.isfinite(last).all() and np.abs(last).max(initial=0.0) < APERTURE:
         return
-    lost = ~np.all(np.abs(states) < APERTURE, axis=2)  # [block, layer + 1, lane], true for NaN
-    anywhere = np.any(lost, axis=1)
+    anywhere = lost(np.moveaxis(states, 2, 3)).any(axis=1)  # [block, lane]
+    if not anywhere.any():
+        return
     block, lane = np.unravel_index(int(anywhere.argmax()), anywhere.shape)
     trajectory = int(block) * len(size[1]) + int(lane)
     raise lost_beam(states[block, :, :, lane], trajectory, maps)
@@ -31,7 +39,7 @@ def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) ->
 
 def lost_beam(states: Array, trajectory: int, maps: RingMaps, turn: int = 0) -> BeamLostError:
     """The error for a lost trajectory with these states [layer + 1, n] in its turn."""
-    gone = ~np.all(np.abs(states) < APERTURE, axis=1)
+    gone = lost(states)
     exit_ = int(gone.argmax())
     where = f"in layer {exit_ - 1} ('{maps.layers[exit_ - 1]}')" if exit_ else "at the launch"
     when = f" in turn {turn}" if turn else ""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.beam import sweeps
 from tmlattice.beam import tangents as kernels
-from tmlattice.beam.aperture import APERTURE, check_alive
+from tmlattice.beam.aperture import APERTURE, check_alive, lost
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.beam.sweeps import curved
@@ -168,8 +168,7 @@ class LayerChain:
             raise ValueError(f"{turns} turns cannot be tracked; give at least one")
         states = self._turns(self._start(launch), turns)
         if keep_lost:
-            lost = ~np.all(np.abs(states) < APERTURE, axis=2)
-            states[np.logical_or.accumulate(lost, axis=1)] = np.nan
+            states[np.logical_or.accumulate(lost(states), axis=1)] = np.nan
         else:
             self._check_alive(states)
         return states
@@ -184,17 +183,17 @@ class LayerChain:
         return sweeps.unpack(history, len(start))
 
     def _check_alive(self, states: Array) -> None:
-        lost = ~np.all(np.abs(states) < APERTURE, axis=2)  # [batch, turn], true for NaN
-        if not lost.any():
+        gone = lost(states)  # [batch, turn]
+        if not gone.any():
             return
-        trajectory = int(np.any(lost, axis=1).argmax())
-        turn = int(lost[trajectory].argmax())
+        trajectory = int(gone.any(axis=1).argmax())
+        turn = int(gone[trajectory].argmax())
         if turn == 0:
             raise BeamLostError(
                 f"trajectory {trajectory} starts outside {APERTURE:g} m or rad; launch closer"
             )
         inside = self.states(states[trajectory, turn - 1][None])[0]
-        gone = ~np.all(np.abs(inside) < APERTURE, axis=1)
+        gone = lost(inside)
         layer = max(int(gone.argmax()) - 1, 0) if gone.any() else len(self.layers) - 1
         raise BeamLostError(
             f"trajectory {trajectory} is lost in turn {turn}, in layer {layer} "
@@ -323,11 +322,3 @@ class Chain(LayerChain):
         rf = cavities.exits, cavities.values
         kernels.trajectories(0, 1, *turn.W, turn.curved, *rf, states, tangents)
         return states[0], tangents[0]
-
-
-def tangents(network: LayerChain, x: Array) -> tuple[Array, Array, Array]:
-    """States [layer + 1, n] for the launch x [n], at all exits, their Jacobians M [layer + 1, n, n]
-    by the launch, and the inverses of these."""
-    path, total = network.tangents(x)
-    M = total[:-1]
-    return path[:-1], M, np.asarray(np.linalg.inv(M), dtype=float)

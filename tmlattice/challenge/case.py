@@ -285,7 +285,7 @@ def read_case(folder: Path, name: str) -> Case:
     return Case(name, public["lattice"], parts, public["options"], tuple(kinds))
 
 
-RECORDS: Mapping[str, type] = {kind: record for kind, (record, _) in KINDS.items()}
+RECORDS: Mapping[str, type] = {name: kind.record for name, kind in KINDS.items()}
 
 
 def read_truth(folder: Path, name: str) -> Truth:
@@ -310,9 +310,9 @@ def read_truth(folder: Path, name: str) -> Truth:
         MemoryError,
         BadZipFile,
     ) as error:
-        said = plain(str(error), 100)
+        reason = plain(str(error), 100)
         raise TmlatticeError(
-            f"the truth of case {name} in '{folder}' cannot be read ({said}); make it anew"
+            f"the truth of case {name} in '{folder}' cannot be read ({reason}); make it anew"
         ) from error
 
 

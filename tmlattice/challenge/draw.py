@@ -10,6 +10,8 @@ from tmlattice.effects import Cause, Effect, find
 from tmlattice.errors import TmlatticeError
 
 TRIES = 1000
+HALVES = 6
+"""Halvings of a largest amount that no beam survives."""
 SUDDEN = 2.0
 """Ratio to the wanted signal to noise above which an amount does not determine it."""
 
@@ -32,14 +34,12 @@ class Draw:
         random: generator.
         signal: smallest and largest signal to noise, log-uniform.
         amount: of every effect instead, of random sign.
-        halves: number of halvings of a largest amount that no beam survives.
         unreachable: effects without an amount of the wanted signal to noise.
     """
 
     random: np.random.Generator
     signal: tuple[float, float]
     amount: float | None = None
-    halves: int = 0
     unreachable: list[Lost] = field(default_factory=list)
 
     def target(self) -> float:
@@ -84,7 +84,7 @@ class Draw:
         """Return causes in this proportion, and no larger, with this signal to noise; None: too
         small, or large for any amount (energy losses switch an RF on)."""
         share, size = 1.0, ruler.of(caps)
-        for _ in range(self.halves):
+        for _ in range(HALVES):
             if np.isfinite(size):
                 break
             share /= 2

@@ -1,4 +1,8 @@
-"""Cases of any kinds of measurement: faults, measurements by AT, and signal to noise."""
+"""Cases of any kinds of measurement: faults, measurements by AT, problems, and signal to noise.
+
+A signal to noise is the norm of the finite change of all rows over their noise, nuisances projected
+out. With distributed errors the noise is that of both (Mahalanobis).
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,11 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.challenge.case import BEFORE, Case, Truth
+from tmlattice.beam.model import Model
+from tmlattice.challenge.case import BEFORE, Case, Truth, ring_of
 from tmlattice.challenge.draw import Draw
-from tmlattice.diagnosis.kinds import How, Measured, part_of, stacked
-from tmlattice.effects import Cause, Effect, LaunchEffect, find, modelled
+from tmlattice.diagnosis.kinds import Measured, PartOptions, part_of, stacked
+from tmlattice.effects import Cause, Effect, LaunchEffect, Settings, find, modelled
 from tmlattice.errors import TmlatticeError
+from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
@@ -20,6 +26,8 @@ from tmlattice.lattice import Ring
 from tmlattice.machine import simulate, stored_beam
 from tmlattice.machine.response import NOISE, simulate_response
 from tmlattice.machine.shots import stream
+from tmlattice.observe.data import Data, joined, of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 
 Array = NDArray[np.float64]
 
@@ -37,8 +45,7 @@ FAINTER, LOUDER = 0.5, 2.0
 TURNS = 500
 """Turns of a stored beam."""
 
-HALVES = 6
-"""Halvings of a largest fault that no stored beam survives."""
+UNKNOWN_LAUNCH = (np.inf, np.inf, np.inf, np.inf, 0.0)
 
 READING_NOISE = 2e-5
 """m; noise of a first turn."""
@@ -129,12 +136,72 @@ def problem_of(
     background: Mapping[str, float],
 ) -> Problem:
     """Return measurements as a problem, with distributed errors of known sizes if there are any."""
-    places = {name: float(max(len(find(name).places(ring)), 1)) for name in modelled(turns=True)}
-    how = How(ring, places, DEFAULT)
+    options = PartOptions(ring, _places(ring, turns=True), DEFAULT)
     first, then = (
-        [part_of(label, one, how) for label, one in some.items()] for some in (measured, before)
+        [part_of(label, one, options) for label, one in some.items()] for some in (measured, before)
     )
-    problem = stacked(first, then, how)
+    return _among(stacked(first, then, options), ring, background)
+
+
+def problem_of_case(
+    case: Case, background: Mapping[str, float], given: Sequence[Cause] = ()
+) -> Problem:
+    """Return the measurements of a case as a problem; see `problem_of`.
+
+    Args:
+        case: public part.
+        background: rms of the distributed errors, by effect.
+        given: causes that are known, of first turns.
+    """
+    ring = ring_of(case.lattice)
+    if case.kinds:
+        return problem_of(ring, case.measured, case.before, background)
+    data = of_measurement(ring, case.fit)
+    if case.reference is not None:
+        data = joined(of_measurement(ring, case.reference, reference=True), data)
+    return _among(_first_turns(ring, data).with_fixed(given), ring, background)
+
+
+def quiet_problem(
+    ring: Ring,
+    launches: Array,
+    settings: Sequence[Settings],
+    noise: float,
+    background: Mapping[str, float],
+    reference: int,
+) -> Problem:
+    """Return the problem of first turns that agree with the design.
+
+    Args:
+        ring: the design.
+        launches: true ones, those of a reference first, [shot, 5].
+        settings: of each shot.
+        noise: rms of a reading, m.
+        background: rms of the distributed errors, by effect.
+        reference: number of shots from before the fault.
+    """
+    active = np.arange(len(launches)) >= reference
+    readings = Model(ring, settings, active=active).readings(launches)
+    valid = np.isfinite(readings)
+    unknown = np.tile(UNKNOWN_LAUNCH, (len(launches), 1))
+    data = Data(
+        np.nan_to_num(readings), valid, np.full(readings.shape, noise), launches, unknown,
+        tuple(settings), 1, active,
+    )  # fmt: skip
+    return _among(_first_turns(ring, data), ring, background)
+
+
+def _first_turns(ring: Ring, data: Data) -> CombinedProblem:
+    model = Model(ring, data.settings, active=data.active)
+    return CombinedProblem.of([FirstTurns(model=model, data=data, places=_places(ring))])
+
+
+def _places(ring: Ring, turns: bool = False) -> dict[str, float]:
+    return {name: float(max(len(find(name).places(ring)), 1)) for name in modelled(turns=turns)}
+
+
+def _among(problem: Problem, ring: Ring, background: Mapping[str, float]) -> Problem:
+    """The problem with distributed errors of known sizes."""
     if not background:
         return problem
     everywhere = [
@@ -146,7 +213,7 @@ def problem_of(
 
 
 class Ruler:
-    """Signal to noise by the model: the finite change of all rows, nuisances projected out.
+    """Signal to noise by the model.
 
     Args:
         problem: of a machine without the fault.
@@ -157,13 +224,21 @@ class Ruler:
         self.start = fit(problem, (), problem.first)
 
     def of(self, causes: Sequence[Cause]) -> float:
-        """Return the signal to noise; NaN if no beam is stored."""
+        """Return that of causes by the model; NaN if the beam does not survive them."""
         seen = [c for c in causes if self.problem.sees((c.effect, c.element))]
         point = self.problem.at(seen, self.start.nuisances)
         if point.lost:
             return float("nan")
-        change = self.start.projection.out(self.start.residual - point.residual)
-        return float(np.linalg.norm(change))
+        return self._norm(self.start.residual - point.residual)
+
+    def size(self, change: Array) -> float:
+        """Return that of a change of the readings, of the last ones of the problem, m."""
+        whole = np.zeros(self.problem.valid.size)
+        whole[-change.size :] = np.nan_to_num(change).ravel()
+        return self._norm(self.problem.as_rows(whole))
+
+    def _norm(self, rows: Array) -> float:
+        return float(np.linalg.norm(self.start.projection.out(rows)))
 
 
 # --- a case ---------------------------------------------------------------------------------------
@@ -186,7 +261,7 @@ def kinds_case(asked: CaseSettings, number: int, name: str) -> tuple[Case, Truth
         return {kind: measure(kind, ring, causes, noise, asked.shots, **own) for kind in kinds}
 
     healthy = machine((), 1)
-    draw = Draw(random, asked.signal, asked.amount, HALVES)
+    draw = Draw(random, asked.signal, asked.amount)
     causes: tuple[Cause, ...] = ()
     alone: dict[str, float] = {}
     total, measured = 0.0, healthy

@@ -25,8 +25,14 @@ from tmlattice.challenge.case import (
     write_case,
 )
 from tmlattice.challenge.draw import Draw
-from tmlattice.challenge.kinds import TIER_KINDS, CaseSettings, kinds_case, measure
-from tmlattice.challenge.ruler import Ruler
+from tmlattice.challenge.kinds import (
+    TIER_KINDS,
+    CaseSettings,
+    Ruler,
+    kinds_case,
+    measure,
+    quiet_problem,
+)
 from tmlattice.challenge.unknown import DISCRETE, LARGEST, Unknown, clean_readings
 from tmlattice.effects import (
     Cause,
@@ -77,7 +83,7 @@ def make(
     effects: Sequence[str] | None = None,
     amount: float | None = None,
     signal: tuple[float, float] = SIGNAL,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     known_rms: bool = False,
     kinds: Sequence[str] = (),
     progress: bool = True,
@@ -316,7 +322,9 @@ class CaseDraw:
         unknown: dict[str, Any] | None = None
         clean, sizes = healthy, []
         if self.asked.tier != "E":
-            ruler = Ruler(self.ring, launches, settings, self.noise, self.background, before)
+            ruler = Ruler(
+                quiet_problem(self.ring, launches, settings, self.noise, self.background, before)
+            )
             kind = self._unknown_kind() if self.asked.tier == "D" else None
             if kind in LARGEST:
                 clean, unknown = self._unknown(str(kind), healthy, ruler)

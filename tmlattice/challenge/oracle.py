@@ -1,160 +1,62 @@
 """The oracle: the best possible answer from the data.
 
-It has the exact statistics: the true launches (where it is linearised; priors of launches are those
-of every method), the true noise and background, and the largest fault. It weighs every hypothesis
-by its likelihood ratio, the leading ones by the finite change of the readings. Its class is every
-hypothesis within a chi-square of 9 of the best.
-
-Of several causes it seeks one at a time, given all the others: no method can do better.
+It has the exact noise and sizes of the distributed errors, and of several causes it seeks one at a
+time, given all the others. It weighs every hypothesis by its fall of chi-square, the leading ones
+refitted through the full model. Its class is every hypothesis within a chi-square of 9 of the best.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.challenge.case import Case, Truth, ring_of
-from tmlattice.challenge.ruler import background_signatures
-from tmlattice.effects import Cause, RingEffect, find, modelled
+from tmlattice.challenge.kinds import CHANGES, problem_of_case
+from tmlattice.effects import Cause, find, modelled
+from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.scan import effective_number, free_threshold
-from tmlattice.inference.whitening import Projection, Whitening
-from tmlattice.machine import draw_background
-from tmlattice.observe.data import Data, joined, of_measurement
+from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.scan import Scan, scan
 
 Array = NDArray[np.float64]
 
 CLASS = 9.0
 """Chi-square within which the oracle does not distinguish hypotheses."""
 
-DRAWS = 200
 REFINED = 60
+"""Hypotheses that are refitted, at most."""
+
+MAX_BEHIND = 60.0
+"""Chi-square below the best of the scan at which a hypothesis is not refitted."""
+
 LISTED = 400
-CHUNK = 512
 
 
-class Oracle:
-    """Every hypothesis about one case, linearised at the true launches.
+@dataclass(frozen=True)
+class Refitted:
+    """Every hypothesis about one case.
 
-    Args:
-        case, truth: both parts of it.
-        given: known causes.
+    Attributes:
+        problem: rows whitened by noise and distributed errors.
+        start: fit of the nuisances alone.
+        seen: the scan of its residual.
+        statistic: fall of chi-square within the largest fault, [hypothesis].
+        amount: of that fall, [hypothesis].
     """
 
-    def __init__(self, case: Case, truth: Truth, given: Sequence[Cause] = ()) -> None:
-        ring = ring_of(case.lattice)
-        data = of_measurement(ring, case.fit)
-        launches = truth.launches["fit"]
-        if case.reference is not None:
-            data = joined(of_measurement(ring, case.reference, reference=True), data)
-            launches = np.concatenate([truth.launches["reference"], launches])
-        self.data = _without_dead(data, truth, [m.name for m in ring.monitors])
-        self.launches = launches
-        # Distributed errors make an orbit of millimetres: a gradient kicks by that orbit, not by
-        # the design's. The oracle is linearised at the machine before the fault; its data are those
-        # of the linear model of the distributed errors.
-        small = draw_background(ring, truth.background, truth.seed)
-        set_there = {name for setting in data.settings for name in setting}
-        known, self.small = [], []  # in the ring for good, and with every reading
-        for cause in (*small, *given):
-            if find(cause.effect).acts_on_settings:
-                self.small += [cause] * (cause.element in set_there)
-            elif isinstance(find(cause.effect), RingEffect):
-                known.append(cause)
-            else:
-                self.small.append(cause)
-        self.model = Model(ring, data.settings, known=known)
-        self.paths = self.model.paths(launches, self.small)
-        spread = None
-        self.linear = np.zeros(self.paths.readings.shape)
-        if truth.background:
-            _, rms, spread = background_signatures(
-                self.model, self.paths, launches, truth.background
-            )
-            amounts = np.array([cause.amount for cause in small])
-            self.linear = np.einsum("h,hsrp->srp", amounts / rms, spread)
-        self.whitening = Whitening(self.data, spread)
-        self.projection = Projection(self.whitening.launch(self.paths.launch))
-        self.hypotheses = self.model.hypotheses(modelled(case.options.get("effects")))
-        self.rows = self._signatures()
-        self.norm = np.einsum("hr,hr->h", self.rows, self.rows)
-        self.cap = np.array([find(n).largest ** find(n).power for n, _ in self.hypotheses])
-        self.discrete = np.array([find(n).discrete for n, _ in self.hypotheses])
-        self.threshold = self._threshold()
+    problem: Problem
+    start: Fit
+    seen: Scan
+    statistic: Array
+    amount: Array
 
-    def residual(self, readings: Array) -> Array:
-        """Return whitened rows of the fit's readings, with those of a reference unchanged."""
-        whole = self.data.readings.copy()
-        whole[self.data.active] = np.nan_to_num(readings)
-        difference = np.where(self.data.valid, whole - self.paths.readings + self.linear, 0.0)
-        return self.projection.out(self.whitening.residual(difference, self.launches))
-
-    def statistics(self, clean: Array) -> tuple[Array, Array]:
-        """Return the fall of chi-square, and the best amount ** power within the largest fault."""
-        inner = self.rows @ clean
-        return _best(inner, self.norm, self.cap, self.discrete)
-
-    def refined(self, clean: Array) -> tuple[Array, Array]:
-        """Return the same, of the leading hypotheses by their finite changes."""
-        statistic, amount = self.statistics(clean)
-        base = self.model.readings(self.launches, self.small)
-        active = self.data.active[:, None, None]
-        for h in np.argsort(-statistic)[:REFINED]:
-            if statistic[h] <= 0 or self.discrete[h]:
-                continue
-            name, place = self.hypotheses[h]
-            power = find(name).power
-            for _ in range(2):
-                if amount[h] == 0 or (power == 2 and amount[h] < 0):
-                    break
-                size = amount[h] if power == 1 else np.sqrt(amount[h])
-                causes = [*self.small, Cause(name, place, float(size))]
-                change = (self.model.readings(self.launches, causes) - base) * active
-                row = self.whitening.signature(np.nan_to_num(change) / amount[h])
-                row = self.projection.out(row)
-                found = _best(
-                    np.array([row @ clean]),
-                    np.array([row @ row]),
-                    self.cap[h : h + 1],
-                    self.discrete[h : h + 1],
-                )
-                statistic[h], amount[h] = found[0][0], found[1][0]
-        return statistic, amount
-
-    def _signatures(self) -> Array:
-        rows = np.empty((len(self.hypotheses), self.whitening.rows))
-        active = self.data.active[:, None, None]
-        for start in range(0, len(rows), CHUNK):
-            some = self.hypotheses[start : start + CHUNK]
-            change = np.nan_to_num(self.model.signatures(self.paths, some, self.launches)) * active
-            rows[start : start + CHUNK] = self.projection.out(self.whitening.signature(change))
-        return rows
-
-    def _threshold(self) -> float:
-        """Statistic that noise reaches in 0.5 % of data sets, from its simulated tail."""
-        draws = np.random.default_rng([0, 7]).standard_normal((DRAWS, self.whitening.rows))
-        inner = self.rows @ self.projection.out(draws).T  # [hypothesis, draw]
-        largest = _best(inner.T, self.norm, self.cap, self.discrete)[0].max(axis=1)
-        return free_threshold(DEFAULT.false_alarm, 1, effective_number(largest, 1))
-
-
-def _best(
-    inner: Array, norm: Array, cap: Array, discrete: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    safe = np.where(norm > 1e-12, norm, np.inf)
-    amount = np.clip(inner / safe, -cap, cap)
-    amount = np.where(discrete, np.where(norm > 1e-12, 1.0, 0.0), amount)
-    return 2 * amount * inner - amount**2 * norm, amount
-
-
-def _without_dead(data: Data, truth: Truth, monitors: Sequence[str]) -> Data:
-    dropped = np.zeros(data.valid.shape, dtype=bool)
-    for cause in truth.causes:
-        if not find(cause.effect).modelled:
-            dropped[:, monitors.index(str(cause.element))] = True
-    return data.without(dropped)
+    @property
+    def left(self) -> float:
+        """Chi-square of the best hypothesis."""
+        return self.start.chi2 - float(self.statistic.max())
 
 
 def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
@@ -164,73 +66,110 @@ def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
     member of the catalogue, in sigma.
     """
     case, truth = argument
-    causes = truth.causes
-    if len(causes) > 1:
-        # a monitor without a signal is known as such
-        asked = [cause for cause in causes if find(cause.effect).modelled]
-        given = [tuple(c for c in causes if c is not cause) for cause in asked]
-        return {
-            "oracles": [_as_answer(Oracle(case, truth, others), case) for others in given],
-            "residual": None,
-        }
-    oracle = Oracle(case, truth)
+    # a monitor without a signal is known as such
+    asked = [cause for cause in truth.causes if find(cause.effect).modelled]
+    several = len(truth.causes) > 1
+    given = [[c for c in asked if c is not cause] for cause in asked] if several else [[]]
     left = None
     if truth.unknown is not None:
-        quiet = oracle.residual(truth.clean["fit"])
-        if case.reference is not None:  # with the reference's noise: only the change counts
-            quiet = quiet - oracle.residual(truth.clean["before"])
-        best = oracle.refined(quiet)[0].max()
-        left = float(np.sqrt(max(float(quiet @ quiet) - best, 0.0)))
-    return {"oracles": [_as_answer(oracle, case)], "residual": left}
+        clean = replace(case.fit, readings=truth.clean["fit"][:, None])
+        quiet = refitted(replace(case, parts={**case.parts, "fit": clean}), truth)
+        left = float(np.sqrt(max(quiet.left, 0.0)))
+    found = [refitted(case, truth, others) for others in given]
+    return {"oracles": [_as_answer(one) for one in found], "residual": left}
 
 
-def _as_answer(oracle: Oracle, case: Case) -> dict[str, Any]:
-    clean = oracle.residual(case.fit.in_order_of(oracle.model.maps.monitors).readings[:, 0])
-    statistic, amount = oracle.refined(clean)
-    root = np.array([1 / find(name).power for name, _ in oracle.hypotheses])
-    return answer(
-        oracle.hypotheses,
-        statistic,
-        np.sign(amount) * np.abs(amount) ** root,
-        np.array(_priors(oracle.hypotheses)),
-        oracle.threshold,
-    )
-
-
-def answer(
-    hypotheses: Sequence[Hypothesis],
-    statistic: Array,
-    amount: Array,
-    prior: Array,
-    threshold: float,
-) -> dict[str, Any]:
-    """Return the oracle's answer from its hypotheses, as JSON.
+def refitted(case: Case, truth: Truth, given: Sequence[Cause] = ()) -> Refitted:
+    """Return the hypotheses about a case, the leading ones refitted.
 
     Args:
-        hypotheses: all hypotheses.
-        statistic, amount, prior: fall of chi-square, best amount, log prior probability of each,
-            [hypothesis].
-        threshold: of the largest statistic.
+        case, truth: both parts of it.
+        given: known causes.
     """
-    weight = statistic / 2 + prior
+    problem = problem_of_case(_without_dead(case, truth), truth.background, given)
+    start = fit(problem, (), problem.first)
+    hypotheses = hypotheses_of(case, problem)
+    seen = scan(problem.metric(start.point), hypotheses, start.residual)
+    reach = np.array([find(n).largest ** find(n).power for n, _ in hypotheses])
+    one_sign = np.array([find(n).one_sign for n, _ in hypotheses])
+    amount = np.clip(seen.amount, np.where(one_sign, 0.0, -reach), reach)
+    discrete = np.array([find(n).discrete for n, _ in hypotheses])
+    inner = seen.amount * seen.information
+    amount = np.where(discrete & (seen.information > 0), 1.0, amount)
+    statistic = 2 * amount * inner - amount**2 * seen.information
+    power = np.array([find(n).power for n, _ in hypotheses])
+    amount = np.sign(amount) * np.abs(amount) ** (1 / power)
+    # the linear scan errs by a share of the statistic itself where an effect is strong
+    behind = MAX_BEHIND + DEFAULT.drift * float(seen.statistic.max())
+    order = np.argsort(-seen.statistic)[:REFINED]
+    order = order[seen.statistic[order] > seen.statistic.max() - behind]
+    everywhere = [h for h, (n, place) in enumerate(hypotheses) if place is None and find(n).curved]
+    for h in dict.fromkeys((*order.tolist(), *everywhere)):
+        name, place = hypotheses[h]
+        whole = find(name).whole or h in everywhere
+        if discrete[h] or not (amount[h] or whole):
+            continue
+        guess = Cause(name, place, float(amount[h]))
+        if whole:
+            guess = best_start(problem, start, hypotheses[h])
+        again = fit(problem, [guess], start.nuisances)
+        least = 0.0 if one_sign[h] else -find(name).largest
+        if again.good and least <= again.causes[0].amount <= find(name).largest:
+            statistic[h] = start.chi2 - again.chi2
+            amount[h] = again.causes[0].amount
+    return Refitted(problem, start, seen, statistic, amount)
+
+
+def hypotheses_of(case: Case, problem: Problem) -> list[Hypothesis]:
+    """Return every effect at every place that a case's diagnosis may name."""
+    ring = ring_of(case.lattice)
+    names = modelled(case.options.get("effects"), turns=bool(case.kinds))
+    if case.before and "effects" not in case.options:
+        names = list(dict.fromkeys([*names, *(name for some in CHANGES for name in some)]))
+    return [
+        (name, place) for name in names
+        for place in find(name).places(ring) if problem.sees((name, place))
+    ]  # fmt: skip
+
+
+def dead_monitors(case: Case, truth: Truth) -> list[int]:
+    """Return the monitors without a signal."""
+    monitors = [monitor.name for monitor in ring_of(case.lattice).monitors]
+    causes = [cause for cause in truth.causes if not find(cause.effect).modelled]
+    return [monitors.index(str(cause.element)) for cause in causes]
+
+
+def _without_dead(case: Case, truth: Truth) -> Case:
+    dead = dead_monitors(case, truth)
+    if not dead:
+        return case
+    readings = case.fit.readings.copy()
+    readings[:, :, dead] = np.nan
+    return replace(case, parts={**case.parts, "fit": replace(case.fit, readings=readings)})
+
+
+def _as_answer(found: Refitted) -> dict[str, Any]:
+    """The oracle's answer as JSON."""
+    hypotheses, statistic = found.seen.hypotheses, found.statistic
+    weight = statistic / 2 + np.array([found.problem.prior(h) for h in hypotheses])
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
-    by_weight = np.argsort(-weight)[:LISTED]
-    by_likelihood = np.argsort(-statistic)[:LISTED]
+    by_likelihood, by_weight = (np.argsort(-own)[:LISTED] for own in (statistic, weight))
 
-    def listed(some: NDArray[np.intp]) -> list[dict[str, Any]]:
+    def listed(some: NDArray[np.intp]) -> list[Mapping[str, Any]]:
         return [
             {
                 "effect": hypotheses[h][0],
                 "element": hypotheses[h][1],
                 "statistic": float(statistic[h]),
-                "amount": float(amount[h]),
+                "amount": float(found.amount[h]),
                 "probability": float(weight[h]),
             }
             for h in some
         ]
 
     top = float(statistic.max())
+    threshold = found.seen.threshold(DEFAULT.false_alarm)
     return {
         "statistic": top,
         "threshold": threshold,
@@ -239,11 +178,3 @@ def answer(
         "class": listed(by_likelihood[statistic[by_likelihood] > top - CLASS]),
         "posterior": listed(by_weight),
     }
-
-
-def _priors(hypotheses: Sequence[Hypothesis]) -> list[float]:
-    """Log prior probabilities: effects are drawn uniformly, then places."""
-    count: dict[str, int] = {}
-    for name, _ in hypotheses:
-        count[name] = count.get(name, 0) + 1
-    return [-float(np.log(len(count) * count[name])) for name, _ in hypotheses]

@@ -114,9 +114,9 @@ def one_action(result: Mapping[str, Any], cause: Cause, ring: Ring) -> bool | No
         return None
     if result["verdict"] != "identified" or len(result["findings"]) != 1:
         return False
-    told, true = result["findings"][0]["recommended_action"], leading(ring, cause)
-    places = (pieces_of(ring, name) for name in (told["element"], true.element))
-    return told["effect"] == true.effect and next(places) == next(places)
+    found, true = result["findings"][0]["recommended_action"], leading(ring, cause)
+    places = (pieces_of(ring, name) for name in (found["element"], true.element))
+    return found["effect"] == true.effect and next(places) == next(places)
 
 
 def oracle_one_action(evaluated: Mapping[str, Any], cause: Cause, ring: Ring) -> bool:
@@ -124,8 +124,10 @@ def oracle_one_action(evaluated: Mapping[str, Any], cause: Cause, ring: Ring) ->
     (oracle,) = evaluated["oracles"]
     members = [m for m in oracle["posterior"] if m["probability"]]
     causes = [Cause(m["effect"], m["element"], m["amount"]) for m in members]
-    told = recommended_actions(ring, causes, [m["probability"] for m in members])
-    first = max(told, key=lambda recommended_action: recommended_action.probability, default=None)
+    actions = recommended_actions(ring, causes, [m["probability"] for m in members])
+    first = max(
+        actions, key=lambda recommended_action: recommended_action.probability, default=None
+    )
     if not oracle["detected"] or first is None or first.probability < DEFAULT.mass:
         return False
     true = leading(ring, cause)

@@ -26,8 +26,7 @@ from tmlattice.challenge.case import (
     trusted_case,
 )
 from tmlattice.challenge.figures import ALONE, Row, summary
-from tmlattice.challenge.ideal import evaluate_kinds, plain_kinds
-from tmlattice.challenge.oracle import evaluate
+from tmlattice.challenge.oracle import dead_monitors, evaluate
 from tmlattice.challenge.record import (
     ALIASED,
     REFUSED,
@@ -140,17 +139,15 @@ def _others(
     where: Mapping[str, Any],
 ) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
     """Oracle and simple methods, by case."""
-    of_kinds = bool(described.get("kinds"))
 
     def load(name: str) -> Callable[[], tuple[Case, Truth]]:
         return lambda: (trusted_case(folder, name, lattice), truths[name])
 
-    ideal, plain_ones = (evaluate_kinds, plain_kinds) if of_kinds else (evaluate, baselines)
-    evaluated = run_batch(ideal, {n: load(n) for n in truths}, folder / "oracle", **where)
+    evaluated = run_batch(evaluate, {n: load(n) for n in truths}, folder / "oracle", **where)
     if described["tier"] == "E":  # they always find something
         return evaluated, {}
     cases = {n: partial(trusted_case, folder, n, lattice) for n in truths}
-    return evaluated, run_batch(plain_ones, cases, folder / "baselines", **where)
+    return evaluated, run_batch(baselines, cases, folder / "baselines", **where)
 
 
 # --- a case ---------------------------------------------------------------------------------------
@@ -284,10 +281,7 @@ def clean_gap(
     data = of_measurement(ring, case.heldout)
     clean = np.nan_to_num(truth.clean["heldout"])
     dropped = np.zeros(data.valid.shape, dtype=bool)
-    monitors = [monitor.name for monitor in ring.monitors]
-    for cause in truth.causes:
-        if not find(cause.effect).modelled:
-            dropped[:, monitors.index(str(cause.element))] = True
+    dropped[:, dead_monitors(case, truth)] = True
     data = type(data)(**{**vars(data), "readings": clean}).without(dropped)
     design = FirstTurns(model=Model(ring, data.settings), data=data, places={})
     found = replace(design, fixed=tuple(causes))

@@ -162,14 +162,13 @@ def _sources(estimated: Path, design: str | None) -> tuple[Path, str | None]:
 
 
 def _devices(knobs: str | None, settings: "Ring", targets: dict[str, float | None]) -> list[Any]:
-    from tmlattice.correction.knobs import default_knobs, kinds_for, read_knobs
+    from tmlattice.correction.knobs import chosen_knobs
     from tmlattice.correction.targets import OPTICS
 
     machine = machine_file()
-    if knobs is None and machine is not None and (own := machine.knobs(settings)) is not None:
-        return own
-    if knobs is None:
-        return default_knobs(settings, kinds_for(targets or OPTICS))
-    if Path(knobs).suffix:
-        return read_knobs(Path(knobs), settings)
-    return default_knobs(settings, [kind.strip() for kind in knobs.split(",")])
+    own: Any = knobs
+    if knobs is None and machine is not None:
+        own = machine.knobs(settings)
+    elif knobs and not Path(knobs).suffix:
+        own = [kind.strip() for kind in knobs.split(",")]
+    return chosen_knobs(own, settings, targets or OPTICS)

@@ -137,7 +137,9 @@ def diagnose(
     an orbit response alone has a step for each family of errors; options about launches do not
     apply to it.
     """
-    with outputs(out, json_file) as (folder, write):
+    from tmlattice.correction.result import FILES
+
+    with outputs(out, json_file, FILES) as (folder, write):
         from tmlattice.correction.applied import applied, read_settings
         from tmlattice.correction.applied import sentence as of_device
         from tmlattice.effects import background_rms, names
@@ -147,11 +149,11 @@ def diagnose(
         background_rms(dict(background))
         if settings_file and not references:
             raise click.UsageError("--settings needs the measurement from before: --reference")
-        asked = read_settings(settings_file) if settings_file else {}
         from tmlattice.diagnosis import diagnose as run
         from tmlattice.measurement import Measurement, OrbitResponse
 
         ring = open_ring(lattice)
+        asked = read_settings(settings_file, ring) if settings_file else []
         (data, said), (before, _) = (_read(p, ring) for p in (measurements, references))
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more
@@ -213,7 +215,7 @@ def diagnose(
             tell("figures")
             write_files(result, folder, document, correction)
         write(document)
-        written = _write_rings(result, known, lattice_out, corrected_out)
+        written = _save_rings(result, known, lattice_out, corrected_out)
         if folder and reading:
             _write_weights(reading, folder)
     _print(result, correction, out, json_file, written)
@@ -290,7 +292,7 @@ def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Corr
     return None if found.refused else found
 
 
-def _write_rings(
+def _save_rings(
     result: "Diagnosis",
     known: "DistributedErrors | None",
     lattice_out: Path | None,
@@ -299,7 +301,7 @@ def _write_rings(
     """The estimated ring and the corrected ring: the files, with what they do not hold."""
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
     from tmlattice.files import output_file, write_json
-    from tmlattice.lattice import write_ring
+    from tmlattice.lattice import save_ring
     from tmlattice.observe.calibration import write_calibration
     from tmlattice.report.action_texts import by_hand_text
 
@@ -307,7 +309,7 @@ def _write_rings(
     if lattice_out:
         ring = result.as_found
         ring = ring if known is None else replace(ring, model=ESTIMATED)
-        written[str(lattice_out)] = write_ring(ring, lattice_out)
+        written[str(lattice_out)] = save_ring(ring, lattice_out)
         beside = calibration_beside(lattice_out)
         if result.calibration or result.by_steps:
             amounts = zip(result.causes, result.errors, strict=True)
@@ -326,7 +328,7 @@ def _write_rings(
             written[str(beside)] = ()
     if corrected_out:
         ring, by_hand = result.repair()
-        told = write_ring(ring, corrected_out)
+        told = save_ring(ring, corrected_out)
         more = by_hand_text(result.ring, by_hand)
         written[str(corrected_out)] = (*told, more) if more else told
     return written
@@ -344,7 +346,7 @@ def _check_out(ring: "Ring", option: str, path: Path) -> None:
     from tempfile import TemporaryDirectory
 
     from tmlattice.files import check_writable
-    from tmlattice.lattice import write_ring
+    from tmlattice.lattice import save_ring
     from tmlattice.lattice.write import SUFFIXES, knows
 
     if not knows(path):
@@ -352,7 +354,7 @@ def _check_out(ring: "Ring", option: str, path: Path) -> None:
     for file in (path, calibration_beside(path)):
         check_writable(file)
     with TemporaryDirectory() as folder:
-        write_ring(ring, Path(folder) / path.name)
+        save_ring(ring, Path(folder) / path.name)
 
 
 def calibration_beside(lattice: Path) -> Path:

@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -394,17 +394,18 @@ json_option = click.option(
 
 @contextmanager
 def outputs(
-    folder: Path | None, json_file: Path | None
+    folder: Path | None, json_file: Path | None, replaced: Collection[str] = ()
 ) -> Iterator[tuple[Path | None, Callable[[Any], None]]]:
     """What a command writes: all of it when it ends well, else nothing.
 
     Yields the folder that is filled (None: none was asked for), and the function that writes the
-    result as JSON, where that was asked for.
+    result as JSON, where that was asked for. Older files of the folder with names of `replaced` are
+    removed if they are not written again.
     """
     from tmlattice.files import output_file, output_folder, write_json
 
     with ExitStack() as files:
-        made = files.enter_context(output_folder(folder)) if folder else None
+        made = files.enter_context(output_folder(folder, replaced)) if folder else None
         path = files.enter_context(output_file(json_file)) if json_file else None
         yield made, lambda result: write_json(path, result) if path else None
 

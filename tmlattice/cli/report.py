@@ -15,17 +15,14 @@ from tmlattice.cli.options import FILE, Careful, console
 def report(result: Path, out: Path | None) -> None:
     """Render report.html and report.txt again from the diagnosis.json of FOLDER.
 
-    FOLDER is that of `tmlattice diagnose --out`, or a diagnosis.json. Figures of the readings and
-    of the scan are those that FOLDER holds, since diagnosis.json does not hold what they show.
+    FOLDER is that of `tmlattice diagnose --out` or `tmlattice correct --out`, or a diagnosis.json
+    or correction.json. Figures of the readings and of the scan are those that FOLDER holds, since
+    diagnosis.json does not hold what they show.
     """
-    from tmlattice.report.plain import report_text
     from tmlattice.report.speaking import render
 
     found = render(result, out)
     screen = console()
-    screen.print(report_text(found), soft_wrap=True)
-    folder = result if result.is_dir() else result.parent
-    if (folder / "correction.json").is_file():
-        screen.print("\nThe correction is not in the new page: see correction.txt.")
-    place = out or folder
-    screen.print(f"\nwritten: {place / 'report.html'}, {place / 'report.txt'}")
+    screen.print(found.report(), soft_wrap=True)
+    place = out or (result if result.is_dir() else result.parent)
+    screen.print(f"\nwritten: {place / 'report.html'}")

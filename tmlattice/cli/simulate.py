@@ -26,7 +26,7 @@ SHOTS = frozenset({"shots", "settings"})
 KINDS: Mapping[str, frozenset[str]] = {
     "trajectory": SHOTS | {"turns", "amplitude", "radiation", "engine", "jobs"},
     "orbit-response": frozenset({"correctors", "engine"}),
-    "turn-by-turn": SHOTS | {"turns", "amplitude", "radiation", "particles"},
+    "turn-by-turn": SHOTS | {"turns", "amplitude", "radiation", "engine", "particles"},
     "closed-orbit": SHOTS | {"radiation"},
     "dispersion": frozenset(),
     "tunes": SHOTS,
@@ -94,9 +94,10 @@ CAUSE = Word(
 )
 @click.option(
     "--engine",
-    type=click.Choice(["at", "ocelot"]),
+    type=click.Choice(["at", "ocelot", "network"]),
     default="at",
-    help="Thick symplectic tracking, or second-order maps.",
+    help="Thick symplectic tracking, or second-order maps: ocelot, and for many particles of a "
+    "stored beam network, on a graphics card where there is one.",
 )
 @click.option("--radiation", is_flag=True, help="Bends and wigglers radiate.")
 @click.option(
@@ -224,7 +225,8 @@ def _run(kind: str, ring: Any, causes: list[Any], options: dict[str, Any]) -> tu
         shots, turns = made.measured.readings.shape[:2]
         return made, (
             f"{shots} shots of {turns} turns of a stored beam, {monitors}, "
-            f"{1e3 * options['amplitude']:g} mm rms, {options['particles']} particle(s), engine at"
+            f"{1e3 * options['amplitude']:g} mm rms, {options['particles']} particle(s), "
+            f"engine {options['engine']}"
         )
     if kind == "closed-orbit":
         made = stored_beam.simulate_orbits(ring, causes, **options)

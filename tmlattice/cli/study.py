@@ -14,8 +14,6 @@ from tmlattice.cli.options import (
     epochs_option,
     is_quiet,
     jobs_option,
-    json_option,
-    outputs,
     require,
     table,
 )
@@ -112,78 +110,6 @@ def tune_fit(
         write_json(own, summary)
     _draw(lattice, cases, out)
     _print(summary)
-
-
-@study.command("localisation", cls=Careful)
-@click.argument("lattice", default="petra3")
-@click.option(
-    "--cases",
-    type=click.IntRange(1),
-    default=40,
-    help="Faults, at random.",
-)
-@click.option(
-    "--signal-to-noise",
-    type=click.FloatRange(0, min_open=True),
-    multiple=True,
-    default=(20.0,),
-    help="Norm of the change of all readings over the noise, launch fitted; repeat for several.",
-)
-@click.option(
-    "--shots",
-    type=click.IntRange(1),
-    multiple=True,
-    default=(1, 4),
-    help="Of a measurement; repeat for several.",
-)
-@epochs_option
-@json_option
-def localisation(
-    lattice: str,
-    json_file: Path | None,
-    **options: Any,
-) -> None:
-    """The place of a gradient fault, as a network's raw and its normalised weights name it."""
-    from tmlattice import __version__
-    from tmlattice.challenge.localisation import study_localisation, summarise
-
-    with outputs(None, json_file) as (_, write):
-        ring = checked_ring(lattice, {})
-        cases = list(study_localisation(ring, progress=not is_quiet(), **options))
-        rows = summarise(cases)
-        write({
-            "format": "tmlattice-study-localisation",
-            "version": 1,
-            "package": __version__,
-            "lattice": lattice,
-            "options": options,
-            "summary": rows,
-            "results": [vars(case) for case in cases],
-        })  # fmt: skip
-    _print_localisation(rows)
-
-
-def _print_localisation(rows: list[dict[str, Any]]) -> None:
-    screen = console()
-    for row in rows:
-        names = table(
-            f"signal to noise {row['signal_to_noise']:g}, {row['shots']} shots, "
-            f"{row['cases']} faults",
-            "element", "within one monitor gap", "median gaps off",
-        )  # fmt: skip
-        for name, found in row["rankings"].items():
-            names.add_row(
-                name,
-                f"{found['element']:.0%}",
-                f"{found['within_one_gap']:.0%}",
-                f"{found['median_gaps']:g}",
-            )
-        screen.print(names)
-        screen.print(
-            f"chi-square a reading {row['chi2_before']:.3f} before fine-tuning, "
-            f"{row['chi2_after']:.3f} after; seconds: fine-tuning "
-            f"{row['seconds_fine_tuning']:.1f}, reading {row['seconds_reading']:.1f}"
-        )
 
 
 def _draw(lattice: str, cases: list[Any], out: Path) -> None:

@@ -13,17 +13,18 @@ import numpy as np
 
 from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
 from tmlattice.correction.first_turn import Threading
-from tmlattice.correction.knobs import Knob, default_knobs, kinds_for, read_knobs
+from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_knobs
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.solve import (
-    MAX_EXCESS,
+    COUNTS,
+    SIGMAS,
     Point,
     Problem,
-    by_gain,
     drawn,
     fewest,
+    nearly,
     optimised,
-    rounded,
+    shortened,
 )
 from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
@@ -36,19 +37,15 @@ Array = np.ndarray
 
 DRAWS = 200
 """Draws from the posterior: the ends of an interval scatter by a tenth of its half width."""
-COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
-"""Numbers of knobs with a stated gain."""
 INTERVAL = (50.0, 15.87, 84.13)
 """Percentiles: the median and the central 68.27 %."""
-SIGMAS = 3.0
-"""Standard deviations by which tunes stay clear of integers and half integers."""
 
 
 def correct(
     diagnosis: Diagnosis | Estimate | Ring | Any,
     *,
     goal: Ring | Any | None = None,
-    knobs: Sequence[Knob] | Iterable[str] | str | Path | None = None,
+    knobs: Sequence[Knob | str] | str | Path | None = None,
     targets: Iterable[str] | Mapping[str, float | None] | None = None,
     seed: int = 0,
     progress: Callable[[str], Any] = lambda stage: None,
@@ -88,7 +85,7 @@ def correct(
         )
     else:
         compared = Targets(wanted, chosen)
-    devices = _knobs(knobs, estimate.settings, compared.names)
+    devices = chosen_knobs(knobs, estimate.settings, compared.names)
     progress("correction")
     problem = drawn(estimate, devices, compared, DRAWS, seed)
     try:
@@ -97,10 +94,12 @@ def correct(
         raise UnstableRingError(f"the estimated ring stores no beam: {error}") from error
     if not begin.slopes.any():
         raise TmlatticeError("no knob changes a target; name others (--knobs, --target)")
-    end, order = _corrected(problem, begin)
-    found = _fields(begin, end, order)
+    whole, order = _corrected(problem, begin)
+    end, share = shortened(begin, whole)
+    found = _fields(begin, whole, end, share, order)
     seconds = time.perf_counter() - begun
-    made = {"seed": seed, "draws": DRAWS, "knobs": len(devices), "seconds": seconds}
+    made = {"lattice": estimate.settings.name, "seed": seed, "draws": DRAWS,
+            "knobs": len(devices), "seconds": seconds}  # fmt: skip
     return Correction(**found, ring=estimate.settings, provenance=made)
 
 
@@ -114,61 +113,41 @@ def _estimate(diagnosis: Diagnosis | Estimate | Any, goal: Ring | None) -> Estim
     return estimate_with(load_ring(diagnosis), goal, None)
 
 
-def _knobs(
-    knobs: Sequence[Knob] | Iterable[str] | str | Path | None,
-    settings: Ring,
-    names: Sequence[str],
-) -> list[Knob]:
-    if knobs is None:
-        return default_knobs(settings, kinds_for(names))
-    if isinstance(knobs, str | Path):
-        return read_knobs(Path(knobs), settings)
-    some = list(knobs)
-    devices = [own for own in some if isinstance(own, Knob)]
-    kinds = [own for own in some if isinstance(own, str)]
-    return devices + (default_knobs(settings, kinds) if kinds else [])
-
-
 def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
     """Where the correction ends, and its knobs by falling gain."""
     every = np.arange(len(problem.knobs))
     whole = optimised(problem, begin, every)
-    order = by_gain(whole)
-    counts = [n for n in COUNTS if n < len(order)] + [len(order)]
-    number = fewest(whole, order, counts)
-    if number < len(order):
-        chosen = np.array(order[:number], dtype=np.int64)
-        goal, _ = whole.step(chosen)
-        end = optimised(problem, problem.better(goal, begin.square) or begin, chosen)
-        if end.square <= (1 + 2 * MAX_EXCESS) * whole.square:
-            return rounded(problem, end), order[:number]
-    return rounded(problem, whole), order  # or not as linear as that
+    order = fewest(whole, whole.step(every)[1])
+    if len(order) == len(every):
+        return whole, order
+    chosen = np.array(order, dtype=np.int64)
+    goal, _ = whole.step(chosen)
+    end = optimised(problem, problem.better(goal, begin.square) or begin, chosen)
+    if nearly(end.square, whole.square):
+        return end, order
+    return whole, [*whole.by_gain()]  # or not as linear as that
 
 
-def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
-    """Fields of the result."""
+def _fields(
+    begin: Point, whole: Point, end: Point, share: float, order: Sequence[int]
+) -> dict[str, Any]:
+    """Fields of the result: the whole correction, and a share of it where all ends."""
     problem, targets = end.problem, end.problem.targets
-    rows = targets.rows(begin.open)
-    change = 2 * rows @ (begin.rows - end.rows)
-    gained = begin.square - end.square
-    error = float(np.std(change))
-    whole = max(begin.square + float(np.mean(np.sum(rows**2, axis=1))), 1e-30)
-    refused = _refusal(begin, gained, error)
-    if refused:
-        end = begin
-    before, after = (_intervals(point) for point in (begin, end))
-    squares, gains = [begin.square], []
-    for n in range(1, len(order) + 1 if not refused else 1):
-        amounts, square = end.step(np.array(order[:n], dtype=np.int64))
-        squares.append(square)
-        if n in COUNTS or n == len(order):
-            gains.append((n, _expected(amounts, end)))
-    shares = -np.diff(squares) / max(begin.square - min(squares), 1e-30)
+    now, then = (
+        np.sum((p.rows + targets.rows(p.open)) ** 2, axis=-1)
+        for p in (begin, end if share else whole)
+    )
+    square = max(float(now.mean()), 1e-30)
+    gain = (now - then) / square
+    refused = "" if share else _refusal(float(gain.mean()), float(gain.std()))
+    order = order if share else []
+    gains = end.gains(np.array(order, dtype=np.int64))
+    gains /= max(float(gains.sum()), 1e-30)
     settings = [
-        Setting(knob, amount, knob.setting(amount), share)
-        for knob, amount, share in zip(
-            (problem.knobs[k] for k in order), end.amounts[order].tolist(), shares.tolist(),
-            strict=False,
+        Setting(knob, amount, knob.setting(amount), own)
+        for knob, amount, own in zip(
+            (problem.knobs[k] for k in order), end.amounts[order].tolist(), gains.tolist(),
+            strict=True,
         )
         if amount
     ]  # fmt: skip
@@ -179,41 +158,44 @@ def _fields(begin: Point, end: Point, order: Sequence[int]) -> dict[str, Any]:
     }
     shown = targets.names[0] if "beta_beating" not in end.errors else "beta_beating"
     profile = tuple(
-        np.moveaxis(np.percentile(p.errors[shown] + p.open[shown], INTERVAL, axis=0), 0, -1)
+        np.moveaxis(
+            np.percentile(p.errors[shown] + p.open[shown], INTERVAL, axis=0), 0, -1
+        ).tolist()
         for p in (begin, end)
     )
     tunes = {}
     if isinstance(targets, Targets):
-        tunes = {"goal": targets.goal.tunes, "now": begin.shown.values.tunes,
-                 "expected": end.shown.values.tunes}  # fmt: skip
+        tunes = {"goal": targets.goal["tunes"], "now": begin.shown.values["tunes"],
+                 "expected": end.shown.values["tunes"]}  # fmt: skip
     return {
         "settings": tuple(settings),
         "refused": refused,
-        "before": before,
-        "after": after,
+        "before": _intervals(begin),
+        "after": _intervals(end),
         "stays": stays,
-        "gains": tuple(gains),
-        "gain": gained / whole,
-        "gain_error": error / whole,
+        "gains": tuple(
+            (n, _expected(share * end.step(np.array(order[:n]))[0], end))
+            for n in sorted({*COUNTS, len(order)}) if 0 < n <= len(order)
+        ),
+        "gain": float(gain.mean()),
+        "gain_error": float(gain.std()),
         "tunes": {name: _pair(value % 1.0) for name, value in tunes.items()},
         "shown": shown,
         "profile": profile,
-        "s": targets.s,
-        "counted": targets.tolerance,
-        "iterations": _iterations(end),
-        "warnings": tuple(_warnings(end, settings)),
-    }
+        "s": tuple(targets.s.tolist()),
+        "targets": targets.tolerance,
+        "iterations": _iterations(end, share),
+        "warnings": tuple(_warnings(end, share, settings)),
+    }  # fmt: skip
 
 
-def _refusal(begin: Point, gained: float, error: float) -> str:
+def _refusal(gain: float, error: float) -> str:
     """Why nothing is changed."""
-    if gained > error:
-        return ""
-    if gained <= 0:
+    if gain <= 0:
         return "No setting is changed: these knobs do not bring the ring closer to the goal."
     return (
-        f"No setting is changed: the expected gain, {gained:.2g} of {begin.square:.2g} in units of "
-        f"the tolerances, is below its error of {error:.2g}."
+        f"No setting is changed: the expected gain, {100 * gain:.2g} ± {100 * error:.2g} % of the "
+        "squared errors, is too uncertain. Measure more, or name fewer targets (--target)."
     )
 
 
@@ -238,19 +220,24 @@ def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _iterations(end: Point) -> int:
-    """One, and another one where most of what stays comes from errors of the knobs' changes, which
-    a second measurement shows."""
-    return 2 if float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
+def _iterations(end: Point, share: float) -> int:
+    """One, and another one after a share of the changes, or where most of what stays comes from
+    errors of the knobs' changes, which a second measurement shows."""
+    return 2 if share < 1 or float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
 
 
-def _warnings(end: Point, settings: Sequence[Setting]) -> Iterable[str]:
+def _warnings(end: Point, share: float, settings: Sequence[Setting]) -> Iterable[str]:
+    if 0 < share < 1:
+        yield (
+            f"the settings are {100 * share:.0f} % of the most probable correction, since larger "
+            "ones may make the ring worse; measure again, and correct the rest"
+        )
     held = [setting.knob.name for setting in settings if setting.at_limit]
     if held:
         yield f"held by their limits: {', '.join(held)}"
     if "tunes" not in end.errors:
         return
-    tunes = end.shown.values.tunes + end.open["tunes"][:, 0]
+    tunes = end.shown.values["tunes"] + end.open["tunes"][:, 0]
     mean, sigma = tunes.mean(axis=0), tunes.std(axis=0)
     for plane, (q, s) in enumerate(zip(mean, sigma, strict=True)):
         near = abs(2 * q - round(2 * q)) / 2

@@ -1,6 +1,6 @@
 """Effect of applied settings: each knob's calibration, from a change between two measurements.
 
->>> for own in applied(diagnosis, read_settings(Path("settings.csv"))):
+>>> for own in applied(diagnosis, read_settings(Path("settings.csv"), ring)):
 ...     print(own.device, own.ratio, own.ratio_error)
 """
 
@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tmlattice.correction.knobs import KINDS, Knob, default_knobs
+from tmlattice.correction.knobs import KINDS, Knob, knobs_of
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import MeasurementError, plain
 from tmlattice.input_files import text_of
+from tmlattice.lattice import Ring
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,9 @@ class Applied:
 
     Attributes:
         device: its name.
-        asked: relative change of its strength, or the change (1/m).
-        found, error: of the measured change, the mean of its members.
+        asked: relative change of its strength, or the change (1/m, rad).
+        found, error: of the measured change, the mean of its members; 0 and infinite if the
+            diagnosis does not determine it.
     """
 
     device: str
@@ -44,42 +46,42 @@ class Applied:
         return abs(self.error / self.asked)
 
 
-def read_settings(path: Path) -> dict[str, tuple[float, float]]:
-    """Return present and new setting by device, from the settings.csv of a correction.
+def read_settings(path: Path, ring: Ring) -> list[tuple[Knob, float]]:
+    """Return devices and their new settings, from the settings.csv of a correction.
+
+    Args:
+        path: of the table.
+        ring: whose strengths are the present settings.
 
     Raises:
-        MeasurementError: a table that cannot be read.
+        MeasurementError, UnknownNameError: a table that cannot be read, or a device that the ring
+            does not have.
     """
-    found: dict[str, tuple[float, float]] = {}
+    rows, new = [], []
     for row in csv.DictReader(text_of(path, MeasurementError).splitlines()):
         try:
-            device, *numbers = row["device"], float(row["present"]), float(row["new"])
-            if device in found:
-                raise MeasurementError(f"{path}: the device '{plain(device, 40)}' occurs twice")
-            if not all(map(math.isfinite, numbers)):
+            new.append(float(row.pop("new")))
+            if not math.isfinite(new[-1]):
                 raise ValueError
-            found[device] = numbers[0], numbers[1]
+            rows.append({"knob": row.pop("device"), "present": float(row.pop("present"))} | row)
         except (KeyError, TypeError, ValueError):
             raise MeasurementError(
                 f"{path}: a row has no device, present or new; give the settings.csv of a "
                 f"correction (found: {plain(str(row), 80)})"
             ) from None
-    if not found:
+        for derived in ("change", "gain"):
+            rows[-1].pop(derived, None)
+    if not rows:
         raise MeasurementError(f"{path}: it contains no setting")
-    return found
+    return list(zip(knobs_of(rows, path, ring), new, strict=True))
 
 
-def applied(
-    diagnosis: Diagnosis,
-    settings: dict[str, tuple[float, float]],
-    knobs: Sequence[Knob] | None = None,
-) -> list[Applied]:
-    """Return requested and measured changes of the devices that a change since a reference shows.
+def applied(diagnosis: Diagnosis, settings: Sequence[tuple[Knob, float]]) -> list[Applied]:
+    """Return requested and measured changes of devices that were set since a reference.
 
     Args:
         diagnosis: of the measurement after, with the one before as its reference.
-        settings: present and new by device, see `read_settings`.
-        knobs: those of the correction; None: those of the lattice.
+        settings: devices and their new settings, see `read_settings`.
 
     Raises:
         MeasurementError: a diagnosis without a reference.
@@ -88,34 +90,31 @@ def applied(
         raise MeasurementError(
             "settings are compared with a change: give the measurement before as --reference"
         )
-    kinds = ("supplies", "quadrupoles", "skew_quadrupoles", "sextupoles")
-    every = default_knobs(diagnosis.ring, kinds) if knobs is None else knobs
-    named = {knob.name: knob for knob in reversed(every)}
     amounts = {
         (c.effect, (c.element or "").casefold()): (c.amount, s) for c, s, _ in diagnosis.supported
     }
     found = []
-    for device, (present, new) in settings.items():
-        knob = named.get(device)
-        if knob is None or KINDS[knob.kind].effect is None or new == present:
+    for knob, new in settings:
+        if new == knob.present:
             continue
-        proportional = KINDS[knob.kind].relative and not knob.curve
-        asked = new / present - 1 if proportional else knob.amount(new)
         family = {"quadrupole": "family_gradient", "sextupole": "family_sextupole"}.get(knob.kind)
-        shared, sigma = amounts.get((str(family), device.casefold()), (0.0, 0.0))
-        effect = str(KINDS[knob.kind].effect)
-        members = [(effect, member.casefold()) for member in knob.members]
+        shared, sigma = amounts.get((str(family), knob.name.casefold()), (0.0, 0.0))
+        members = [(str(KINDS[knob.kind].effect), member.casefold()) for member in knob.members]
         own = [amounts[key] for key in members if key in amounts]
+        mean, error = shared, math.inf
         if sigma or own:
-            mean = sum(amount for amount, _ in own) / len(knob.members)
+            mean += sum(amount for amount, _ in own) / len(knob.members)
             error = float(np.hypot(sigma, np.linalg.norm([s for _, s in own]) / len(knob.members)))
-            found.append(Applied(device, asked, shared + mean, error))
+        found.append(Applied(knob.name, knob.amount(new), mean, error))
     return found
 
 
 def sentence(own: Applied) -> str:
     """Return a sentence on one device."""
+    asked = f"{own.device}: requested {100 * own.asked:+.3g} %, measured"
+    if math.isinf(own.error):
+        return f"{asked} nothing: this change does not determine it"
     return (
-        f"{own.device}: requested {100 * own.asked:+.3g} %, measured {100 * own.found:+.3g} ± "
-        f"{100 * own.error:.2g} %, calibration {own.ratio:.3g} ± {own.ratio_error:.2g}"
+        f"{asked} {100 * own.found:+.3g} ± {100 * own.error:.2g} %, calibration {own.ratio:.3g} ± "
+        f"{own.ratio_error:.2g}"
     )

@@ -4,17 +4,19 @@
 >>> estimate.draw(200, np.random.default_rng(0)).shape      # [draw, error]
 """
 
-import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
 from tmlattice.effects import Cause, RingEffect, apply, find
-from tmlattice.errors import LatticeError
+from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
@@ -22,7 +24,8 @@ from tmlattice.observe.calibration import Dispersion, read_dispersion, read_ener
 Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
 
-log = logging.getLogger(__name__)
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
+"""Shares of a posterior mean that are tried until the ring stores a beam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +97,26 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
         if cause.effect == "corrector_calibration" and cause.element is not None:
             scales[cause.element] = scales.get(cause.element, 1.0) * (1 + cause.amount)
     return Estimate(
-        apply(ring, mean) if mean else ring,
+        _with_mean(ring, mean) if mean else ring,
         settings,
         tuple(known.hypotheses[i] for i in kept),
         known,
         np.array(kept, dtype=np.int64),
         scales,
     )
+
+
+def _with_mean(ring: Ring, mean: Sequence[Cause]) -> Ring:
+    """The ring with a linearised posterior mean; with a half of it, a quarter, ..., where it stores
+    a beam only then."""
+    for share in SHARES:
+        found = apply(ring, [replace(cause, amount=share * cause.amount) for cause in mean])
+        try:
+            StoredBeam(ResponseModel(found))
+        except UnstableRingError:
+            continue
+        return found
+    return apply(ring, mean)  # a beam that is not stored anyway, as of first turns
 
 
 def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:

@@ -9,7 +9,7 @@ its supply; an excitation curve gives the strength of a setting.
 
 import csv
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -131,6 +131,15 @@ class Knob:
         low, high = sorted(self.amount(e) if math.isfinite(e) else rises * e for e in ends)
         return low, high
 
+    def row(self) -> dict[str, str]:
+        """Return the texts of a table's columns, see `COLUMNS`."""
+        limits = ["" if math.isinf(end) else f"{end:.9g}" for end in (self.low, self.high)]
+        step = f"{self.step:.9g}" if self.step else ""
+        curve = " ".join(f"{x:.9g}:{y:.9g}" for x, y in self.curve)
+        texts = (self.name, self.kind, " ".join(self.members), self.unit, f"{self.present:.9g}",
+                 *limits, step, f"{self.error:g}", curve)  # fmt: skip
+        return dict(zip(COLUMNS, texts, strict=True))
+
     def causes(self, amount: float) -> list[Cause]:
         """Return the causes of an amount in the ring."""
         effect = KINDS[self.kind].effect
@@ -139,11 +148,50 @@ class Knob:
         return [Cause(effect, member, amount) for member in self.members]
 
 
-def kinds_for(targets: Collection[str]) -> list[str]:
-    """Return the default kinds of knobs for some targets."""
-    orbit = {"closed_orbit", "first_turn"} & set(targets)
-    kinds = [] if set(targets) <= orbit else ["supplies", "skew_quadrupoles"]
-    return kinds + ["correctors"] * bool(orbit)
+def chosen_knobs(
+    knobs: Sequence["Knob | str"] | str | Path | None, ring: Ring, targets: Collection[str]
+) -> list[Knob]:
+    """Return knobs that are given in any form.
+
+    Args:
+        knobs: devices, or kinds of `default_knobs`; or the path of a table; None: those of the
+            targets.
+        ring: with the present settings.
+        targets: names.
+
+    Raises:
+        ChoiceError, MeasurementError, UnknownNameError: knobs that cannot be used.
+    """
+    if isinstance(knobs, str | Path):
+        return read_knobs(Path(knobs), ring)
+    if knobs is None:
+        orbit = {"closed_orbit", "first_turn"} & set(targets)
+        optics = [] if set(targets) <= orbit else ["supplies", "skew_quadrupoles"]
+        knobs = [*optics, *["correctors"] * bool(orbit)]
+    devices = [own for own in knobs if isinstance(own, Knob)]
+    kinds = [own for own in knobs if isinstance(own, str)]
+    every = devices + (default_knobs(ring, kinds) if kinds else [])
+    check_distinct("the knobs", every)
+    return every
+
+
+def check_distinct(where: str, knobs: Iterable[Knob]) -> None:
+    """Raise a MeasurementError if two knobs have one name, or change the same strength of a magnet:
+    the new setting of each would undo the other's."""
+    names: set[str] = set()
+    owners: dict[tuple[str | None, str], str] = {}
+    for knob in knobs:
+        if knob.name in names:
+            raise MeasurementError(f"{where}: the knob '{plain(knob.name, 40)}' occurs twice")
+        names.add(knob.name)
+        for member in knob.members:
+            key = KINDS[knob.kind].effect, member
+            if key in owners:
+                both = " and ".join(f"'{plain(n, 40)}'" for n in (owners[key], knob.name))
+                raise MeasurementError(
+                    f"{where}: '{plain(member, 40)}' is a member of {both}; keep it in one"
+                )
+            owners[key] = knob.name
 
 
 def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:
@@ -158,11 +206,13 @@ def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:
         ChoiceError: another kind.
     """
     made = {
-        "supplies": lambda: _supplies(ring),
-        "quadrupoles": lambda: _each(ring, "quadrupole"),
+        "supplies": lambda: _grouped(ring, "quadrupole", _supplies(ring)),
+        "quadrupoles": lambda: _grouped(ring, "quadrupole", {}),
         "skew_quadrupoles": lambda: _skew(ring),
         "correctors": lambda: _correctors(ring),
-        "sextupoles": lambda: _sextupoles(ring),
+        "sextupoles": lambda: _grouped(
+            ring, "sextupole", {e.name: e.family for e in ring.elements if e.kind == "sextupole"}
+        ),
         "rf": lambda: [_knob("rf", "rf", (), rf_of(ring).frequency(ring))],
     }
     chosen = list(("supplies", "skew_quadrupoles", "correctors") if kinds is None else kinds)
@@ -181,30 +231,31 @@ def _upright(ring: Ring, name: str) -> bool:
     return abs(abs(ring[name].tilt) - math.pi / 4) > 0.1
 
 
-def _supplies(ring: Ring) -> list[Knob]:
-    """Knobs by family or equal design strength; quadrupoles of no family one by one."""
+def _grouped(ring: Ring, kind: str, owner: Mapping[str, str]) -> list[Knob]:
+    """Knobs of powered magnets, those of one owner together, and alone without one."""
+    strength = KINDS[kind].strength
+    groups: dict[str, list[str]] = {name: [] for name in owner.values()}
+    for own in magnets(ring, (kind,)):
+        members = [piece.name for piece in own if getattr(piece, strength)]
+        if members and (kind != "quadrupole" or _upright(ring, members[0])):
+            groups.setdefault(owner.get(own[0].name, own[0].name), []).extend(members)
+    return [
+        _knob(name, kind, tuple(members), getattr(ring[members[0]], strength))
+        for name, members in groups.items()
+        if members
+    ]
+
+
+def _supplies(ring: Ring) -> dict[str, str]:
+    """Owners of quadrupoles: families, or those of equal design strength."""
     names = [pieces[0].name for pieces in magnets(ring, ("quadrupole",), powered=True)]
     kinds, belongs = supplied_alike(ring)
-    knobs, taken = [], set()
+    owner: dict[str, str] = {}
     for kind, column in zip(kinds, belongs.T, strict=True):
-        own = [names[i] for i in np.flatnonzero(column) if _upright(ring, names[i])]
-        taken |= set(own)
-        members = tuple(piece for name in own for piece in ring.pieces(name) if ring[piece].k1)
-        families = {ring[member].family for member in members}
-        if members:
-            name = families.pop() if len(families) == 1 else kind
-            knobs.append(_knob(name, "quadrupole", members, ring[members[0]].k1))
-    return knobs + [knob for knob in _each(ring, "quadrupole") if knob.name not in taken]
-
-
-def _each(ring: Ring, kind: str) -> list[Knob]:
-    strength = KINDS[kind].strength
-    found = []
-    for own in magnets(ring, (kind,)):
-        members = tuple(piece.name for piece in own if getattr(piece, strength))
-        if members and (kind != "quadrupole" or _upright(ring, members[0])):
-            found.append(_knob(own[0].name, kind, members, getattr(ring[members[0]], strength)))
-    return found
+        own = [names[i] for i in np.flatnonzero(column)]
+        families = {ring[name].family for name in own}
+        owner |= dict.fromkeys(own, families.pop() if len(families) == 1 else kind)
+    return owner
 
 
 def _skew(ring: Ring) -> list[Knob]:
@@ -221,16 +272,6 @@ def _correctors(ring: Ring) -> list[Knob]:
         _knob(e.name, e.kind, (e.name,), e.angle)
         for e in ring.elements
         if e.kind in ("hcorrector", "vcorrector")
-    ]
-
-
-def _sextupoles(ring: Ring) -> list[Knob]:
-    families: dict[str, list[Knob]] = {}
-    for knob in _each(ring, "sextupole"):
-        families.setdefault(ring[knob.name].family, []).append(knob)
-    return [
-        replace(own[0], name=family, members=tuple(m for knob in own for m in knob.members))
-        for family, own in families.items()
     ]
 
 
@@ -275,10 +316,7 @@ def knobs_of(rows: Any, path: Path, ring: Ring) -> list[Knob]:
     every = ("supplies", "quadrupoles", "skew_quadrupoles", "correctors", "sextupoles", "rf")
     shown = {knob.name.casefold(): knob for knob in reversed(default_knobs(ring, every))}
     knobs = [_read(path, row, ring, shown) for row in rows]
-    names = [knob.name for knob in knobs]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise MeasurementError(f"{path}: the knob '{plain(twice, 40)}' occurs twice")
+    check_distinct(str(path), knobs)
     return knobs
 
 
@@ -348,12 +386,6 @@ def _check(where: str, knob: Knob) -> None:
 def write_knobs(path: Path, knobs: Iterable[Knob]) -> None:
     """Write a table of knobs for `read_knobs`, .csv."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for knob in knobs:
-            limits = ["" if math.isinf(end) else f"{end:.9g}" for end in (knob.low, knob.high)]
-            curve = " ".join(f"{x:.9g}:{y:.9g}" for x, y in knob.curve)
-            writer.writerow(
-                [knob.name, knob.kind, " ".join(knob.members), knob.unit, f"{knob.present:.9g}",
-                 *limits, f"{knob.step:.9g}" if knob.step else "", f"{knob.error:g}", curve]
-            )  # fmt: skip
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(knob.row() for knob in knobs)

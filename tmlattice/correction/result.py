@@ -9,22 +9,31 @@ import csv
 import io
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from tmlattice.correction.knobs import Knob
 from tmlattice.correction.snippets import snippet
 from tmlattice.correction.targets import TARGETS
+from tmlattice.diagnosis.records import decoded, encoded
 from tmlattice.late import Method
 from tmlattice.lattice import Ring
+from tmlattice.measurement.documents import read_document
 from tmlattice.speaks import Speaks
 
 Interval = tuple[float, float, float]
 """Median and the ends of the central 68 %."""
-FORMAT = "tmlattice-correction"
-HEAD = ("device", "present", "new", "change", "unit", "low", "high", "gain")
+DOCUMENT, LATTICE = "correction.json", "correction.lattice.json"
+CODES = {"madx": "settings.madx", "at": "settings.at.py", "elegant": "settings.ele"}
+FILES = ("settings.csv", *CODES.values(), DOCUMENT, LATTICE, "correction.txt", "correction.png")
+"""Files of a correction, apart from the page."""
+FORMAT, VERSION = "tmlattice-correction", 2
+HEAD = (
+    "device", "present", "new", "change", "unit", "low", "high", "gain",
+    "kind", "members", "step", "error", "curve",
+)  # fmt: skip
+"""Columns of settings.csv: those of a table of knobs, with the new setting, its change and gain."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +62,12 @@ class Setting:
             for end in (self.knob.low, self.knob.high)
         )
 
-    def row(self) -> list[Any]:
-        """Return the values in the order of `HEAD`."""
-        knob = self.knob
-        return [knob.name, knob.present, self.new, self.new - knob.present, knob.unit,
-                *(None if math.isinf(end) else end for end in (knob.low, knob.high)),
-                self.gain]  # fmt: skip
+    def row(self) -> dict[str, str]:
+        """Return the texts of the columns `HEAD`."""
+        return self.knob.row() | {
+            "device": self.knob.name, "new": f"{self.new:.9g}",
+            "change": f"{self.new - self.knob.present:.9g}", "gain": f"{self.gain:.9g}",
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,11 +87,11 @@ class Correction(Speaks):
         shown: the target that figures show: beta beating, or the trajectory.
         profile: its errors at the readings now and expected, each [reading, plane, 3] (`Interval`).
         s: of the readings, m.
-        counted: the targets, with their tolerances.
+        targets: the wanted ones, with their tolerances.
         iterations: of measurement and correction that are needed.
         warnings: for the reader.
-        ring: with the present settings.
         provenance: versions, options, seconds.
+        ring: with the present settings.
     """
 
     settings: tuple[Setting, ...]
@@ -95,13 +104,13 @@ class Correction(Speaks):
     gain_error: float
     tunes: Mapping[str, tuple[float, float]]
     shown: str
-    profile: tuple[np.ndarray, np.ndarray] = field(repr=False)
-    s: np.ndarray = field(repr=False)
-    counted: Mapping[str, float]
+    profile: tuple[Any, Any]
+    s: tuple[float, ...]
+    targets: Mapping[str, float]
     iterations: int
     warnings: tuple[str, ...]
-    ring: Ring = field(repr=False)
-    provenance: Mapping[str, Any] = field(repr=False)
+    provenance: Mapping[str, Any]
+    ring: Any = None
 
     def _told(self) -> tuple[str, dict[str, str]]:
         return "", {"devices": str(len(self.settings)), "expected": self.words}
@@ -114,7 +123,7 @@ class Correction(Speaks):
         first = [setting.knob.name for setting in self.settings[:3]]
         count = len(self.settings)
         names = ", ".join(first) + (f" and {count - 3} more" if count > 3 else "")
-        parts = [_change(name, self.before[name], self.after[name]) for name in self.counted]
+        parts = [_change(name, self.before[name], self.after[name]) for name in self.targets]
         most = sorted((part for part in parts if part), key=lambda part: -part[0])[:3]
         devices = f"The device {names} takes" if count == 1 else f"The {count} devices {names} take"
         return f"{devices} {'; '.join(text for _, text in most)}."
@@ -132,61 +141,42 @@ class Correction(Speaks):
     )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the result in the format `tmlattice-correction`, version 1."""
+        """Return the result in the format `tmlattice-correction`; the ring is not part of it."""
         from tmlattice import __version__
 
-        def of(parts: Mapping[str, Any]) -> dict[str, Any]:
-            return {
-                name: [list(np.atleast_1d(own)) for own in pair] for name, pair in parts.items()
-            }
-
-        settings = [
-            dict(zip(HEAD, setting.row(), strict=True))
-            | {"kind": setting.knob.kind, "members": list(setting.knob.members),
-               "strength_change": setting.amount, "at_limit": setting.at_limit}
-            for setting in self.settings
-        ]  # fmt: skip
-        return {
-            "format": FORMAT,
-            "version": 1,
-            "package": __version__,
-            "settings": settings,
-            "refused": self.refused,
-            "words": self.words,
-            "targets": dict(self.counted),
-            "before": of(self.before),
-            "after": of(self.after),
-            "stays": {
-                name: {"not_reachable": list(reach), "not_determined": list(data)}
-                for name, (reach, data) in self.stays.items()
-            },
-            "gains": [{"devices": n, **{k: list(v) for k, v in own.items()}}
-                      for n, own in self.gains],
-            "gain": self.gain,
-            "gain_sigma": self.gain_error,
-            "tunes": {name: list(pair) for name, pair in self.tunes.items()},
-            "profile": {"target": self.shown, "s": self.s.tolist(),
-                        "before": self.profile[0].tolist(), "after": self.profile[1].tolist()},
-            "iterations": self.iterations,
-            "warnings": list(self.warnings),
-            "provenance": dict(self.provenance),
-        }  # fmt: skip
+        own = {f.name: encoded(getattr(self, f.name)) for f in fields(self) if f.name != "ring"}
+        return {"format": FORMAT, "version": VERSION, "package": __version__, "words": self.words,
+                **own}  # fmt: skip
 
     def table(self) -> str:
         """Return the settings as CSV."""
         text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(HEAD)
-        for setting in self.settings:
-            writer.writerow(
-                ["" if v is None else f"{v:.9g}" if isinstance(v, float) else v
-                 for v in setting.row()]
-            )  # fmt: skip
+        writer = csv.DictWriter(text, HEAD, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(setting.row() for setting in self.settings)
         return text.getvalue()
 
     def snippet(self, code: str) -> str:
         """Return the settings as statements of "madx", "at" (Python) or "elegant"."""
         return snippet(self.ring, [(s.knob, s.amount) for s in self.settings], code)
+
+
+def read_correction(path: Path, ring: Ring) -> Correction:
+    """Return the correction of a correction.json.
+
+    Args:
+        path: of the file.
+        ring: with the present settings.
+
+    Raises:
+        MeasurementError: it cannot be read.
+    """
+    document = read_document(path, "correction", FORMAT, VERSION)
+    found: Correction = replace(decoded(Correction, document), ring=ring)
+    for setting in found.settings:
+        for member in setting.knob.members:
+            ring[member]
+    return found
 
 
 def _change(

@@ -1,7 +1,7 @@
 """New strengths of magnets as statements of MAD-X, AT and elegant.
 
 A statement is for all magnets of a name if all of them get the same; else for one occurrence. In
-MAD-X an occurrence has the name that `write_ring` gives it: `qd..12` for `qd::12`.
+MAD-X an occurrence has the name that `save_ring` gives it: `qd..12` for `qd::12`.
 """
 
 import math

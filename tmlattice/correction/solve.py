@@ -11,14 +11,14 @@ they gain. The third is what the data do not determine: no knob lowers it.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
+from scipy.linalg import solve, solve_triangular
 
 from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.first_turn import Threading
@@ -37,11 +37,21 @@ log = logging.getLogger(__name__)
 MAX_ROUNDS = 30
 """Linearisations at most: a threaded beam gets further with each of them."""
 MIN_FALL = 1e-3
-"""Relative fall of the expected square below which the iteration ends."""
+"""Fall of the expected square, relative and in squares of the tolerances, that ends the search."""
 MAX_HALVINGS = 6
 """Halvings, at most, of a step that does not lower the expected square."""
-MAX_EXCESS = 0.02
-"""Relative excess over the smallest expected square (1 % in rms) allowed for fewer knobs."""
+MAX_EXCESS = 5e-4, 2e-3
+"""Excess over the smallest expected square that is allowed for fewer knobs: relative (0.025 % in
+rms), and in squares of the tolerances."""
+SIGMAS, MIN_SHARE = 3.0, 0.1
+"""Standard deviations by which a correction is expected to make the ring better; and the smallest
+share of its changes that is worth while: it has a fifth of the expected gain."""
+COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""Numbers of knobs with a stated gain."""
+ROUNDING = 1e-10
+"""Of the squares of slopes, relative to a knob's size: a ridge for knobs without errors."""
+MAX_PIVOTS = 50
+"""Of the search for the knobs at their limits: systems solved."""
 AT_ONCE = 500
 """Uncertain errors whose derivatives are in memory."""
 
@@ -201,29 +211,77 @@ class Point:
         return float(self.rows @ self.rows + self.unsure @ self.unsure)
 
     @cached_property
-    def _triangle(self) -> tuple[Array, Array, float]:
-        """Triangle R of the slopes in units of the knobs' sizes; in its coordinates the errors
-        without any change, [knob]; and the square of the part that no knob changes."""
-        q, r = np.linalg.qr(self.slopes / self.problem.sizes)
+    def _normal(self) -> tuple[Array, Array, float]:
+        """Normal equations in units of the knobs' sizes: matrix with the ridge, [knob, knob], right
+        side, [knob], and the square without any change."""
+        slopes = self.slopes / self.problem.sizes
         start = self.rows - self.slopes @ self.amounts
-        inside = q.T @ start
-        return r, inside, max(float(start @ start - inside @ inside), 0.0)
+        matrix = slopes.T @ slopes
+        matrix.flat[:: len(matrix) + 1] += self.problem.sigma**2 + ROUNDING
+        return matrix, -slopes.T @ start, float(start @ start)
 
     def step(self, knobs: Indices) -> tuple[Array, float]:
         """Return the amounts of some knobs, the others at zero, of the smallest linearised expected
         square within the limits; and that square."""
-        r, start, fixed = self._triangle
-        matrix = np.vstack([r[:, knobs], np.diag(self.problem.sigma[knobs])])
-        right = np.concatenate([-start, np.zeros(len(knobs))])
-        low, high = self.problem.bounds[:, knobs] * self.problem.sizes[knobs]
-        if np.isfinite([low, high]).any():
-            found = lsq_linear(matrix, right, (low, np.maximum(high, low + 1e-300))).x
-        else:
-            found = np.linalg.lstsq(matrix, right, rcond=None)[0]
-        left = matrix @ found - right
+        matrix, right, square = self._normal
+        bounds = self.problem.bounds[:, knobs] * self.problem.sizes[knobs]
+        matrix, right = matrix[np.ix_(knobs, knobs)], right[knobs]
+        found = bounded(matrix, right, *bounds)
         amounts = np.zeros(len(self.amounts))
         amounts[knobs] = found / self.problem.sizes[knobs]
-        return amounts, fixed + float(left @ left)
+        return amounts, square + float(found @ (matrix @ found - 2 * right))
+
+    def gains(self, knobs: Indices) -> Array:
+        """Return the falls of the linearised expected square by each knob after those before it,
+        without limits, [knob]."""
+        matrix, right, _ = self._normal
+        root = np.linalg.cholesky(matrix[np.ix_(knobs, knobs)])
+        return np.asarray(solve_triangular(root, right[knobs], lower=True) ** 2)
+
+    def by_gain(self) -> Iterator[int]:
+        """Yield the knobs in the order of the largest fall of the expected square, with those
+        before adjusted (orthogonal matching pursuit, as MICADO): a pivoted Cholesky
+        decomposition."""
+        matrix, right, _ = self._normal
+        left, scale = right.copy(), np.diag(matrix).copy()
+        open_, factor = np.ones(len(right), dtype=bool), np.zeros(matrix.shape)
+        for n in range(len(right)):
+            gains = np.where(open_, left**2 / np.maximum(scale, ROUNDING), 0.0)
+            k = int(np.argmax(gains))
+            if not gains[k]:
+                return  # the others have no effect
+            open_[k] = False
+            pivot = np.sqrt(max(scale[k], ROUNDING))
+            column = (matrix[k] - factor[:n, k] @ factor[:n]) / pivot
+            factor[n] = column
+            left -= column * (left[k] / pivot)
+            scale -= column**2
+            yield k
+
+
+def bounded(matrix: Array, right: Array, low: Array, high: Array) -> Array:
+    """Return the minimum of x matrix x / 2 - right x with low <= x <= high.
+
+    Knobs beyond a limit are held there, and released where the slope leads back inside, all at once
+    (block principal pivoting: Judice & Pires, Computers & Operations Research 21 (1994) 587).
+
+    Args:
+        matrix: positive definite, [knob, knob].
+        right, low, high: [knob].
+    """
+    held = np.zeros(len(right), dtype=int)  # -1 at the low limit, 1 at the high one
+    x = np.zeros(len(right))
+    for _ in range(MAX_PIVOTS):
+        free = held == 0
+        x = np.where(held > 0, high, np.where(held < 0, low, 0.0))
+        rest = right - matrix[:, ~free] @ x[~free]
+        x[free] = solve(matrix[np.ix_(free, free)], rest[free], assume_a="pos")
+        outward = held * (rest - matrix[:, free] @ x[free])
+        wrong = (x < low) | (x > high) | (outward < 0)
+        if not wrong.any():
+            break
+        held[wrong] = np.where(held, 0, np.where(x > high, 1, -1))[wrong]
+    return np.clip(x, low, high)
 
 
 def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
@@ -245,45 +303,46 @@ def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
         if found is None:
             return now
         log.info("expected square %.4g -> %.4g", now.square, found.square)
-        done = now.square - found.square < MIN_FALL * now.square
+        done = now.square - found.square < MIN_FALL * (1 + found.square)
         now = found
         if done:
             break
     return now
 
 
-def by_gain(point: Point) -> list[int]:
-    """Return the knobs in the order of the largest fall of the expected square, with those before
-    adjusted (orthogonal matching pursuit, as MICADO)."""
-    r, start, _ = point._triangle
-    count = len(point.amounts)
-    left_over = [k for k in range(count) if r[:, k].any()]
-    J = np.vstack([r, np.diag(point.problem.sigma)])
-    left = np.concatenate([start, np.zeros(count)])
+def fewest(point: Point, square: float) -> list[int]:
+    """Return the first knobs by gain that nearly reach an expected square, to first order."""
     order: list[int] = []
-    while left_over:
-        inner, norm = left @ J[:, left_over], np.linalg.norm(J[:, left_over], axis=0)
-        share = np.where(norm > 1e-9, inner / np.maximum(norm, 1e-9), 0.0)
-        chosen = left_over.pop(int(np.argmax(np.abs(share))))
-        order.append(chosen)
-        direction = J[:, chosen] / max(float(np.sqrt(J[:, chosen] @ J[:, chosen])), 1e-9)
-        left -= direction * (direction @ left)
-        if left_over:
-            J[:, left_over] -= np.outer(direction, direction @ J[:, left_over])
+    for k in point.by_gain():
+        order.append(k)
+        if len(order) in COUNTS and nearly(point.step(np.array(order))[1], square):
+            break
     return order
 
 
-def fewest(point: Point, order: Sequence[int], counts: Sequence[int]) -> int:
-    """Return the number of first knobs that reach nearly the gain of all, to first order."""
-    squares = np.array([point.step(np.array(order[:n], dtype=np.int64))[1] for n in counts])
-    return counts[int(np.argmax(squares <= (1 + MAX_EXCESS) * squares.min()))]
+def nearly(square: float, least: float) -> bool:
+    """Return whether an expected square is as good as the smallest one."""
+    relative, beyond = MAX_EXCESS
+    return square <= (1 + relative) * least + beyond
 
 
-def rounded(problem: Problem, point: Point) -> Point:
-    """Return the point at settings that the devices' steps allow; derivatives stay."""
-    pairs = zip(problem.knobs, point.amounts.tolist(), strict=True)
-    amounts = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
-    return point if np.array_equal(amounts, point.amounts) else problem.at(amounts)
+def shortened(begin: Point, end: Point) -> tuple[Point, float]:
+    """Return the point at the largest share of a correction's changes whose gain is expected to be
+    `SIGMAS` standard deviations above zero, at settings that the devices' steps allow; and that
+    share.
+
+    In a draw with the rows r, and r + d after all changes, a share x changes the square by
+    x (2 r d + x d^2).
+    """
+    problem, amounts = end.problem, end.amounts
+    now, then = (p.rows + problem.targets.rows(p.open) for p in (begin, end))
+    slope = 2 * np.sum(now * (then - now), axis=1)
+    size = max(float(np.mean(np.sum((then - now) ** 2, axis=1))), 1e-30)
+    share = -float(slope.mean() + SIGMAS * slope.std()) / size
+    share = 0.0 if share < MIN_SHARE else min(share, 1.0)
+    pairs = zip(problem.knobs, (share * amounts).tolist(), strict=True)
+    new = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
+    return (end if np.array_equal(new, amounts) else problem.at(new)), share
 
 
 def drawn(

@@ -9,7 +9,8 @@ relative energy of the step in the design, as a control room measures them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,25 +67,11 @@ THREADING = "first_turn"
 """Target of a beam that is not stored: it is corrected alone."""
 
 
-@dataclass(frozen=True)
-class Optics:
-    """Optics of a stored beam at the BPMs; or derivatives, with a leading axis of hypotheses.
-
-    Attributes:
-        orbit, beta, dispersion: m, [BPM, plane].
-        phase: at the BPMs, in turns, [BPM, plane].
-        tunes, chromaticity: [plane].
-        coupling: of each mode the amplitude in the other plane over that in its own, complex,
-            [BPM, mode].
-    """
-
-    orbit: Array
-    beta: Array
-    phase: Array
-    dispersion: Array
-    tunes: Array
-    chromaticity: Array
-    coupling: NDArray[np.complex128]
+Optics = Mapping[str, NDArray[Any]]
+"""Of a stored beam at the BPMs, or derivatives with a leading axis of hypotheses: `orbit`, `beta`,
+`dispersion`, m, [BPM, plane]; `phase`, turns, [BPM, plane]; `tunes`, `chromaticity` [plane]; and
+`coupling`, of each mode the amplitude in the other plane over that in its own, complex,
+[BPM, mode]."""
 
 
 class StoredOptics:
@@ -125,11 +112,8 @@ class StoredOptics:
             )
             for side in (0.5, -0.5)
         )
-        change = {f.name: getattr(up.values, f.name) - getattr(down.values, f.name)
-                  for f in fields(Optics)}  # fmt: skip
-        change["tunes"] = short_way(change["tunes"])
-        change["phase"] -= np.round(change["phase"])
-        return Optics(**{name: value[None] / self.step for name, value in change.items()})
+        change = _difference(up.values, down.values)
+        return {name: value[None] / self.step for name, value in change.items()}
 
     def derivatives(self, hypotheses: Sequence[Hypothesis]) -> Optics:
         """Return the change per unit of effects on the ring, [hypothesis, ...]."""
@@ -165,13 +149,20 @@ def _means(sides: Sequence[dict[str, np.ndarray]], value: bool = False) -> Optic
         phase = below["phase"] + (turned - np.round(turned)) / 2
     else:
         phase = (above["phase"] + below["phase"]) / 2
-    return Optics(
-        **mean,
-        phase=phase,
-        tunes=below["tunes"] + tunes / 2,
-        dispersion=(above["orbit"] - below["orbit"]) / (2 * ENERGY),
-        chromaticity=tunes / (2 * ENERGY),
-    )
+    return mean | {
+        "phase": phase,
+        "tunes": below["tunes"] + tunes / 2,
+        "dispersion": (above["orbit"] - below["orbit"]) / (2 * ENERGY),
+        "chromaticity": tunes / (2 * ENERGY),
+    }
+
+
+def _difference(optics: Optics, other: Optics) -> dict[str, NDArray[Any]]:
+    """Difference of the optics of two rings, tunes and phases the short way."""
+    change = {name: value - other[name] for name, value in optics.items()}
+    change["tunes"] = short_way(change["tunes"])
+    change["phase"] = change["phase"] - np.round(change["phase"])
+    return change
 
 
 class Weighted:
@@ -231,7 +222,7 @@ class Targets(Weighted):
         self.step = ENERGY / float(model.rf_start[5])
         self.goal = StoredOptics(model, self.step).values
         self.names = tuple(name for name in TARGETS if name in given)
-        rms = float(np.sqrt(np.mean(self.goal.dispersion[:, 0] ** 2))) or 1.0
+        rms = float(np.sqrt(np.mean(self.goal["dispersion"][:, 0] ** 2))) or 1.0
         self.tolerance = {
             name: given[name] or TARGETS[name].tolerance * (rms if name == "dispersion" else 1.0)
             for name in self.names
@@ -248,30 +239,23 @@ class Targets(Weighted):
 
     def errors(self, optics: Optics) -> dict[str, Array]:
         """Return errors of all targets of a stored beam, [reading, plane] each, in their units."""
-        goal = self.goal
-        change = Optics(*(getattr(optics, f.name) - getattr(goal, f.name) for f in fields(goal)))
-        found = self._parts(change)
-        advance = found["phase_advance"]
-        found["phase_advance"] = advance - np.round(advance)
-        found["tunes"] = short_way(found["tunes"])
+        found = self.changes(_difference(optics, self.goal))
+        found["phase_advance"] -= np.round(found["phase_advance"])
         return found
 
     def changes(self, derivatives: Optics) -> dict[str, Array]:
-        """Return the derivatives of `errors`, [hypothesis, reading, plane] each."""
-        return self._parts(derivatives)
-
-    def _parts(self, change: Optics) -> dict[str, Array]:
-        """Linear in a change of the optics."""
-        beta = self.goal.beta
-        across = np.sqrt(beta / beta[:, ::-1]) * change.coupling
+        """Return the derivatives of `errors`, [hypothesis, reading, plane] each: linear in those of
+        the optics."""
+        beta = self.goal["beta"]
+        across = np.sqrt(beta / beta[:, ::-1]) * derivatives["coupling"]
         return {
-            "beta_beating": change.beta / beta,
-            "phase_advance": np.diff(change.phase, axis=-2),
-            "dispersion": change.dispersion,
-            "tunes": change.tunes[..., None, :],
-            "chromaticity": change.chromaticity[..., None, :],
+            "beta_beating": derivatives["beta"] / beta,
+            "phase_advance": np.diff(derivatives["phase"], axis=-2),
+            "dispersion": derivatives["dispersion"],
+            "tunes": derivatives["tunes"][..., None, :],
+            "chromaticity": derivatives["chromaticity"][..., None, :],
             "coupling": np.concatenate([across.real, across.imag], axis=-2),
-            "closed_orbit": change.orbit,
+            "closed_orbit": derivatives["orbit"],
         }
 
 

@@ -48,7 +48,7 @@ def diagnose(
     max_effects: int | None = None,
     false_alarm: float = DEFAULT.false_alarm,
     assume: Sequence[str] = (),
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     known: DistributedErrors | None = None,
     heldout: Measurement | None = None,
     radiation: bool = False,

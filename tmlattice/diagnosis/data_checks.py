@@ -3,8 +3,9 @@
 >>> checkup = check_data(load_ring("petra3"), read_measurement("day_1"))
 >>> [check.sentence for check in checkup.reported]
 
-Global errors come first: a wrong sign, unit or order is reported with its correction and with the
-assumption that continues without it. Launches, noise, BPMs and single readings follow.
+Global errors come first, by the same search in every kind of measurement: a wrong sign, unit or
+order is reported with its correction and with the assumption that continues without it. Of first
+turns launches, noise and single readings follow.
 
 BPMs and correctors of a measurement that are not in the lattice. A control room reads more than its
 lattice file has, such as a BPM in a transfer line. Such channels are rejected, with a note. If most
@@ -22,24 +23,30 @@ from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
 from tmlattice.diagnosis.signals import Check, Checkup, fine, note, wrong
-from tmlattice.diagnosis.stored_data_checks import GLOBAL, stored_checks
 from tmlattice.effects import Cause, expected_radiation
-from tmlattice.errors import MeasurementError, TmlatticeError, UnknownNameError, first_of
+from tmlattice.errors import (
+    MeasurementError,
+    TmlatticeError,
+    TooFewTurnsError,
+    UnknownNameError,
+    first_of,
+)
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
     Measurement,
     OrbitResponse,
-    in_words,
+    TuneReading,
+    TurnByTurn,
 )
-from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.stored_files import KINDS as STORED
-from tmlattice.observe.global_errors import GlobalErrors, Verdict, certain
+from tmlattice.observe.compared import ANOTHER, Compared, OfResponse, compared
+from tmlattice.observe.global_errors import CERTAIN, OfTurns, Search, Verdict
 from tmlattice.observe.noise import PASSES, noise_scatter
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors, ResponseVerdict
 from tmlattice.observe.sections import Passes, SectionFits
 
 ENERGY = 0.02
@@ -55,12 +62,19 @@ FAR = 100.0
 benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first BPMs change."""
+NOTHING_FROM, SURE, NO_BEAM, HALF = 2, 4, 0.75, 0.5
+"""Sections at the end that follow no trajectory, from which on the beam may be lost, and is: a few
+swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9; and the share
+that separates them from others."""
 SECTIONS = 4
 """Fewest passes that determine the usual misfit."""
 SPOILT = 3.0
 """Misfit of a section over the typical one above which it is not used."""
 OVER, UNDER = 2.5, 3.0
 """Factors by which a stated noise may be too large, and too small."""
+GLOBAL = "signs, units and order"
+MOST_ERRORS = 4
+"""Global errors of one measurement at most."""
 _UNIT = "-in-"
 """In the names of assumptions about a unit."""
 SCALED = 3.0
@@ -82,8 +96,7 @@ def check_data(
     Args:
         ring: the design.
         data: of any kind.
-        assumed: what is recorded wrongly, names of `ASSUMPTIONS`; it is undone first. Of first
-            turns and of orbit responses alone.
+        assumed: what is recorded wrongly, names of `ASSUMPTIONS`; it is undone first.
         radiation: the model radiates as expected.
 
     Raises:
@@ -95,17 +108,18 @@ def check_data(
     begun = time.perf_counter()
     data, absent = in_the_lattice(ring, data)
     checks = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
-    if not isinstance(data, Measurement | OrbitResponse):
-        kind = next(name for name, own in STORED.items() if isinstance(data, own.record))
-        if assumed:
-            raise MeasurementError(
-                f"'{assumed[0]}' cannot be assumed of {in_words(data)}: correct the data themselves"
-            )
-        checks += stored_checks(ring, data)
+    few = signals.few(ring, data)
+    if few is None:
+        names = [monitor.name for monitor in ring.monitors]
+        data = assume(in_beam_order(data, names), assumed, names)
+        if isinstance(data, Measurement):
+            checks += _of_first_turns(ring, data, expected_radiation(ring) if radiation else ())
+        else:
+            checks += _of_compared(ring, data)
     else:
-        kind = "trajectory" if isinstance(data, Measurement) else "orbit_response"
-        few = signals.few(ring, data)
-        checks += _of_readings(ring, data, assumed, radiation) if few is None else [few]
+        checks.append(few)
+    plain = "trajectory" if isinstance(data, Measurement) else "orbit_response"
+    kind = next((name for name, own in STORED.items() if isinstance(data, own.record)), plain)
     provenance = {
         "package": __version__,
         "lattice": ring.name,
@@ -114,16 +128,6 @@ def check_data(
         "seconds": time.perf_counter() - begun,
     }
     return Checkup(kind, tuple(checks), provenance)
-
-
-def _of_readings(
-    ring: Ring, data: Measurement | OrbitResponse, assumed: Sequence[str], radiation: bool
-) -> list[Check]:
-    names = [monitor.name for monitor in ring.monitors]
-    if isinstance(data, OrbitResponse):
-        return _of_response(ring, assume(in_beam_order(data, names), assumed, names))
-    corrected = assume(in_beam_order(data, names), assumed, names)
-    return _of_first_turns(ring, corrected, expected_radiation(ring) if radiation else ())
 
 
 _REPORTED = ("energy", "copied monitors", "lost beam", GLOBAL, "launches")
@@ -160,7 +164,24 @@ def data_checks(
     return text + [f"the reference: {sentence}" for sentence in reported if sentence not in text]
 
 
-Some = TypeVar("Some", Measurement, Measurement | None, OrbitResponse)
+def raise_if_wrong(ring: Ring, data: AnyMeasurement, problem: Any = None) -> None:
+    """Raise an error if a global error of a stored beam's data can be corrected.
+
+    Args:
+        ring: the design.
+        data: measured.
+        problem: their lines, if these are turns and the lines are known.
+
+    Raises:
+        MeasurementError: the error, and its correction.
+    """
+    names = [monitor.name for monitor in ring.monitors]
+    for check in _of_compared(ring, in_beam_order(data, names), problem):
+        if check.name == GLOBAL and check.status == "wrong":
+            raise MeasurementError(check.sentence)
+
+
+Some = TypeVar("Some")
 
 
 def corrected_data(ring: Ring, data: Some, assumed: Sequence[str]) -> Some:
@@ -183,17 +204,40 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
     return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
 
 
-AnySearch = TypeVar("AnySearch", GlobalErrors, ResponseGlobalErrors)
+AnySearch = TypeVar("AnySearch", bound=Search)
 
 
-def _in_turn(checked: AnySearch, most: int) -> tuple[list[Any], AnySearch]:
-    """Global errors one after another, each with those before it corrected, and the search with all
-    of them corrected."""
-    found: list[Any] = []
-    while len(found) < most and (own := checked.verdict()) is not None:
-        found.append(own)
-        checked = checked.corrected(own.names)
-    return found, checked
+def _global(searched: AnySearch) -> tuple[list[Check], AnySearch]:
+    """One check for each global error, one after another, each with those before it corrected; and
+    the search with all of them corrected."""
+    checks: list[Check] = []
+    while len(checks) < MOST_ERRORS and (own := searched.verdict()) is not None:
+        checks.append(_sentence(searched, own))
+        searched = searched.corrected(own.names)
+    return checks or [fine(GLOBAL, "no global error would improve the agreement")], searched
+
+
+def _sentence(searched: Search, verdict: Verdict) -> Check:
+    words = " and ".join(ASSUMPTIONS[n].words for n in verdict.names)
+    others = "; ".join(
+        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}"
+        for own in verdict.alike
+    )
+    corrections = ", ".join(dict.fromkeys(ASSUMPTIONS[n].correction for n in verdict.names))
+    before, after = (searched.shown(own) for own in (verdict.before, verdict.after))
+    sure = verdict.worth > CERTAIN or isinstance(searched, Compared)
+    text = (
+        f"{words if sure else f'possibly {words}'}{f' ({others})' if others else ''}: "
+        f"{verdict.of} {before} as stated, {after} with that corrected; {corrections}, or go on "
+        f"with {_options(verdict.names)}"
+    )
+    chi2 = (verdict.before, verdict.after) if isinstance(searched, OfTurns) else (None, None)
+    make = wrong if sure else note
+    return make(GLOBAL, text, before=chi2[0], after=chi2[1], assume=verdict.names)
+
+
+def _options(names: Iterable[str]) -> str:
+    return " ".join(f"--assume {name}" for name in names)
 
 
 # --- first turns ----------------------------------------------------------------------------------
@@ -210,12 +254,14 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
-    verdicts, checked = _in_turn(GlobalErrors(ring, data, known), 3)
-    passes, found = checked.found(checked.measurement)
+    errors, checked = _global(OfTurns(ring, data, known))
+    passes, found = checked.found(checked.data)
+    if lost_too := _no_beam(ring, checked, passes, found):
+        return [*checks, *errors, *lost_too]
     lattice = _lattice(ring, checked, passes, found)
     if lattice.status == "wrong":  # no wrong sign, unit or order explains that
         return [*checks, lattice]
-    checks += [*_global(verdicts), lattice]
+    checks += [*errors, lattice]
     if any(check.status == "wrong" for check in checks):
         return checks  # noise and launches have no meaning before that is corrected
     return [
@@ -226,43 +272,12 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]
 
 
-def _global(verdicts: Sequence[Verdict]) -> list[Check]:
-    """One check for each global error."""
-    if not verdicts:
-        return [fine(GLOBAL, "no global error would improve the agreement")]
-    return [_sentence(verdict) for verdict in verdicts]
-
-
-def _sentence(verdict: Verdict) -> Check:
-    words, others, correction = _words(verdict.names, verdict.alike)
-    where, before, after = "", verdict.before[0], verdict.after[0]
-    if not before > 2 * after:  # the sections agree either way: the launches decide
-        where, before, after = " of the launches", verdict.before[1], verdict.after[1]
-    if not np.isfinite(before):
-        where, before, after = "", verdict.before[0], verdict.after[0]
-    sure = certain(verdict)
-    text = (
-        f"{words if sure else f'possibly {words}'}{others}: chi-square per reading{where} "
-        f"{_number(before)} as stated, {_number(after)} with that corrected; {correction}"
-    )
-    make = wrong if sure else note
-    return make(GLOBAL, text, before=before, after=after, assume=verdict.names)
-
-
-def _options(names: Iterable[str]) -> str:
-    return " ".join(f"--assume {name}" for name in names)
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}" if value < 100 else f"{value:.3g}"
-
-
-def _lattice(ring: Ring, checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+def _lattice(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
     """The check whether the readings follow trajectories of this ring."""
     share = found.share(passes)
     if not np.isfinite(share):
         return fine("lattice", "too few BPMs to decide whether this is the machine's lattice")
-    stated = checked.measurement.noise is not None
+    stated = checked.data.noise is not None
     if share > ALIEN and not (stated and found.level < 4):
         return wrong(
             "lattice",
@@ -274,10 +289,31 @@ def _lattice(ring: Ring, checked: GlobalErrors, passes: Passes, found: SectionFi
     return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
 
 
-def _launches(checked: GlobalErrors) -> Check:
+def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -> list[Check]:
+    """The check for readings behind a lost beam: the last sections of all shots follow nothing."""
+    shares = found.shares(passes)
+    read = np.flatnonzero(np.isfinite(shares))
+    if len(passes.readings) < 2 or not len(read) or passes.turn.any():
+        return []
+    strange = np.cumsum(np.log(np.maximum(shares[read], 1e-9) / HALF)[::-1])[::-1]
+    behind = read[strange.argmax() :]
+    left = float(np.sqrt(np.mean(shares[behind] ** 2)))
+    if not (NOTHING_FROM <= len(behind) < len(read) and left > NO_BEAM):
+        return []
+    first = ring[checked.data.monitors[found.owner[behind[0], 0]]]
+    make = wrong if len(behind) >= SURE else note
+    return [make(
+        "lost beam",
+        f"from {first.name} (s = {first.s:.2f} m) on the readings follow no trajectory in any "
+        "shot, and before they do: the beam was lost, or these BPMs have other names; leave their "
+        "readings out, or correct the names",
+    )]  # fmt: skip
+
+
+def _launches(checked: OfTurns) -> Check:
     """The check of the stated launches against fitted ones."""
     square = max(checked.square([()]), 1.0)
-    data = checked.measurement
+    data = checked.data
     if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
         return fine("launches", "no launch is stated; they are fitted")
     own, misfit = checked.launches(square, EXACT)
@@ -297,13 +333,13 @@ def _launches(checked: GlobalErrors) -> Check:
     return fine("launches", "the fitted launches are the stated ones")
 
 
-def _noise(checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
     """The check of the stated noise against the residuals between neighbouring BPMs."""
     level = float(np.sqrt(found.level))
     if not np.isfinite(level):
         return fine("noise", "too few BPMs to check the noise")
     typical = float(np.median(passes.sigma))
-    if checked.measurement.noise is None:
+    if checked.data.noise is None:
         return fine("noise", f"none is stated; the residuals are {_micro(level * typical)}")
     if level < 1 / OVER:
         return wrong(
@@ -331,7 +367,7 @@ def _noise(checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
         return note(
             "noise",
             f"{text}: the noise is larger than stated, or distributed errors are as large; "
-            f"{len(checked.measurement.shots)} shots do not show which: take {PASSES} or more",
+            f"{len(checked.data.shots)} shots do not show which: take {PASSES} or more",
         )
     return fine(
         "noise",
@@ -347,7 +383,7 @@ def _micro(metres: float) -> str:
     return f"{1e6 * metres:.3g} µm"
 
 
-def _spikes(checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
+def _spikes(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
     """The check for outliers, where the same section of other shots agrees."""
     none = fine("spikes", "no reading is an outlier")
     there = found.freedom > 2
@@ -362,23 +398,40 @@ def _spikes(checked: GlobalErrors, passes: Passes, found: SectionFits) -> Check:
         worst = int(alone.argmax())
         rest = found.misfit[p, w] * found.freedom[p, w] - alone[worst]
         if alone[worst] > SPIKE**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
-            name = checked.measurement.monitors[found.owner[w, worst]]
-            shot = checked.measurement.shots[passes.shot[p]]
+            name = checked.data.monitors[found.owner[w, worst]]
+            shot = checked.data.shots[passes.shot[p]]
             reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
     if not reported:
         return none
     return note("spikes", f"outliers: {signals.some(reported)}; leave them empty")
 
 
-# --- an orbit response ----------------------------------------------------------------------------
-def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
-    checks = signals.monitors(ring, data.monitors, data.response)
+# --- what is compared with the design's -----------------------------------------------------------
+def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[Check]:
+    checks: list[Check] = []
+    if isinstance(data, TurnByTurn):
+        data = beam_lost(data).without
+    if not isinstance(data, TuneReading):
+        values = read_of(data).reshape(-1, len(data.monitors), 2)
+        moved = isinstance(data, OrbitResponse | TurnByTurn)
+        checks = signals.monitors(ring, data.monitors, values, moved)
     if any(check.status == "wrong" for check in checks):
         return checks
-    verdicts, checked = _in_turn(ResponseGlobalErrors(ring, data), 4)
-    left = checked.misfit(())
-    typical = float(np.nanmedian(left)) if np.isfinite(left).any() else 0.0
-    if typical > (CORRECTED if verdicts else ANOTHER):
+    try:
+        search = compared(ring, data, problem)
+        checks += [note("lines", sentence) for sentence in search.warnings]
+        checks += [fine("tunes", sentence) for sentence in search.tunes]
+        errors, checked = _global(search)
+        left = checked.misfit()
+    except (MeasurementError, TooFewTurnsError) as error:
+        return [*checks, wrong("data", str(error))]
+    if not np.isfinite(left).any():
+        text = "one orbit is the sum of all errors: it shows neither signs nor the order of BPMs"
+        return [*checks, fine(GLOBAL, text)]
+    typical = float(np.nanmedian(left))
+    more = _rf_step(checked) if isinstance(checked, OfResponse) else []
+    found = [check for check in errors if check.status == "wrong"]
+    if isinstance(data, OrbitResponse) and typical > (CORRECTED if found else ANOTHER):
         guess = _far(ring, data)
         if guess is not None and guess.left < BETTER * typical:
             far = note(
@@ -389,32 +442,19 @@ def _of_response(ring: Ring, data: OrbitResponse) -> list[Check]:
                 "of the data are not checked",
             )
             # a wrong unit shows with any lattice
-            units = [own for own in verdicts if all(_UNIT in name for name in own.names)]
-            return [*checks, *map(_of_all, units), *_rf_step(checked), far]
+            units = [own for own in found if all(_UNIT in name for name in own.assume)]
+            return [*checks, *units, *more, far]
+    text = f"{search.of} {search.shown(typical)}"
     if typical > ANOTHER:  # no wrong sign, unit or order explains that
         return [*checks, wrong(
             "lattice",
-            f"the response is not that of '{ring.name}': the typical column differs from the "
-            f"design's by {100 * np.sqrt(typical):.0f} % of its size; name the lattice of this "
-            "machine, and check the names and the order of BPMs and correctors",
+            f"the data are not those of '{ring.name}': {text}; name the lattice of this machine, "
+            "and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
-    if not verdicts:
-        checks.append(fine(GLOBAL, "no global error would improve the agreement"))
-    text = f"the typical column is the design's to {100 * np.sqrt(typical):.0f} %"
-    return [*checks, *map(_of_all, verdicts), *_rf_step(checked), fine("lattice", text)]
+    return [*checks, *errors, *more, fine("lattice", text)]
 
 
-def _of_all(verdict: ResponseVerdict) -> Check:
-    words, others, correction = _words(verdict.names, verdict.alike)
-    before, after = (100 * np.sqrt(own) for own in (verdict.before, verdict.after))
-    text = (
-        f"{words}{others}: columns differ from the design's by {before:.0f} % of their size as "
-        f"stated, by {after:.0f} % with that corrected; {correction}"
-    )
-    return wrong(GLOBAL, text, assume=verdict.names)
-
-
-def _rf_step(checked: ResponseGlobalErrors) -> list[Check]:
+def _rf_step(checked: OfResponse) -> list[Check]:
     scale = checked.rf_scale()
     if not max(abs(scale), 1 / abs(scale)) > SCALED:
         return []
@@ -431,20 +471,6 @@ def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
         return elsewhere(response_data(ring, data))
     except TmlatticeError:  # reported elsewhere
         return None
-
-
-def _words(names: Sequence[str], alike: Sequence[Sequence[str]]) -> tuple[str, str, str]:
-    """The error, its alternatives, and the correction."""
-    words = " and ".join(ASSUMPTIONS[n].words for n in names)
-    others = "; ".join(
-        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}" for own in alike
-    )
-    corrections = ", ".join(dict.fromkeys(ASSUMPTIONS[n].correction for n in names))
-    return (
-        words,
-        f" ({others})" if others else "",
-        f"{corrections}, or go on with {_options(names)}",
-    )
 
 
 MOST = 0.5

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.model import Model
-from tmlattice.diagnosis.data_checks import corrected_data, data_checks
+from tmlattice.beam.rf import rf_of
+from tmlattice.beam.stored import StoredBeam
+from tmlattice.diagnosis.data_checks import corrected_data, data_checks, raise_if_wrong
 from tmlattice.diagnosis.prepare import batch, noise_of, prepare
-from tmlattice.diagnosis.stored_data_checks import raise_if_wrong
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
@@ -24,6 +26,7 @@ from tmlattice.measurement import (
     Dispersion,
     Measurement,
     OrbitResponse,
+    RfStep,
     TuneReading,
     TurnByTurn,
 )
@@ -34,17 +37,28 @@ from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
+from tmlattice.observe.spectra import Lines
 from tmlattice.observe.split import split_columns
 from tmlattice.observe.stored import ModelCache, Stored
 from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
 
 Array = NDArray[np.float64]
+
+NOISE, TURN_NOISE = 2e-6, 2e-5
+"""rms of an averaged reading of a stored beam, and of one of one turn, m."""
+TUNE, CHROMATICITY = 1e-4, 0.1
+"""rms of what is read of them."""
+TURNS, AMPLITUDE = 1000, 3e-4
+"""Amplitude of a kicked beam, m, at the BPMs where it is largest."""
+KICK, ENERGY_ORBIT = 1e-4, 1.3e-3
+"""Kick of each corrector, rad; orbit change by the RF's step, m rms."""
+
 Measured = Measurement | OrbitResponse | TurnByTurn | ClosedOrbit | Dispersion | TuneReading
 
 
 @dataclass(frozen=True)
-class How:
+class PartOptions:
     """Options of the diagnosis that a part needs.
 
     Attributes:
@@ -102,20 +116,18 @@ class Part:
     shots: tuple[tuple[int | None, ...], tuple[int, ...]] = ((), ())
 
 
-def part_of(label: str, measured: Measured, how: How) -> Part:
+def part_of(label: str, measured: Measured, options: PartOptions) -> Part:
     """Return a measurement as a part of a diagnosis.
 
     Raises:
         MeasurementError: data that cannot be used; the sentence names the label.
         UnknownNameError: a monitor that the ring does not have.
     """
-    for kind, (record, made) in KINDS.items():
-        if isinstance(measured, record):
-            return made(label, kind, measured, how)
-    raise TypeError(f"{type(measured).__name__} is no measurement")
+    name = kind_of(measured)
+    return KINDS[name].part(label, name, measured, options)
 
 
-def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> CombinedProblem:
+def stacked(parts: Sequence[Part], before: Sequence[Part], options: PartOptions) -> CombinedProblem:
     """Measurements with those of a reference as one problem; stored beams of one machine share its
     models."""
     cache = ModelCache()
@@ -131,40 +143,45 @@ def stacked(parts: Sequence[Part], before: Sequence[Part], how: How) -> Combined
         for part, own in zip((*parts, *before), (*first, *then), strict=True)
     )
     whole = CombinedProblem.of(first, then)
-    return replace(whole, places=how.places, judgement=how.judgement, starts=starts)
+    return replace(whole, places=options.places, judgement=options.judgement, starts=starts)
 
 
 def kind_of(measured: Measured) -> str:
     """The kind of a measurement, as its folder has it."""
-    return next(kind for kind, (record, _) in KINDS.items() if isinstance(measured, record))
+    for name, kind in KINDS.items():
+        if isinstance(measured, kind.record):
+            return name
+    raise TypeError(f"{type(measured).__name__} is no measurement")
 
 
 # --- the kinds ----
-def _first_turns(label: str, kind: str, measured: Any, how: How) -> Part:
-    ring = how.ring
-    measured = corrected_data(ring, measured, how.assume)
-    before, held = (corrected_data(ring, own, how.assume) for own in (how.reference, how.heldout))
-    messages = data_checks(ring, measured, how.radiation, before)
+def _first_turns(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
+    ring = options.ring
+    measured = corrected_data(ring, measured, options.assume)
+    before, held = (
+        corrected_data(ring, own, options.assume) for own in (options.reference, options.heldout)
+    )
+    messages = data_checks(ring, measured, options.radiation, before)
     measured = batch(ring, measured, messages)
     before, held = (own and batch(ring, own, messages) for own in (before, held))
-    if held is None and how.holdout:
-        measured, held = measured.split(how.holdout, how.seed)
-        if held is None and not how.places:
+    if held is None and options.holdout:
+        measured, held = measured.split(options.holdout, options.seed)
+        if held is None and not options.places:
             messages.append("one shot was measured, so none is held out")
-    options = (how.radiation, how.effects, how.judgement)
-    ready = prepare(ring, measured, before, *options)
+    chosen = (options.radiation, options.effects, options.judgement)
+    ready = prepare(ring, measured, before, *chosen)
     estimated = ready.estimated
     if before is not None and estimated:  # the same electronics: from all shots
         noise = scatter(ready.problem.data, ready.before.point.view)
         if np.isfinite(noise).all():
             measured, before = (_with_noise(own, noise) for own in (measured, before))
-            ready = prepare(ring, measured, before, *options)
+            ready = prepare(ring, measured, before, *chosen)
     other = None
     if held is not None:
         data = of_measurement(ring, held).with_sigma(np.array(noise_of(ready.problem.data)))
         known = ready.problem.model.assembly.known
         model = Model(ring, data.settings, data.turns, known, active=data.active)
-        other = FirstTurns(model=model, data=data, places=how.places)
+        other = FirstTurns(model=model, data=data, places=options.places)
     earlier: tuple[int | None, ...] = (None,) * (0 if before is None else len(before.shots))
     return Part(
         label, kind, ready.problem, other, estimated, ready.dead, (*messages, *ready.messages),
@@ -180,22 +197,22 @@ def _with_noise(measured: Measurement, noise: Array) -> Measurement:
     return replace(measured, noise=np.where(np.isfinite(stated), stated, noise))
 
 
-def _response(label: str, kind: str, measured: Any, how: How) -> Part:
-    ring = how.ring
-    measured = corrected_data(ring, measured, how.assume)
+def _response(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
+    ring = options.ring
+    measured = corrected_data(ring, measured, options.assume)
     messages = tuple(data_checks(ring, measured))
     data = response_data(ring, measured)
     there = np.isfinite(data.orbits)
     base = Predicted(data, Errors.none(data)).bend()
-    if not how.holdout:
-        whole = Response(base=base, used=there, places=how.places, judgement=how.judgement)
+    if not options.holdout:
+        whole = Response(base=base, used=there, places=options.places, judgement=options.judgement)
         return Part(label, kind, whole, messages=messages)
-    split = split_columns(data, min(how.holdout, 0.2), np.random.default_rng(how.seed))
+    split = split_columns(data, min(options.holdout, 0.2), np.random.default_rng(options.seed))
     held = np.append(split.held[:-1], False)[:, None]
     # half of a held-out corrector's BPMs is fitted, to determine its own kick
     fitted, judges = (
-        Response(base=base, used=there & which[:, :, None], places=how.places,
-                 judgement=how.judgement)
+        Response(base=base, used=there & which[:, :, None], places=options.places,
+                 judgement=options.judgement)
         for which in (~held | split.half, held & ~split.half)
     )  # fmt: skip
     return Part(label, kind, fitted, judges, messages=messages)
@@ -203,40 +220,149 @@ def _response(label: str, kind: str, measured: Any, how: How) -> Part:
 
 def _of_stored(
     make: Callable[..., Problem], shots: bool = False
-) -> Callable[[str, str, Any, How], Part]:
+) -> Callable[[str, str, Any, PartOptions], Part]:
     """A kind of a stored beam; with `shots`, some are held out if there are enough of them."""
 
-    def made(label: str, kind: str, measured: Any, how: How) -> Part:
-        if how.assume:
-            raise MeasurementError(
-                f"'{how.assume[0]}' cannot be assumed of {label}, a {kind.replace('_', ' ')}: "
-                "correct the data themselves"
-            )
+    def made(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
+        measured = corrected_data(options.ring, measured, options.assume)
         held = None
         ids = list(measured.shots) if shots else []
-        count = round(how.holdout * len(ids))
+        count = round(options.holdout * len(ids))
         if len(ids) > 2 and count:
-            drawn = np.random.default_rng(how.seed).permutation(ids).tolist()
+            drawn = np.random.default_rng(options.seed).permutation(ids).tolist()
             held, measured = (
                 measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
             )
-        problem = make(how.ring, measured, how.places)
+        problem = make(options.ring, measured, options.places)
         if isinstance(problem, Stored):
-            raise_if_wrong(how.ring, measured, problem)
+            raise_if_wrong(options.ring, measured, problem)
         messages = problem.warnings if isinstance(problem, ManyTurns) else ()
         return Part(
-            label, kind, problem, held and make(how.ring, held, how.places), messages=messages
+            label,
+            kind,
+            problem,
+            held and make(options.ring, held, options.places),
+            messages=messages,
         )
 
     return made
 
 
-KINDS: Mapping[str, tuple[type, Callable[[str, str, Any, How], Part]]] = {
-    "trajectory": (Measurement, _first_turns),
-    "orbit_response": (OrbitResponse, _response),
-    "turn_by_turn": (TurnByTurn, _of_stored(many_turns, shots=True)),
-    "closed_orbit": (ClosedOrbit, _of_stored(closed_orbits, shots=True)),
-    "dispersion": (Dispersion, _of_stored(dispersion)),
-    "tunes": (TuneReading, _of_stored(tune_readings)),
-}
-"""Records and their part functions, by the kind that a folder states."""
+# --- simulated measurements: their noise and the amplitude of kicks count ------------------
+def _no_orbit(ring: Ring) -> tuple[tuple[str, ...], Array]:
+    names = tuple(monitor.name for monitor in ring.monitors)
+    return names, np.zeros((len(names), 2))
+
+
+def _propose_orbit(ring: Ring, options: PartOptions) -> Problem:
+    names, nothing = _no_orbit(ring)
+    orbit = ClosedOrbit(orbit=nothing[None], monitors=names, noise=nothing + NOISE)
+    return closed_orbits(ring, orbit, options.places)
+
+
+def _propose_dispersion(ring: Ring, options: PartOptions) -> Problem:
+    names, nothing = _no_orbit(ring)
+    model, rf = ResponseModel(ring), rf_of(ring)
+    size = float(np.sqrt(np.mean(model.rf_response()[:, 0] ** 2)))
+    if not size:
+        raise TmlatticeError("no dispersion")
+    step = RfStep(
+        rf.frequency(ring), rf.harmonic, ENERGY_ORBIT / size * rf.frequency(ring), nothing
+    )
+    proposed = Dispersion(steps=(step,), monitors=names, noise=nothing + NOISE)
+    return dispersion(ring, proposed, options.places)
+
+
+def _propose_tunes(ring: Ring, options: PartOptions) -> Problem:
+    two = np.ones((1, 2))
+    reading = TuneReading(
+        tune=0.25 * two, tune_error=TUNE * two, chromaticity=two,
+        chromaticity_error=CHROMATICITY * two,
+    )  # fmt: skip
+    return tune_readings(ring, reading, options.places)
+
+
+def _propose_turns(ring: Ring, options: PartOptions) -> Problem:
+    names, nothing = _no_orbit(ring)
+    beam = StoredBeam(ResponseModel(ring))
+    lines = AMPLITUDE * beam.modes / np.abs(beam.modes).max(axis=(0, 1))
+    noise = np.full(lines.shape, TURN_NOISE * np.sqrt(2 / TURNS))
+    found = Lines(
+        names, (0,), beam.tunes[None] % 1, np.full((1, 2), 1e-6), lines[None], noise[None],
+        nothing + TURN_NOISE, np.array([TURNS]), np.ones((1, 2, 1), dtype=complex), (),
+    )  # fmt: skip
+    kicked = TurnByTurn(readings=np.zeros((1, 16, len(names), 2)), monitors=names)
+    return many_turns(ring, kicked, options.places, found)
+
+
+def _propose_response(ring: Ring, options: PartOptions) -> Problem:
+    names, nothing = _no_orbit(ring)
+    columns = ResponseModel(ring).columns(None)
+    count = len(columns.names)
+    if not count:
+        raise TmlatticeError("no corrector")
+    response = OrbitResponse(
+        correctors=columns.names, planes=columns.planes, kicks=np.full(count, KICK),
+        monitors=names, response=np.broadcast_to(nothing, (count, *nothing.shape)).copy(),
+        noise=nothing + NOISE,
+    )  # fmt: skip
+    data = response_data(ring, response)
+    base = Predicted(data, Errors.none(data)).bend()
+    return Response(
+        base=base, used=np.isfinite(data.orbits), places=options.places,
+        judgement=options.judgement,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of measurement.
+
+    Attributes:
+        record: its class.
+        part: makes it a part of a diagnosis, of its label, kind, record and options.
+        quantities: of the stored beam that it contains.
+        words: what to measure, as a sentence begins with it.
+        proposal: problem of a simulated measurement with the usual noise; None: it is never
+            recommended as the next one.
+        per_measurement, per_corrector: machine time, minutes: of the whole, and of each corrector.
+    """
+
+    record: type
+    part: Callable[[str, str, Any, PartOptions], Part]
+    quantities: tuple[str, ...] = ()
+    words: str = ""
+    proposal: Callable[[Ring, PartOptions], Problem] | None = None
+    per_measurement: float = 0.0
+    per_corrector: float = 0.0
+
+    def minutes(self, ring: Ring) -> float:
+        """Machine time of one measurement."""
+        correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in ring.elements)
+        return self.per_measurement + self.per_corrector * correctors
+
+
+KINDS: Mapping[str, Kind] = {
+    "trajectory": Kind(Measurement, _first_turns),
+    "closed_orbit": Kind(
+        ClosedOrbit, _of_stored(closed_orbits, shots=True), ("closed_orbit",),
+        "A closed orbit", _propose_orbit, 0.5,
+    ),
+    "tunes": Kind(
+        TuneReading, _of_stored(tune_readings), ("tunes",),
+        "Tunes and chromaticities", _propose_tunes, 2.0,
+    ),
+    "turn_by_turn": Kind(
+        TurnByTurn, _of_stored(many_turns, shots=True), ("closed_orbit", "tunes"),
+        "Turns of the stored beam after a kick", _propose_turns, 2.0,
+    ),
+    "dispersion": Kind(
+        Dispersion, _of_stored(dispersion), ("dispersion",),
+        "The dispersion", _propose_dispersion, 3.0,
+    ),
+    "orbit_response": Kind(
+        OrbitResponse, _response, (), "An orbit response", _propose_response,
+        per_corrector=0.2,  # two settings and their orbits
+    ),
+}  # fmt: skip
+"""Every kind, by the name that a folder states."""

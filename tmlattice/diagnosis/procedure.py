@@ -2,8 +2,8 @@
 
 >>> diagnose_together(ring, {"kick": turns, "orbit": orbit, "injection": first_turns})
 
-Rows are stacked; causes are shared, nuisances are each measurement's own (see `strategy` for the
-steps). A reference of each kind has the earlier errors.
+Rows are stacked; causes are shared, nuisances are each measurement's own (see `selection`
+for the steps). A reference of each kind has the earlier errors.
 """
 
 import logging
@@ -24,11 +24,12 @@ from tmlattice.diagnosis.findings import (
     verdict_of,
     with_consequences,
 )
-from tmlattice.diagnosis.kinds import How, Measured, Part, kind_of, part_of, stacked
+from tmlattice.diagnosis.kinds import Measured, Part, PartOptions, kind_of, part_of, stacked
 from tmlattice.diagnosis.next_kind import leading, next_kind
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.selection import freedom, select, select_changes
 from tmlattice.diagnosis.stages import (
     held_out,
     held_out_shots,
@@ -40,7 +41,6 @@ from tmlattice.diagnosis.stages import (
     trajectory_view,
     views_of,
 )
-from tmlattice.diagnosis.strategy import freedom, sought, sought_since
 from tmlattice.diagnosis.support import correlations_of
 from tmlattice.diagnosis.suspects import suspects
 from tmlattice.diagnosis.views import JointView
@@ -77,7 +77,7 @@ def diagnose_together(
     measured: Mapping[str, Measured],
     *,
     reference: Mapping[str, Any] | None = None,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     known: DistributedErrors | None = None,
     holdout: float = 0.33,
     heldout: Measurement | None = None,
@@ -106,45 +106,51 @@ def diagnose_together(
     """
     begun = time.perf_counter()
     judgement = Judgement(false_alarm=false_alarm)
-    how = How(ring, {}, judgement, holdout, assume, seed)
+    options = PartOptions(ring, {}, judgement, holdout, assume, seed)
     progress("data")
     kinds = [kind_of(one) for one in measured.values()]
     if kinds == ["trajectory"] and known is None:  # with launches of its own, all can be shared
         (label, one), *_ = measured.items()
         first = next(iter((reference or {}).values()), None)
-        whole = replace(how, effects=effects, radiation=radiation, reference=first, heldout=heldout)
+        whole = replace(
+            options, effects=effects, radiation=radiation, reference=first, heldout=heldout
+        )
         parts, before = [part_of(label, one, whole)], list[Part]()
         hypotheses = list(parts[0].hypotheses or ())
         chosen = list(parts[0].problem.places)
-        how = replace(whole, places=parts[0].problem.places)
+        options = replace(whole, places=parts[0].problem.places)
     else:
         chosen = _chosen(ring, effects, "turn_by_turn" in kinds)
         places = {name: float(max(len(find(name).places(ring)), 1)) for name in chosen}
-        how = replace(how, places=places)
-        parts = [with_silent(ring, _named(label, one, how), one) for label, one in measured.items()]
-        plain = replace(how, holdout=0.0)
+        options = replace(options, places=places)
+        parts = [
+            with_silent(ring, _named(label, one, options), one) for label, one in measured.items()
+        ]
+        plain = replace(options, holdout=0.0)
         before = [_named(label, one, plain) for label, one in (reference or {}).items()]
         hypotheses = _seen(ring, chosen, parts)
     problem = replace(
-        stacked(parts, before, how), rare=rare(ring, chosen),
+        stacked(parts, before, options), rare=rare(ring, chosen),
         fixed=() if known is None else known.causes,
     )  # fmt: skip
     search = Search(
         problem, hypotheses, max_effects, seed=seed, progress=progress,
         unnamed=all(part.kind != "orbit_response" for part in parts),
     )  # fmt: skip
-    usual = background_rms({"all": None})
+    usual = background_rms("all")
+    if isinstance(background, str):
+        background = {background: None}
     sizes = usual if background is None else background_rms(background)
     everywhere = [(name, place) for name in sizes for place in find(name).places(ring)]
     learn = background is None
     noisy = any(part.estimated for part in parts)
     if problem.alone:
-        sought_out = sought(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
+        selected = select(search, everywhere, sizes, learn=learn, noisy=noisy, known=known)
     else:
         first, _ = problem.reference(problem.first)
         earlier = replace(search, problem=first, hypotheses=_seen(ring, modelled(), parts))
-        sought_out = sought_since(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
-    small = sought_out.small
+        selected = select_changes(search, earlier, everywhere, sizes, learn=learn, noisy=noisy)
+    small = selected.distributed
     if noisy and problem.alone and small is not None:  # with the noise that was learnt
         assert isinstance(small.plain, CombinedProblem)
         problem = small.plain
@@ -152,7 +158,7 @@ def diagnose_together(
         parts = [replace(part, problem=learnt) for part, learnt in own]
     progress("report")
     return _report(
-        ring, parts, problem, sought_out.explanation, small, how,
+        ring, parts, problem, selected.explanation, small, options,
         {
             "seconds": time.perf_counter() - begun, "seed": seed,
             "options": {
@@ -166,9 +172,9 @@ def diagnose_together(
     )  # fmt: skip
 
 
-def _named(label: str, measured: Measured, how: How) -> Part:
+def _named(label: str, measured: Measured, options: PartOptions) -> Part:
     try:
-        return part_of(label, measured, how)
+        return part_of(label, measured, options)
     except MeasurementError as error:
         raise MeasurementError(f"{label}: {error}") from error
 
@@ -201,10 +207,10 @@ def _report(
     problem: CombinedProblem,
     found: Explanation,
     small: FittedErrors | None,
-    how: How,
+    options: PartOptions,
     made: Mapping[str, Any],
 ) -> Diagnosis:
-    judgement = how.judgement
+    judgement = options.judgement
     found = finished(_by_ring(ring, problem, found))
     result = found.fit
     # what counts turns late reads nothing in the first ones
@@ -274,7 +280,7 @@ def _report(
             judgement,
         ),
         tunes={"before": ring_tunes(ring), "after": ring_tunes(corrected)},
-        next=_next(ring, found, parts, how, problem.fixed),
+        next=_next(ring, found, parts, options, problem.fixed),
         sensitivity=sensitivity(found.first, judgement),
         warnings=tuple(dict.fromkeys(warnings)),
         suspects=suspects(ring, found, judgement) if verdict == "distributed" else (),
@@ -293,17 +299,21 @@ def _report(
 
 
 def _next(
-    ring: Ring, found: Explanation, parts: Sequence[Part], how: How, fixed: tuple[Cause, ...]
+    ring: Ring,
+    found: Explanation,
+    parts: Sequence[Part],
+    options: PartOptions,
+    fixed: tuple[Cause, ...],
 ) -> NextMeasurement | None:
     """The recommended next measurement: of first turns one more shot, else another kind."""
     one = parts[0].problem
     if len(parts) > 1 or not isinstance(one, FirstTurns):
-        return next_kind(ring, found, [part.kind for part in parts], how, fixed)
-    pair = leading(ring, found, how.judgement.mass)
+        return next_kind(ring, found, [part.kind for part in parts], options, fixed)
+    pair = leading(ring, found, options.judgement.mass)
     if pair is None:
         return None
     try:
-        return next_measurement(ring, one.data, *pair, one.model.assembly.known, how.seed)
+        return next_measurement(ring, one.data, *pair, one.model.assembly.known, options.seed)
     except TmlatticeError:
         log.warning("no next measurement could be found", exc_info=True)
     return None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
+from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
 from tmlattice.diagnosis.records import OPTIONAL, encoded, record_of
@@ -40,14 +41,6 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis.response.missing_effects import Weighed
     from tmlattice.diagnosis.response.stepwise import Step
     from tmlattice.diagnosis.suspects import Suspect
-
-_MEASURES = {
-    "closed_orbit": ("closed_orbit",),
-    "turn_by_turn": ("closed_orbit", "tunes"),
-    "dispersion": ("dispersion",),
-    "tunes": ("tunes",),
-}
-"""Quantities of the stored beam that a kind of measurement contains."""
 
 VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
 """Verdicts from the most certain to the least."""
@@ -224,7 +217,7 @@ class Diagnosis(Speaks):
         compared: blocks of readings with their prediction by the result.
         correlations: pairs of amounts that the data hardly separate.
         covariance: of the amounts of the causes, [cause, cause]; None where none is stated, as of
-            a change between two orbit responses and of a diagnosis that was loaded. See `tables`.
+            many changes between two orbit responses, and after loading. See `tables`.
         devices: what the control system calls elements, by their names.
         supports: how much of each cause comes from the data, the same length; empty where all do,
             because their priors are log-uniform.
@@ -328,7 +321,7 @@ class Diagnosis(Speaks):
         if isinstance(self.view, StoredView):
             return self.view.measured
         kinds = {part.kind for part in self.parts} or {self.kind}
-        found = {quantity for kind in kinds for quantity in _MEASURES.get(kind, ())}
+        found = {quantity for kind in kinds for quantity in KINDS[kind].quantities}
         if isinstance(self.view, ResponseView) and np.isfinite(self.view.data[-1]).any():
             found.add("dispersion")
         return tuple(sorted(found))

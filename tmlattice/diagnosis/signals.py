@@ -11,8 +11,10 @@ from tmlattice.diagnosis.records import encoded, named
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, OrbitResponse
+from tmlattice.measurement import AnyMeasurement, Measurement, TuneReading
 from tmlattice.measurement.lost_beam import FEWEST, LostBeam
+from tmlattice.measurement.monitors import LARGEST_READING
+from tmlattice.measurement.shots import FEWEST as TURNS
 from tmlattice.observe.noise import SAME_PLACE
 
 Array = NDArray[np.float64]
@@ -23,7 +25,10 @@ NAMED = 3
 CUT = FEWEST
 """Silent BPMs at the end of a shot from which on the beam counts as lost."""
 ALIKE = 0.5
-"""Share of constant signals from which on the data are no readings."""
+"""Share of constant signals from which on the data are no readings; and of the readings of a signal
+that repeat the one before, from which on it is frozen."""
+SENSIBLE = LARGEST_READING / 100
+"""m; typical reading below which the readings are in metres, and larger ones are none."""
 STRAY = 0.02
 """Share of a turn's readings below which a turn far behind the others is a wrong number."""
 
@@ -159,6 +164,14 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     if not np.count_nonzero(values[there]):
         text = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen monitors", text)]
+    large = np.abs(values) > LARGEST_READING
+    if large.any() and np.median(np.abs(values[there])) < SENSIBLE:  # else their unit is wrong
+        own = some([names[m] for m in np.flatnonzero(large.any(axis=(0, 2))).tolist()])
+        text = (
+            f"{large.sum()} of {there.sum()} readings are above {LARGEST_READING} m, of {own}: no "
+            "beam reads that; leave them out (NaN, or an empty field)"
+        )
+        return [wrong("large readings", text)]
     checks = []
     checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [
@@ -176,7 +189,8 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     with np.errstate(invalid="ignore"):
         high = np.where(there, values, -np.inf).max(axis=0)
         low = np.where(there, values, np.inf).min(axis=0)
-    stuck = many & (high == low)
+    again = (values[1:] == values[:-1]).sum(axis=0) > ALIKE * (len(values) - 1)
+    stuck = many & ((high == low) | (again & (moved & (len(values) >= TURNS))))
     frozen = [
         n if both else f"{n} in {'x' if x else 'y'}"
         for n, (x, y), both in zip(names, stuck, stuck.all(axis=1), strict=True)
@@ -189,7 +203,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         )
         checks.append(wrong("frozen monitors", text))
     elif frozen:
-        text = f"the same reading in every shot and turn: {some(frozen)}; leave the signal out"
+        text = f"the same reading again and again: {some(frozen)}; leave the signal out"
         checks.append(note("frozen monitors", text))
     else:
         checks.append(fine("frozen monitors", "no BPM is frozen"))
@@ -220,7 +234,7 @@ def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> li
     return found
 
 
-def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
+def first_turns(ring: Ring, data: Measurement, lost: LostBeam[Measurement]) -> list[Check]:
     """Check first turns for invalid turn numbers and lost beams.
 
     Args:
@@ -251,7 +265,7 @@ def first_turns(ring: Ring, data: Measurement, lost: LostBeam) -> list[Check]:
     return checks
 
 
-def _no_signal(ring: Ring, lost: LostBeam) -> str:
+def _no_signal(ring: Ring, lost: LostBeam[Measurement]) -> str:
     """The message where the beam was lost, by constant readings."""
     data, shots = lost.without, lost.shots
     ends = sorted(set(lost.last[shots].tolist()))
@@ -291,9 +305,9 @@ def _turns(there: Flags) -> Check:
     return fine("turns", f"{turns} read")
 
 
-def few(ring: Ring, data: Measurement | OrbitResponse) -> Check | None:
+def few(ring: Ring, data: AnyMeasurement) -> Check | None:
     """The check for too few BPMs."""
-    if not ring.monitors:
+    if not ring.monitors and not isinstance(data, TuneReading):
         return wrong(
             "monitors", f"'{ring.name}' has no monitor; name those elements of the lattice that "
             "are monitors",

@@ -22,19 +22,15 @@ from tmlattice.inference.distributed import (
     chain_factors,
     signatures_of,
 )
-from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
-from tmlattice.inference.validation import Gap, Misfit, held_out_gap
+from tmlattice.inference.validation import DETERMINED, Gap, Misfit, held_out_gap
 from tmlattice.inference.whitening import Blocks
 from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-GAP = 0.05
-"""Chi-square per reading beyond the noise below which there is no gap."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +196,7 @@ def held_out(
     readings = sum(int((judge.valid & own).sum()) for judge, own in zip(judges, among, strict=True))
     gap = Gap(tuple(misfits), np.zeros((0, 0, 0)), None, None, since, readings)
     before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
-    if before > GAP and since < len(misfits) - 1 and gap.significant(DEFAULT.false_alarm):
+    if readings and before > DETERMINED * np.sqrt(2 / readings) and since < len(misfits) - 1:
         return replace(gap, explained=1 - after / before)
     return gap
 

@@ -26,9 +26,6 @@ from tmlattice.lattice import Element, Ring
 MOST = 3
 """Suspects of each kind."""
 
-FLOOR = 9.0
-"""Fall of chi-square from which on a hypothesis is suspect: 3 sigma for a single test."""
-
 SuspectKind = Literal["monitor", "corrector", "magnet", "section"]
 
 OUTLIER = 5.0
@@ -94,7 +91,7 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
     found: dict[tuple[SuspectKind, object], Suspect] = {}
     places = {element.name: element for element in ring.elements}
     threshold = explanation.scan.threshold(judgement.false_alarm)
-    for effect, name, statistic in _candidates(ring, explanation):
+    for effect, name, statistic in _candidates(ring, explanation, judgement):
         if name not in places:
             continue  # the beam, or a family: no place to inspect
         element = places[name]
@@ -163,8 +160,9 @@ def numbers(amounts: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, .
     return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
 
 
-def _candidates(ring: Ring, explanation: Explanation) -> Iterator[Candidate]:
-    """Candidates by falling statistic: of the search, then of the scan of its residual."""
+def _candidates(ring: Ring, explanation: Explanation, judgement: Judgement) -> Iterator[Candidate]:
+    """Candidates by falling statistic: of the search, then of the scan of its residual, those that
+    a single test finds significant."""
     candidates: list[Candidate] = [
         (cause.effect, cause.element, named.detection.statistic)
         for cause, named in zip(explanation.fit.causes, explanation.named, strict=True)
@@ -175,9 +173,9 @@ def _candidates(ring: Ring, explanation: Explanation) -> Iterator[Candidate]:
         (None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()
     ]
     yield from sorted(candidates, key=lambda candidate: -candidate[2])
-    scan = explanation.scan
+    scan, least = explanation.scan, chi2.isf(judgement.false_alarm, 1)
     for i in np.argsort(-scan.statistic):
-        if scan.statistic[i] < FLOOR:
+        if scan.statistic[i] < least:
             break
         effect, name = scan.hypotheses[int(i)]
         if name is not None:

@@ -9,19 +9,19 @@ from tmlattice.errors import EffectError
 from tmlattice.lattice import Ring
 
 
-def background_rms(wanted: Mapping[str, float | None]) -> dict[str, float]:
+def background_rms(wanted: str | Mapping[str, float | None]) -> dict[str, float]:
     """Return the rms of each distributed effect.
 
     Args:
         wanted: effect -> rms, or None for the catalogue's; "all" -> a scale of the catalogue's
             (None: 1) for every effect that has one; "none" alone: no errors. Named effects
-            override "all".
+            override "all". A name alone stands for its None.
 
     Raises:
         EffectError: an effect without a usual size, or a negative rms.
         UnknownNameError: no such effect.
     """
-    wanted = dict(wanted)
+    wanted = {wanted: None} if isinstance(wanted, str) else dict(wanted)
     if "none" in wanted:
         if len(wanted) > 1:
             raise EffectError("'none' excludes all distributed errors; give it alone")

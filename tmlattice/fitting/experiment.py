@@ -7,6 +7,7 @@ it predicts are compared with OCELOT's one-turn matrix of the perturbed ring.
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -152,37 +153,38 @@ def tune_fit(
     start = np.asarray(launch, dtype=float)
     if start.shape != (4,) or not np.isfinite(start).all():
         raise TmlatticeError("a launch has four finite numbers: x, px, y, py in m and rad")
-    recipe = {
+    recipe: dict[str, Any] = {
         "epochs": epochs, "learning_rate": learning_rate, "regularization": regularization,
         "regularization_rate": regularization_rate, "relative_to_design": relative_to_design,
         "free": free, "clip": clip, "patience": patience,
     }  # fmt: skip
-    work = _Work(_ordered(methods), _enough(turns), start, progress, recipe, candidates)
     name = middle_of_first_arc(ring).name if magnet is None else ring[magnet].name
-    with work.watch.stage("compile"):
-        for element in {e.kind: e for e in ring.elements}.values():
-            element_map(element, ring.map_energy)  # OCELOT compiles some of its own code
-    with work.watch.stage("maps"):
-        machine, true_tunes, change = changed_ring(ring, name, change)
-        network = TaylorNetwork.from_ring(ring)
-        truth = TaylorNetwork.from_ring(machine)
-        design_tunes = matrix_tunes(ring_matrix(ring))
-    readings = truth.readings(start[None])
-    readings = readings + noise * np.random.default_rng(seed).standard_normal(readings.shape)
-    rms = np.full((len(network.monitors), 2), max(noise, NOISE_FLOOR))
-    exact = np.zeros_like(start[None])
-    measurement = Measurement(start[None], readings[:, None], network.monitors, rms, exact)
-    found = _fit_and_track(network, measurement, np.zeros((1, 4)), work)
-    return TuneFit(
-        ring=ring,
-        magnet=name,
-        change=change,
-        noise=noise,
-        design_tunes=design_tunes,
-        true_tunes=true_tunes,
-        seed=seed,
-        **found,
-    )
+    machine, true_tunes, change = changed_ring(ring, name, change)
+    measurement = first_turn_of(machine, start[None], noise, np.random.default_rng(seed))
+    found = tune_fit_measurement(
+        ring, measurement, turns, methods=methods, candidates=candidates, progress=progress,
+        **recipe,
+    )  # fmt: skip
+    return replace(found, magnet=name, change=change, noise=noise, true_tunes=true_tunes, seed=seed)
+
+
+def first_turn_of(
+    machine: Ring, launches: Array, noise: float, random: np.random.Generator
+) -> Measurement:
+    """Return the first turn of a ring with noise, its launches exact.
+
+    Args:
+        machine: the ring.
+        launches: [shot, 4], m and rad.
+        noise: rms of a reading, m; at least `NOISE_FLOOR` is stated.
+        random: of the noise.
+    """
+    truth = TaylorNetwork.from_ring(machine)
+    readings = truth.readings(launches)
+    readings = readings + noise * random.standard_normal(readings.shape)
+    rms = np.full((len(truth.monitors), 2), max(noise, NOISE_FLOOR))
+    exact = np.zeros_like(launches)
+    return Measurement(launches, readings[:, None], truth.monitors, rms, exact)
 
 
 @by_name
@@ -192,6 +194,7 @@ def tune_fit_measurement(
     turns: int = 500,
     *,
     methods: Sequence[str] = METHODS,
+    candidates: Sequence[str] | None = None,
     source: str | None = None,
     progress: bool = True,
     **recipe: Any,
@@ -206,7 +209,8 @@ def tune_fit_measurement(
         ring: the design.
         measurement: of one shot or more; an unstated noise is estimated.
         turns: tracked for the tunes, at a vanishing amplitude.
-        methods: some of `METHODS`.
+        methods: some of `METHODS`, or "known".
+        candidates: names of the only magnets that may have changed, of "known".
         source: where the data are from, for the report.
         progress: show a bar where there is a terminal.
         recipe: options of `fitting.adam.fit_adam`.
@@ -218,7 +222,10 @@ def tune_fit_measurement(
         UnstableRingError: the design has no tune.
         BeamLostError: a launch is lost on the first turn, or the fit diverged.
     """
-    names, turns = _ordered(methods), _enough(turns)
+    begun = time.perf_counter()
+    names = _ordered(methods)
+    if turns < MIN_TURNS:
+        raise TooFewTurnsError(f"{turns} turns are too few for a tune; give at least {MIN_TURNS}")
     dimension = 6 if measurement.launches[:, 4].any() else 4
     sigma = launch_errors(measurement, dimension)
     if not (measurement.launches.any() or sigma.any()):
@@ -232,44 +239,56 @@ def tune_fit_measurement(
             f"shot {changed[0]} has settings other than the design's, which this fit does not "
             "model; select the shots without them"
         )
-    start = np.zeros(dimension)
-    start[:4] = DEFAULT_LAUNCH  # both planes move, whatever the shots did
-    work = _Work(names, turns, start, progress, recipe)
-    with work.watch.stage("compile"):
+    watch = _Stopwatch()
+    with watch.stage("compile"):
         for element in {e.kind: e for e in ring.elements}.values():
-            element_map(element, ring.map_energy, dimension)
-    with work.watch.stage("maps"):
+            element_map(element, ring.map_energy, dimension)  # OCELOT compiles some of its own code
+    with watch.stage("maps"):
         network = TaylorNetwork.from_ring(ring, dimension)
         design_tunes = matrix_tunes(ring_matrix(ring))
     measurement = measurement.in_order_of(network.monitors)
     measurement, estimated = with_noise(ring, measurement, dimension)
-    found = _fit_and_track(network, measurement, sigma, work)
-    assert measurement.noise is not None
+    noise = measurement.noise
+    assert noise is not None
+    nominal = measurement.states(dimension)
+    read = measurement.readings[:, 0]
+    if not np.isfinite(read).any():
+        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
+    shown = int(np.isfinite(read).any(axis=(1, 2)).argmax())  # the first shot with a reading
+    with watch.stage("compile"):
+        compile_kernels(network, names)
+    before = network.readings(FreeLaunches(nominal, sigma, read, noise).fitted(network))
+    own = {"adam": recipe, "known": {"candidates": candidates}}
+    columns = []
+    for name in names:
+        options = {"launch_sigma": sigma, "progress": progress, **own.get(name, {})}
+        columns.append(fit_and_track(name, network, measurement, turns, shown, **options))
+    columns.sort(key=lambda column: column.fit is None)
+    if columns[0].fit is None:
+        raise UnstableRingError(columns[0].problem or "no method found a ring with tunes")
+    watch["fit"] = sum(column.fit.seconds for column in columns if column.fit is not None)
+    watch["tunes"] = sum(column.seconds for column in columns) - watch["fit"]
+    watch["total"] = time.perf_counter() - begun
     return TuneFit(
         ring=ring,
         magnet=None,
         change=None,
-        noise=float(np.sqrt(np.nanmean(measurement.noise**2))),
+        launch=nominal[shown],
+        noise=float(np.sqrt(np.nanmean(noise**2))),
         design_tunes=design_tunes,
         true_tunes=None,
+        s=network.maps.s_monitors,
+        measured=read[shown],
+        before=before[shown],
+        rms_before=float(np.sqrt(np.nanmean((read - before) ** 2))),
+        methods=tuple(columns),
+        seconds=dict(watch),
         seed=0,
+        turns=turns,
+        shots=len(nominal),
         source=source,
         noise_estimated=estimated,
-        **found,
     )
-
-
-class _Work:
-    """What the methods share: which, how many turns from where, and the options of "adam" and of
-    "known"."""
-
-    def __init__(
-        self, methods: tuple[str, ...], turns: int, start: Array, progress: bool,
-        recipe: dict[str, Any], candidates: Sequence[str] | None = None,
-    ) -> None:  # fmt: skip
-        self.methods, self.turns, self.start, self.progress = methods, turns, start, progress
-        self.options = {"adam": recipe, "known": {"candidates": candidates}}
-        self.watch, self.begun = _Stopwatch(), time.perf_counter()
 
 
 def _ordered(methods: Sequence[str]) -> tuple[str, ...]:
@@ -283,64 +302,34 @@ def _ordered(methods: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in known if name in methods)
 
 
-def _enough(turns: int) -> int:
-    if turns < MIN_TURNS:
-        raise TooFewTurnsError(f"{turns} turns are too few for a tune; give at least {MIN_TURNS}")
-    return turns
-
-
-def _fit_and_track(
-    network: TaylorNetwork, measurement: Measurement, sigma: Array, work: _Work
-) -> dict[str, Any]:
-    """Return the fits with their tunes: attributes of TuneFit."""
-    assert measurement.noise is not None
-    nominal = measurement.states(network.dimension)
-    read = measurement.readings[:, 0]
-    if not np.isfinite(read).any():
-        raise MeasurementError("no reading of the first turn (turn 0); nothing can be fitted")
-    shown = int(np.isfinite(read).any(axis=(1, 2)).argmax())  # the first shot with a reading
-    with work.watch.stage("compile"):
-        compile_kernels(network, work.methods)
-    design = FreeLaunches(nominal, sigma, read, measurement.noise).fitted(network)
-    before = network.readings(design)
-    columns = [_column(name, network, measurement, sigma, shown, work) for name in work.methods]
-    fitted = [column for column in columns if column.fit is not None]
-    if not fitted:
-        raise UnstableRingError(columns[0].problem or "no method found a ring with tunes")
-    work.watch["total"] = time.perf_counter() - work.begun
-    return {
-        "launch": nominal[shown],
-        "s": network.maps.s_monitors,
-        "measured": read[shown],
-        "before": before[shown],
-        "rms_before": float(np.sqrt(np.nanmean((read - before) ** 2))),
-        "methods": tuple(sorted(columns, key=lambda column: column.fit is None)),
-        "turns": work.turns,
-        "shots": len(nominal),
-        "seconds": dict(work.watch),
-    }
-
-
-def _column(
+def fit_and_track(
     name: str,
     network: TaylorNetwork,
     measurement: Measurement,
-    sigma: Array,
-    shown: int,
-    work: _Work,
+    turns: int,
+    shown: int = 0,
+    **options: Any,
 ) -> MethodFit:
-    """Return one method's fit, its tunes, and its residual."""
+    """Return one method's fit, its tunes, and its residual.
+
+    Args:
+        name: of the method.
+        network: the design.
+        measurement: in the order of its monitors, with noise.
+        turns: tracked for the tunes.
+        shown: the shot whose readings are kept.
+        options: of `fine_tune`.
+    """
     read, noise = measurement.readings[:, 0], measurement.noise
     assert noise is not None
     begun = time.perf_counter()
-    options = {"launch_sigma": sigma} | work.options.get(name, {})
     tune, signal, growth, problem = None, None, None, None
     fit = None
+    start = np.zeros(network.dimension)
+    start[:4] = DEFAULT_LAUNCH  # both planes move, whatever the shots did
     try:
-        with work.watch.stage("fit"):
-            fit = fine_tune(network, measurement, method=name, progress=work.progress, **options)
-        with work.watch.stage("tunes"):
-            tune, signal, growth = network_tunes(fit.network, work.start, work.turns)
+        fit = fine_tune(network, measurement, method=name, **options)
+        tune, signal, growth = network_tunes(fit.network, start, turns)
     except (UnstableRingError, TooFewTurnsError) as error:
         problem = f"the fine-tuned network has no tune: {error}"
     if fit is not None and fit.tunes is not None:

@@ -1,285 +1,122 @@
-"""Fine-tuning by the most probable changes: many amounts under a prior.
+"""Fine-tuning by the most probable changes of all strengths, given the readings.
 
-A Gaussian prior spreads one large fault over all magnets that could share it. `Prior.FAULTS` has
-the tails of Student's t with one degree of freedom: most strengths are nearly right, a few have
-large errors.
-
-Gauss-Newton in the space of the readings: with slopes J and prior variances P the amounts are
-P J^T (J P J^T + C)^-1 target. Only products with J are needed (`Shifts`). Heavy tails give each
-amount a variance of its own, which is updated during the fit.
+Every powered quadrupole and sextupole has a relative change with a Gaussian prior. `Prior.FAULTS`
+has a wide one for the magnets that `sparse` selects and a narrow one for all others: most strengths
+are nearly right, a few have large errors. Gauss-Newton starts at the changes of `sparse`.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
-from tmlattice.beam.shifts import Shifts
-from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
+from tmlattice.effects import Cause
+from tmlattice.errors import UnstableRingError, unknown_choice
 from tmlattice.fitting.adam import FitResult
-from tmlattice.fitting.launches import FreeLaunches, launch_slopes
-from tmlattice.fitting.sparse import in_coordinates, sparse_causes, warn_of_launches
-from tmlattice.inference.priors import Student
-from tmlattice.inference.search import Explanation
+from tmlattice.fitting.sparse import FAULT, first_turns, fitted, searched, warn_of_launches
+from tmlattice.inference.distributed import components_of_rows
+from tmlattice.inference.newton import fit_nuisances
+from tmlattice.inference.problem import Hypothesis, Point
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
-from tmlattice.network import SymplecticNetwork, TaylorNetwork
-from tmlattice.network.spaces import STRENGTH_RMS, Generators, Space, Strengths, tune_slopes
-from tmlattice.observe.data import Data, first_turn
-from tmlattice.optics import one_turn_optics
+from tmlattice.network import TaylorNetwork
+from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.optics import RingTunes, short_way
 
 Array = NDArray[np.float64]
 
 
 class Prior(StrEnum):
-    """Free amounts, and their rms before scaling."""
+    """Prior of the relative changes."""
 
     FAULTS = "faults"
-    """Relative changes of the powered quadrupoles and sextupoles: 1 % is the half width of a
-    distribution with long tails, scaled to 0.01 % by default."""
+    """Any size for the magnets that `sparse` selects, 0.01 % rms by default for the others."""
     STRENGTHS = "strengths"
-    """The same, Gaussian: 1 % rms, scaled by the evidence by default."""
-    GENERATORS = "generators"
-    """Every coefficient of every layer's generator, Gaussian, by the effect of each degree at 1 mm
-    and 0.1 mrad; scaled by the evidence."""
+    """The same rms for all magnets, by default that of the largest marginal likelihood."""
 
+
+STRENGTH_RMS = 0.01
+"""Unit of the scale, relative."""
 
 FAULT_SCALE = 0.01
+"""Default scale of the magnets without a fault."""
 
-MAX_LAUNCH = 0.01
-"""m and rad: prior rms of an unknown launch; beam pipes are no wider."""
+STEPS = 8
+"""Steps of Gauss-Newton, at most: one or two from the changes of `sparse`."""
 
+STEP = 1e-5
+"""Relative change of a strength, for slopes of the tunes."""
 
-@dataclass(frozen=True)
-class TurnReadings:
-    """A measured first turn as a function of a space's amounts.
-
-    Attributes:
-        space: of the amounts; changed by every call.
-        data: one turn.
-        launches: of the shots, in the network's coordinates, [shot, n]; of unknown ones the point
-            of linearisation.
-        offset: their difference from nominal ones with an error, [shot, n], or None.
-    """
-
-    space: Space
-    data: Data
-    launches: Array
-    offset: Array | None = None
-
-    @property
-    def launch_sigma(self) -> Array:
-        """rms of the nominal launches, [shot, n]; 0 where exact."""
-        return in_coordinates(self.data.launch_sigma, self.launches.shape[1])
-
-    @property
-    def sigma(self) -> Array:
-        """Noise of the readings, m, [row]."""
-        return np.asarray(self.data.sigma[self.data.valid])
-
-    @property
-    def largest(self) -> float:
-        """Largest amount of the space."""
-        return self.space.largest
-
-    def residual(self, amounts: Array) -> Array:
-        """Measured less model, m, [row]."""
-        readings = self.space.readings(amounts, self.launches)
-        left = self.data.readings - readings
-        if self.offset is not None:  # relative to the nominal ones, which have the prior
-            left = left + np.einsum(
-                "smpi,si->smp", launch_slopes(self.space.network, self.launches), self.offset
-            )
-        return np.asarray(left[self.data.valid])
-
-    def slopes(self, amounts: Array) -> Shifts:
-        """Return the slopes as shifts of the launches."""
-        maps = self.space.network.maps
-        pairs = [self.space.shifts(amounts, x) for x in self.launches]
-        return Shifts(
-            rows=np.stack([maps.R1 @ M[maps.at] for M, _ in pairs]),
-            shift=np.stack([shift for _, shift in pairs]),
-            upto=np.searchsorted(self.space.layer, maps.at),
-            present=self.data.valid,
-        )
-
-    def nuisances(self, amounts: Array) -> Array:
-        """Covariance of the readings by errors of the launches, m^2, [row, row]."""
-        sigma = np.minimum(self.launch_sigma, MAX_LAUNCH)
-        if not sigma.any():
-            return np.zeros((len(self.sigma),) * 2)
-        return self.slopes(amounts).launch_kernel(sigma)
-
-
-INITIAL_NOISE = 30.0
-"""The residual's rms over the first added noise, which falls to zero: a linear model that is
-believed exactly far from the solution diverges."""
-
-WIDEST, NARROWING = 1000.0, 1.78
-"""Heavy tails have many local maxima: the prior starts wider by the first number, near a Gaussian,
-and narrows by the second at every update of the variances."""
-
-MAX_HALVINGS = 8
-"""Halvings of a step, at most, beyond the linear range."""
-
-SCALE_ITERATIONS = 4
-"""Iterations in which the prior's scale follows the evidence."""
-
-SCALES = np.logspace(-4, 3, 141)
+SETTLED = 0.01
+"""Change of the readings over their noise, below which the fit has converged."""
 
 
 @dataclass(frozen=True)
 class MostProbable:
-    """A fit: amounts, residual and history.
+    """Most probable changes.
 
     Attributes:
-        amounts: [amount].
-        residual: measured less model, m, [row].
-        prior: with its final width.
+        problem: of the ring with these changes.
+        hypotheses: (effect, magnet), [magnet].
+        amounts, rms: relative changes, and those of the prior, [magnet].
+        spread: root of their covariance, [magnet, magnet]: spread spread^T.
+        point: the model there.
         chi2: of every step.
-        converged: whether the last step was smaller than the noise.
     """
 
+    problem: FirstTurns
+    hypotheses: Sequence[Hypothesis]
     amounts: Array
-    residual: Array
-    prior: Student
+    rms: Array
+    spread: Array
+    point: Point
     chi2: tuple[float, ...]
-    converged: bool = False
 
 
 def most_probable(
-    problem: TurnReadings,
-    prior: Student,
-    start: Array,
-    *,
-    choose: bool = False,
-    wide: bool = True,
-    iterations: int = 12,
+    problem: FirstTurns, hypotheses: Sequence[Hypothesis], amounts: Array, rms: Array, learn: bool
 ) -> MostProbable:
-    """Most probable amounts, with an added noise that falls to zero.
+    """Return the most probable changes, and their covariance.
 
     Args:
-        problem: readings as a function of amounts.
-        prior: of each amount.
-        start: first guess, [amount].
-        choose: fit the width of the prior by the evidence.
-        wide: start with wide tails; not where the start is a local maximum to keep.
-        iterations: at most, at each level of added noise.
+        problem: of the design.
+        hypotheses: (effect, magnet).
+        amounts: first guess, [magnet].
+        rms: of the prior, [magnet].
+        learn: multiply it by the factor of the largest marginal likelihood.
     """
-    residual = problem.residual(start)
-    now = MostProbable(start, residual, prior, (_chi2(problem, residual),))
-    widening = WIDEST if wide and np.isfinite(prior.freedom) else 1.0
-    added_noise = float(np.sqrt(np.mean(residual**2))) / INITIAL_NOISE
-    least = float(problem.sigma.min())
+    chi2, nuisances = list[float](), problem.first
     while True:
-        added_noise = 0.0 if added_noise < least else added_noise
-        for i in range(iterations):
-            now, widening = _iterated(
-                problem, now, added_noise, widening, choose and i < SCALE_ITERATIONS
-            )
-            if now.converged:
-                break
-        if added_noise == 0.0:
-            return now
-        added_noise /= 10
-
-
-def _final_cost(problem: TurnReadings, found: MostProbable) -> float:
-    """Negative log posterior, up to constants, with the readings' own noise."""
-    half = cho_factor(_base(problem, found.amounts, 0.0))
-    return _cost(half, found.residual, found.prior, found.amounts)
-
-
-def _chi2(problem: TurnReadings, residual: Array) -> float:
-    return float(np.sum((residual / problem.sigma) ** 2))
-
-
-def _base(problem: TurnReadings, amounts: Array, added_noise: float) -> Array:
-    return problem.nuisances(amounts) + np.diag(problem.sigma**2 + added_noise**2)
-
-
-def _cost(half: tuple[Array, bool], residual: Array, prior: Student, amounts: Array) -> float:
-    return float(0.5 * residual @ cho_solve(half, residual) + prior.penalty(amounts).sum())
-
-
-def _iterated(
-    problem: TurnReadings, now: MostProbable, added_noise: float, widening: float, choose: bool
-) -> tuple[MostProbable, float]:
-    """Return one step with added noise; converged if the step is smaller than the noise."""
-    slopes, base = problem.slopes(now.amounts), _base(problem, now.amounts, added_noise)
-    target = now.residual + slopes.times(now.amounts)
-    if choose:
-        unit = slopes.kernel(np.ones(len(now.amounts)))
-        now = replace(now, prior=replace(now.prior, width=best_scale(unit, base, target)))
-    wanted, half = now.amounts, cho_factor(base)
-    best = _linear(slopes, base, half, target, len(wanted))
-    for _ in range(MAX_HALVINGS if np.isfinite(now.prior.freedom) else 1):  # along one linear model
-        wide = replace(now.prior, width=now.prior.width * widening)
-        wanted = best(wide.precision(wanted))
-        widening = max(1.0, widening / NARROWING)
-    wide = replace(now.prior, width=now.prior.width * widening)
-    step = np.clip(wanted, -problem.largest, problem.largest) - now.amounts
-    before = _cost(half, now.residual, wide, now.amounts)
-    for _ in range(MAX_HALVINGS):
-        try:
-            residual = problem.residual(now.amounts + step)
-            if _cost(half, residual, wide, now.amounts + step) <= before:
-                break
-        except BeamLostError:
-            pass
-        step = step / 2
-    else:
-        chi2 = (*now.chi2, now.chi2[-1])
-        return replace(now, chi2=chi2, converged=widening == 1.0), widening
-    least = float(np.sqrt((problem.sigma**2).min() + added_noise**2))
-    small = bool(np.abs(slopes.times(step)).max() < 0.1 * least)
-    chi2 = (*now.chi2, _chi2(problem, residual))
-    converged = small and widening == 1.0
-    return MostProbable(now.amounts + step, residual, now.prior, chi2, converged), widening
-
-
-def _linear(
-    slopes: Shifts, base: Array, half: tuple[Array, bool], target: Array, amounts: int
-) -> Callable[[Array], Array]:
-    """Best amounts of a linear model as a function of the prior's precisions [amount], in the space
-    of amounts or of readings, whichever is smaller."""
-    if amounts < len(target):
-        J = slopes.matrix
-        weighed = cho_solve(half, J)
-        inner, gram = weighed.T @ target, J.T @ weighed
-
-        def of_amounts(precision: Array) -> Array:
-            size = np.sqrt(precision)
-            scaled = gram / size / size[:, None] + np.eye(len(size))
-            return np.asarray(cho_solve(cho_factor(scaled), inner / size) / size)
-
-        return of_amounts
-
-    def of_readings(precision: Array) -> Array:
-        factor = cho_factor(slopes.kernel(1 / precision) + base)
-        return slopes.transposed(cho_solve(factor, target)) / precision
-
-    return of_readings
-
-
-def best_scale(kernel: Array, base: Array, target: Array) -> float:
-    """Factor s of the largest evidence, target ~ N(0, s^2 kernel + base)."""
-    half = np.linalg.cholesky(base)
-    inner = np.linalg.solve(half, np.linalg.solve(half, kernel).T)
-    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    power = (vectors.T @ np.linalg.solve(half, target)) ** 2
-    spread = SCALES[:, None] ** 2 * np.maximum(values, 0.0) + 1.0
-    evidence = -0.5 * np.sum(power / spread + np.log(spread), axis=1)
-    return float(SCALES[int(evidence.argmax())])
+        own = zip(hypotheses, amounts.tolist(), strict=True)
+        model = problem.model.knowing([Cause(*h, a) for h, a in own])
+        there = replace(problem, model=model)
+        point = fit_nuisances(there, (), nuisances)
+        assert point.projection is not None, point.lost
+        nuisances = point.nuisances
+        rows = there.metric(point).rows(hypotheses)
+        residual = point.residual + amounts @ rows
+        if learn:
+            one, directions = np.zeros(len(rms), dtype=np.int64), point.projection.matrix()
+            found = components_of_rows(residual, directions, rms[:, None] * rows, one)
+            rms = rms * found.scale[0]
+        # (1 + A A^T)^-1 by a triangle: prior less data would cancel for small noise
+        A = point.projection.out(rms[:, None] * rows)
+        triangle = np.linalg.qr(np.concatenate([A.T, np.eye(len(rms))]), mode="r")
+        spread = rms[:, None] * solve_triangular(triangle, np.eye(len(rms)))
+        best = spread @ (spread.T @ (A @ residual / rms))
+        chi2.append(point.chi2)
+        moved = np.abs(point.projection.out((best - amounts) @ rows)).max()
+        if moved < SETTLED or len(chi2) > STEPS:
+            return MostProbable(there, hypotheses, amounts, rms, spread, point, tuple(chi2))
+        amounts = best
 
 
 def fit_map(
-    network: TaylorNetwork | SymplecticNetwork,
+    network: TaylorNetwork,
     measurement: Measurement,
     *,
     ring: Ring | None = None,
@@ -288,7 +125,6 @@ def fit_map(
     scale: float | None = None,
     noise: float | None = None,
     launch_sigma: ArrayLike | None = None,
-    iterations: int = 12,
     progress: bool = True,
 ) -> FitResult:
     """Fit a measurement's first turn by the most probable changes under a prior.
@@ -297,132 +133,71 @@ def fit_map(
         network: the design.
         measurement: at least one shot.
         ring: of the network; None: the network's own `ring`.
-        prior: free amounts, see `Prior`.
-        kinds: of magnets, for the priors on strengths.
-        scale: factor on the prior's rms; None: 0.01 for faults, else that of greatest evidence.
+        prior: of the changes, see `Prior`.
+        kinds: of magnets that may have changed.
+        scale: rms of the prior, in %; None: 0.01 % for faults, else that of the largest marginal
+            likelihood.
         noise: rms of one reading, m; else the measurement's.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
             exact; inf: unknown; None: the measurement's own.
-        iterations: of Gauss-Newton at most, at each level of added noise.
         progress: ignored, as in every method.
 
     Returns:
-        The fitted network (symplectic, for the prior on generators), its tunes, and their standard
-        error by the posterior covariance. It is valid if the prior is: a Gaussian one describes
-        many small changes, not one magnet with an error of 20 %.
+        The network of the most probable ring, its tunes, and their standard error by the posterior
+        covariance. It is valid if the prior is: `Prior.STRENGTHS` describes many small changes, not
+        one magnet with an error of 20 %.
 
     Raises:
         MeasurementError: no reading, or no noise stated.
-        TmlatticeError: a prior on strengths without a ring.
+        TmlatticeError: no ring to change, or no powered magnet of these kinds.
         BeamLostError: the launch is lost in the design.
+        ChoiceError: an unknown prior.
     """
     begun = time.perf_counter()
-    prior = Prior(prior)
-    ring = network.ring if ring is None else ring
-    space: Space
-    if prior is Prior.GENERATORS:
-        space = Generators(network)
-    else:
-        if ring is None:
-            raise TmlatticeError("the prior on strengths needs the ring whose they are: give ring=")
-        if isinstance(network, SymplecticNetwork):
-            network = TaylorNetwork.from_ring(ring, network.dimension)
-        space = Strengths(network, ring, kinds)
-    monitors, dimension = space.network.monitors, space.network.dimension
-    data = first_turn(monitors, measurement, noise, launch_sigma, dimension)
-    tails = prior is Prior.FAULTS
-    sparse = sparse_causes(ring, data, kinds, dimension) if tails and ring is not None else None
-    if sparse is not None and ring is not None:
-        warn_of_launches(ring, data, dimension, sparse)
-    problem = _readings(space, data, measurement.states(dimension), sparse)
-    width = FAULT_SCALE if tails and scale is None else scale
-    student = Student(1.0 if width is None else width, 1.0 if tails else np.inf)
-    start = np.zeros(len(space.layer))
-    found = most_probable(problem, student, start, choose=width is None, iterations=iterations)
-    if sparse is not None:  # many maxima: the sparse fit is another start
-        amounts = _from_sparse(space, sparse)
-        other = most_probable(problem, student, amounts, wide=False, iterations=iterations)
-        found = min((found, other), key=partial(_final_cost, problem)) if amounts.any() else found
-    space.put(found.amounts)
-    tunes, sigma, errors = _posterior(problem, found)
-    changes = {
-        name: (float(STRENGTH_RMS * amount), float(STRENGTH_RMS * error))
-        for name, amount, error in zip(space.names, found.amounts, errors, strict=False)
-    }
-    space.network.requires_grad_(True)
-    return FitResult(
-        network=space.network,
-        loss=[c * float(np.mean(problem.sigma**2)) / data.shots for c in found.chi2],
-        penalty=[0.0] * len(found.chi2),
-        best_epoch=len(found.chi2) - 1,
-        stopped_early=found.converged,
-        seconds=time.perf_counter() - begun,
+    try:
+        prior = Prior(prior)
+    except ValueError:
+        raise unknown_choice("prior", prior, Prior) from None
+    sparse = searched(network, measurement, ring, kinds, noise, launch_sigma)
+    hypotheses = sparse.first.hypotheses
+    start = np.zeros(len(hypotheses))
+    for cause in sparse.fit.causes:
+        start[hypotheses.index((cause.effect, cause.element))] = cause.amount
+    rms = np.full(len(start), STRENGTH_RMS * (FAULT_SCALE if scale is None else scale))
+    if prior is Prior.FAULTS:
+        warn_of_launches(sparse)
+        rms = np.where(start, FAULT, rms)
+    learn = scale is None and prior is Prior.STRENGTHS
+    found = most_probable(first_turns(sparse), hypotheses, start, rms, learn)
+    tunes, sigma = _tunes(found)
+    return fitted(
+        sparse,
+        [Cause(*h, a) for h, a in zip(hypotheses, found.amounts.tolist(), strict=True)],
+        np.linalg.norm(found.spread, axis=1).tolist(),
+        found.point.nuisances,
+        found.chi2,
         options={
             "method": "map",
             "prior": prior.value,
             "kinds": list(kinds),
-            "scale": found.prior.width,
+            "scale": found.rms.min() / STRENGTH_RMS,
             "noise": noise,
             "launch_sigma": None if launch_sigma is None else np.ravel(launch_sigma).tolist(),
-            "iterations": iterations,
         },
+        seconds=time.perf_counter() - begun,
         tunes=tunes,
         tune_sigma=sigma,
-        changes=changes,
-        launches=None
-        if not problem.launch_sigma.any()
-        else _free(problem).fitted(space.network, problem.launches),
     )
 
 
-def _readings(space: Space, data: Data, nominal: Array, sparse: Explanation | None) -> TurnReadings:
-    """Return the problem at the nominal launches, or at those of the sparse fit."""
-    nominal = np.ascontiguousarray(nominal)
-    sigma = in_coordinates(data.launch_sigma, nominal.shape[1])
-    if sparse is None or not sigma.any():
-        return TurnReadings(space, data, nominal)
-    about = in_coordinates(sparse.fit.nuisances, nominal.shape[1])
-    offset = np.where(np.isfinite(sigma), about - nominal, 0.0)
-    return TurnReadings(space, data, about, offset)
-
-
-def _free(problem: TurnReadings) -> FreeLaunches:
-    data = problem.data
-    nominal = in_coordinates(data.launches, problem.launches.shape[1])
-    readings = np.where(data.valid, data.readings, np.nan)
-    return FreeLaunches(nominal, problem.launch_sigma, readings, data.sigma[0])
-
-
-def _from_sparse(space: Space, found: Explanation) -> Array:
-    """Amounts of the sparse fit; of the most probable magnet if it is empty."""
-    best = found.fit if found.named or not found.beyond else found.beyond[0].fit
-    start = np.zeros(len(space.layer))
-    for cause in best.causes:
-        start[space.names.index(str(cause.element))] = cause.amount / STRENGTH_RMS
-    return start
-
-
-def _posterior(
-    problem: TurnReadings, found: MostProbable
-) -> tuple[Array | None, Array | None, Array]:
-    """Tunes, their standard error, and that of the amounts (of strengths; else empty)."""
-    space, slopes = problem.space, problem.slopes(found.amounts)
-    variance, base = 1 / found.prior.precision(found.amounts), _base(problem, found.amounts, 0.0)
-    sizes, errors, spread = np.sqrt(variance), np.zeros(0), None
-    if space.names:
-        # (1 + A^T A)^-1 by a triangle: prior less data would cancel for small noise
-        A = solve_triangular(np.linalg.cholesky(base), slopes.matrix * sizes, lower=True)
-        triangle = np.linalg.qr(np.concatenate([A, np.eye(len(sizes))]), mode="r")
-        spread = sizes[:, None] * solve_triangular(triangle, np.eye(len(sizes)))
-        errors = np.sqrt(np.sum(spread**2, axis=1))
+def _tunes(found: MostProbable) -> tuple[Array, Array] | tuple[None, None]:
+    """Tunes and their standard errors, [2] each; None of an unstable ring."""
+    turn = RingTunes(found.problem.model.assembly)
+    slopes = []
     try:
-        tunes = one_turn_optics(space.network).tunes
-        rates = tune_slopes(space, found.amounts)
+        for hypothesis, amount in zip(found.hypotheses, found.amounts.tolist(), strict=True):
+            ends = [turn.of([Cause(*hypothesis, side / (1 + amount))]) for side in (STEP, -STEP)]
+            slopes.append(short_way(ends[0] - ends[1]) / (2 * STEP))
+        return turn.of(()), np.linalg.norm(np.transpose(slopes) @ found.spread, axis=1)
     except UnstableRingError:
-        return None, None, errors
-    if spread is not None:
-        return tunes, np.sqrt(np.sum((rates @ spread) ** 2, axis=1)), errors
-    factor = np.linalg.inv(slopes.kernel(variance) + base)
-    seen = np.stack([slopes.times(variance * rate) for rate in rates])
-    covariance = (rates * variance) @ rates.T - seen @ factor @ seen.T
-    return tunes, np.sqrt(np.maximum(np.diag(covariance), 0.0)), errors
+        return None, None

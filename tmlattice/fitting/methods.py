@@ -62,7 +62,6 @@ def fine_tune(
     candidates: Sequence[str] | None = None,
     prior: Prior | str = Prior.FAULTS,
     scale: float | None = None,
-    iterations: int = 12,
 ) -> FitResult:
     """Fit a network to the first turn of a measurement; the given network is not changed.
 
@@ -85,7 +84,7 @@ def fine_tune(
             the kinds of magnets, and the rms of one reading, m (None: the measurement's).
         fault, largest_number, refined: of "sparse" and "known".
         candidates: of the same: the only magnets that may have changed.
-        prior, scale, iterations: of "map".
+        prior, scale: of "map".
 
     A warning reports readings that contradict the stated errors of the launches.
 
@@ -105,9 +104,9 @@ def fine_tune(
         raise ValueError(
             "method 'known' needs the names of the magnets that may have changed: give candidates="
         )
-    if fit is fit_sparse and isinstance(network, SymplecticNetwork):
+    if fit is not fit_adam and isinstance(network, SymplecticNetwork):
         if network.ring is None:
-            raise ValueError("methods 'sparse' and 'known' need a network made from a ring")
+            raise ValueError(f"method '{chosen}' needs a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
     result = fit(network, measurement, **options)
     if chosen is Method.ADAM:
@@ -148,7 +147,7 @@ def _check_launches(
     if not any(e.k1 or e.k2 for e in ring.elements if e.kind in EFFECTS):
         return
     data = first_turn(network.monitors, measurement, None, sigma, n)
-    warn_of_launches(ring, data, n, sparse_causes(ring, data, dimension=n))
+    warn_of_launches(sparse_causes(ring, data, dimension=n))
 
 
 def _with_chi2(result: FitResult, measurement: Measurement) -> FitResult:

@@ -7,15 +7,15 @@ about as well increase the stated error of the tunes.
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2 as chi_square
 
 from tmlattice.beam.model import Model
-from tmlattice.beam.strengths import LARGEST
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
@@ -33,6 +33,9 @@ from tmlattice.optics import RingTunes, short_way
 Array = NDArray[np.float64]
 
 EFFECTS = {"quadrupole": "quadrupole_gradient", "sextupole": "sextupole_strength"}
+
+LARGEST = 1.5
+"""Largest relative change of a strength."""
 
 FAULT = 0.3
 """Prior rms of the relative change of a changed strength."""
@@ -96,68 +99,122 @@ def fit_sparse(
         UnstableRingError: the ring that explains the readings has no tune.
     """
     begun = time.perf_counter()
-    ring = network.ring if ring is None else ring
-    if ring is None:
-        raise TmlatticeError("method 'sparse' changes the ring's magnets: give ring=")
-    monitors = [monitor.name for monitor in ring.monitors]
-    data = first_turn(monitors, measurement, noise, launch_sigma, network.dimension)
-    found = sparse_causes(
-        ring, data, kinds, network.dimension, fault, largest_number, refined, candidates
-    )
-    warn_of_launches(ring, data, network.dimension, found)
+    found = searched(network, measurement, ring, kinds, noise, launch_sigma, {
+        "fault": fault, "largest_number": largest_number, "refined": refined,
+        "candidates": candidates,
+    })  # fmt: skip
+    warn_of_launches(found)
     best = _refined(found)
-    assert isinstance(found.problem, FirstTurns)
-    turn = RingTunes(found.problem.model.assembly)
+    turn = RingTunes(first_turns(found).model.assembly)
     tunes = turn.of(best.causes)
     errors = np.sqrt(np.diag(best.covariance))
-    chi2 = [found.before.chi2, best.chi2][: 1 + bool(best.causes)]
+    options = {
+        "method": "sparse",
+        "kinds": list(kinds),
+        "noise": noise,
+        "launch_sigma": None if launch_sigma is None else np.ravel(launch_sigma).tolist(),
+        "fault": fault,
+        "largest_number": largest_number,
+        "refined": refined,
+        "candidates": None if candidates is None else list(candidates),
+    }
+    return fitted(
+        found,
+        best.causes,
+        errors.tolist(),
+        best.nuisances,
+        [found.before.chi2, best.chi2][: 1 + bool(best.causes)],
+        options=options,
+        seconds=time.perf_counter() - begun,
+        tunes=tunes,
+        tune_sigma=_spread(turn, best, tunes, found) if best.causes else None,
+    )
+
+
+def first_turns(found: Explanation) -> FirstTurns:
+    """Return the problem that was searched."""
+    assert isinstance(found.problem, FirstTurns)
+    return found.problem
+
+
+def searched(
+    network: TaylorNetwork,
+    measurement: Measurement,
+    ring: Ring | None,
+    kinds: Sequence[str],
+    noise: float | None,
+    launch_sigma: ArrayLike | None,
+    options: Mapping[str, Any] = {},
+) -> Explanation:
+    """Return the changed magnets by their evidence.
+
+    Args:
+        network, measurement, ring, kinds, noise, launch_sigma: see `fit_sparse`.
+        options: further ones of `sparse_causes`.
+
+    Raises:
+        TmlatticeError: no ring to change.
+    """
+    ring = network.ring if ring is None else ring
+    if ring is None:
+        raise TmlatticeError("methods but 'adam' change the ring's magnets: give ring=")
+    monitors = [monitor.name for monitor in ring.monitors]
+    data = first_turn(monitors, measurement, noise, launch_sigma, network.dimension)
+    return sparse_causes(ring, data, kinds, network.dimension, **options)
+
+
+def fitted(
+    found: Explanation,
+    causes: Sequence[Cause],
+    errors: Sequence[float],
+    launches: Array,
+    chi2: Sequence[float],
+    **result: Any,
+) -> FitResult:
+    """Return the ring with these changes as a fitted network.
+
+    Args:
+        found: the search.
+        causes, errors: relative changes, and their standard errors.
+        launches: as fitted, [shot, 5].
+        chi2: of every step.
+        result: further attributes.
+    """
+    problem = first_turns(found)
+    model, data = problem.model, problem.data
+    n = model.dimension
     return FitResult(
-        network=TaylorNetwork.from_ring(apply(ring, best.causes), network.dimension),
+        network=TaylorNetwork.from_ring(apply(model.design, causes), n),
         loss=[c * float(np.mean(data.sigma**2)) / data.shots for c in chi2],
         penalty=[0.0] * len(chi2),
         best_epoch=len(chi2) - 1,
         stopped_early=False,
-        seconds=time.perf_counter() - begun,
-        options={
-            "method": "sparse",
-            "kinds": list(kinds),
-            "noise": noise,
-            "launch_sigma": None if launch_sigma is None else np.ravel(launch_sigma).tolist(),
-            "fault": fault,
-            "largest_number": largest_number,
-            "refined": refined,
-            "candidates": None if candidates is None else list(candidates),
-        },
-        tunes=tunes,
-        tune_sigma=_spread(turn, best, tunes, found) if best.causes else None,
         changes={
             str(cause.element): (cause.amount, float(error))
-            for cause, error in zip(best.causes, errors, strict=True)
+            for cause, error in zip(causes, errors, strict=True)
         },
-        launches=in_coordinates(best.nuisances, network.dimension)
-        if data.launch_sigma.any()
-        else None,
+        launches=in_coordinates(launches, n) if data.launch_sigma.any() else None,
+        **result,
     )
 
 
-def warn_of_launches(ring: Ring, data: Data, dimension: int, found: Explanation) -> None:
+def warn_of_launches(found: Explanation) -> None:
     """Warn if the readings contradict the stated launches.
 
     The same search with free launches must explain the readings, and lower chi-square by more than
     four free numbers per shot do by chance, at odds of `FALSE_ALARM_ODDS`.
 
     Args:
-        ring: the design.
-        data: with the stated launches; unknown ones cannot be contradicted.
-        dimension: 4 or 6.
-        found: the search with the stated launches.
+        found: the search with the stated launches; unknown ones cannot be contradicted.
     """
+    model, data = first_turns(found).model, first_turns(found).data
     stated = np.isfinite(data.launch_sigma[:, :4])
     if not stated.any():
         return
     sigma = data.launch_sigma.copy()
     sigma[:, :4] = np.inf
-    free = sparse_causes(ring, replace(data, launch_sigma=sigma), dimension=dimension).fit
+    unknown = replace(data, launch_sigma=sigma)
+    free = sparse_causes(model.design, unknown, dimension=model.dimension).fit
     readings, numbers = int(data.valid.sum()), int(stated.sum())
     gain = found.fit.chi2 - free.chi2
     explained = free.chi2 <= readings + MAX_MISFIT * np.sqrt(2 * readings)

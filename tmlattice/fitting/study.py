@@ -22,14 +22,18 @@ from numpy.typing import NDArray
 from tmlattice.batch import MADE_BY, fingerprint, run_batch
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
-from tmlattice.fitting.experiment import DEFAULT_LAUNCH, network_tunes, perturbed_ring
-from tmlattice.fitting.methods import fine_tune
+from tmlattice.fitting.experiment import (
+    DEFAULT_LAUNCH,
+    first_turn_of,
+    fit_and_track,
+    perturbed_ring,
+)
+from tmlattice.fitting.method_fit import errors
 from tmlattice.input_files import json_of
 from tmlattice.lattice import Element, Ring, load_ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.lattice.load import contents
 from tmlattice.maps import ring_matrix
-from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.optics import Optics, matrix_tunes, one_turn_optics
 
@@ -165,53 +169,44 @@ def run_case(
         true = matrix_tunes(ring_matrix(machine))
     except UnstableRingError:
         return dataclasses.replace(empty, problem=UNSTABLE)
-    design, truth = _network_of(ring), TaylorNetwork.from_ring(machine)
+    design = _network_of(ring)
     optics = one_turn_optics(design)
     start = np.asarray(launch, dtype=float)
     phases = np.pi * np.arange(shots)[:, None] / shots * np.ones(2)
     launches = turned_launches(optics, start, phases)
     # independent noise for each magnet, so that the cases are independent
     generator = np.random.default_rng([seed, zlib.crc32(empty.magnet.encode())])
-    clean = truth.readings(launches)
-    readings = clean + noise * generator.standard_normal(clean.shape)
-    stated = np.full((len(design.monitors), 2), noise) if noise else None
-    exact = np.zeros_like(launches)
-    measurement = Measurement(launches, readings[:, None], design.monitors, stated, exact)
+    measurement = first_turn_of(machine, launches, noise, generator)
     known = dataclasses.replace(empty, true_tunes=_pair(true))
+    kind, _, regularization = method.partition("-")
+    options: dict[str, Any] = {"candidates": names} if kind == "known" else {}
+    if kind == "adam":
+        options = {**recipe, "regularization": regularization or "symplectic"}
     try:
-        kind, _, regularization = method.partition("-")
-        if kind == "adam":
-            options = {**recipe, "regularization": regularization or "symplectic"}
-            fit = fine_tune(design, measurement, progress=False, **options)
-            predicted = network_tunes(fit.network, start, turns)[0]
-        else:
-            only = names if method == "known" else None
-            fit = fine_tune(
-                design, measurement, method=method, noise=noise, candidates=only, progress=False
-            )
-            if fit.tunes is None:
-                return dataclasses.replace(known, problem="the fitted network has no tune")
-            predicted = fit.tunes
+        found = fit_and_track(kind, design, measurement, turns, progress=False, **options)
     except TmlatticeError as error:
         return dataclasses.replace(known, problem=str(error))
-    away = np.abs((predicted - true + 0.5) % 1.0 - 0.5)
+    if found.fit is None or found.tunes is None:
+        return dataclasses.replace(known, problem=found.problem)
+    fit = found.fit
+    absolute, relative = errors(found.tunes, true)
+    assert absolute is not None
+    assert relative is not None
     new = turned_launches(optics, NEW_AMPLITUDE * start, 2 * np.pi * np.random.default_rng(
         [seed, 1]).random((4, 2)))  # fmt: skip
     try:
-        miss = truth.readings(new) - fit.network.readings(new)
+        miss = TaylorNetwork.from_ring(machine).readings(new) - fit.network.readings(new)
         prediction = float(np.sqrt(np.mean(miss**2)))
     except TmlatticeError:
         prediction = None  # lost at five times the amplitude in one of them
-    rms = [
-        float(np.sqrt(np.mean((readings - n.readings(launches)) ** 2)))
-        for n in (design, fit.network)
-    ]
+    left = measurement.readings[:, 0] - design.readings(launches)
+    before = float(np.sqrt(np.mean(left**2)))
     return dataclasses.replace(
         known,
-        absolute_error=_pair(away),
-        relative_error=_pair(away / true),
+        absolute_error=_pair(absolute),
+        relative_error=_pair(relative),
         tune_sigma=None if fit.tune_sigma is None else _pair(fit.tune_sigma),
-        orbit_rms=_pair(np.array(rms)),
+        orbit_rms=(before, found.rms),
         prediction_rms=prediction,
         found=tuple(fit.changes) if method in ("sparse", "known") else None,
         seconds=fit.seconds,

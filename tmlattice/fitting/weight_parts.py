@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.effects import CATALOGUE, RingEffect, directions, names
-from tmlattice.errors import MeasurementError
+from tmlattice.fitting.launches import with_noise
 from tmlattice.inference.newton import fit
 from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
@@ -22,7 +22,6 @@ from tmlattice.measurement import Measurement
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.metric import behind
-from tmlattice.observe.noise import estimate
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -124,27 +123,18 @@ class Trajectories:
         states: at every exit, [shot, layer + 2, n].
         whole, information: of the readings on a kick at a layer's exit, before and after the
             launch is projected out, [shot, layer, n, n].
-        pull: -d (chi-square / 2) / d kick, [shot, layer, n].
         launches, chi2, readings: see `WeightReading`.
     """
 
     def __init__(self, ring: Ring, measurement: Measurement, n: int) -> None:
+        monitors = [monitor.name for monitor in ring.monitors]
+        measurement, _ = with_noise(ring, measurement.in_order_of(monitors), n)
         data = of_measurement(ring, measurement)
         launch_sigma = data.launch_sigma.copy()
         if n == 4:
             launch_sigma[:, 4] = 0.0
         data = replace(data, launch_sigma=launch_sigma)
         self.model = model = Model(ring, data.settings, dimension=n)
-        if not np.isfinite(data.sigma[data.valid]).all():
-            rough = data.with_sigma(np.array([1e-4, 1e-4]))
-            first = fit(FirstTurns(model=model, data=rough, places={}), (), data.launches)
-            noise = estimate(data, first.point.view)
-            if not (noise > 0).all():
-                raise MeasurementError(
-                    "the noise of the readings is not stated and they are too few to estimate it; "
-                    "give it"
-                )
-            data = data.with_sigma(noise)
         whitening = Whitening(data)
         problem = FirstTurns(model=model, data=data, places={}, white=whitening)
         found = fit(problem, (), data.launches)
@@ -156,20 +146,16 @@ class Trajectories:
         shots, count = data.shots, len(model.at)
         G = (paths.beam_launch * whitening.weight[..., None]).reshape(shots, count, 2, n)
         Q = found.projection.Q[:, :-5].reshape(shots, count, 2, -1)
-        clean = found.projection.out(found.residual).reshape(shots, -1)[:, :-5]
-        clean = clean.reshape(shots, count, 2)
         # by a change of the launch before the monitors from each one on
         H = behind(np.einsum("smpi,smpj->smij", G, G))
         K = behind(np.einsum("smpi,smpq->smiq", G, Q))
-        g = behind(np.einsum("smpi,smp->smi", G, clean))
         layers = len(model.maps.layers)
         start = model.maps.start[1 : layers + 1]
         back = np.linalg.inv(paths.tangents[:, 1 : layers + 1])  # kick -> change of the launch
         forth = back.swapaxes(-1, -2)
-        H, K, g = H[:, start], K[:, start], g[:, start]
+        H, K = H[:, start], K[:, start]
         self.whole = forth @ H @ back
         self.information = forth @ (H - K @ K.swapaxes(-1, -2)) @ back
-        self.pull = np.einsum("skij,skj->ski", forth, g)
 
     def kicks(self, layer: Indices, weights: Sequence[Array]) -> Array:
         """Kicks by weights' rows at the exits of layers, along the trajectories, [shot, row, n]."""
@@ -177,16 +163,6 @@ class Trajectories:
         D0, D1, D2 = (np.ascontiguousarray(w) for w in weights)
         kernels.kicks(layer, D0, D1, D2, self.states, self.states.shape[1] - 1, out)
         return out[:, 0]
-
-    def gradient(self) -> tuple[Array, Array, Array]:
-        """Return d (chi-square / 2) / d weights of every layer, launch fitted."""
-        x = self.states[:, : self.pull.shape[1]]
-        i, j = np.triu_indices(x.shape[2])
-        return (
-            -self.pull.sum(axis=0),
-            -np.einsum("ski,skj->kij", self.pull, x),
-            -np.einsum("ski,skj->kij", self.pull, x[..., i] * x[..., j]),
-        )
 
     def ensemble(self) -> Array:
         """Root of the second moments of (1, x, x^[2]), [P, P]: root root^T."""
@@ -260,12 +236,11 @@ def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
     return np.array(found)
 
 
-def split(seen: Trajectories, effects: LayerEffects, weights: Array, gradient: bool) -> Split:
+def split(seen: Trajectories, effects: LayerEffects, weights: Array) -> Split:
     """Return the parts: effects, other symplectic changes, the rest.
 
     Args:
-        weights: change, or gradient, [layer, n, P].
-        gradient: whether it is one.
+        weights: change, [layer, n, P].
     """
     maps = seen.model.maps
     kicked, trajectory = seen.roots(), seen.ensemble()
@@ -280,11 +255,7 @@ def split(seen: Trajectories, effects: LayerEffects, weights: Array, gradient: b
         def sized(change: Array, left: Array = left, right: Array = right) -> Array:
             return np.asarray(left @ change @ right).reshape(*change.shape[:-2], -1)
 
-        if gradient:  # the step -information^-1 gradient
-            step = np.linalg.pinv(left).T @ -weights[k] @ np.linalg.pinv(right).T
-            vector = step.reshape(-1)
-        else:
-            vector = sized(weights[k])
+        vector = sized(weights[k])
         own = order[first[k] : first[k + 1]]
         columns = sized(rows[own]).T
         size = np.linalg.norm(columns, axis=0)

@@ -1,8 +1,7 @@
-"""Physics of a network's weights: every layer's weight change, or gradient, in parts.
+"""Physics of a network's weights: every layer's weight change in parts.
 
 >>> reading = read_network(ring, fine_tune(network, measurement).network, measurement)
 >>> ring.magnets[reading.places("score")[0]].name         # the layer that changed most, in sigma
->>> read_gradient(ring, measurement).places("score")      # without fine-tuning: the linear scan
 
 A layer's weights act on the data through the kick that they give each trajectory at the layer's
 exit, (dW0 + dW1 x + dW2 x^[2]) at the state x at its entrance. The information of the readings on
@@ -24,7 +23,7 @@ An effect is used if it acts through one layer and changes no read-out: none of 
 magnets, of monitors or of the beam.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -54,24 +53,20 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class WeightReading:
-    """Weight changes, or gradients, of all layers, as physical effects.
+    """Weight changes of all layers, as physical effects.
 
     Attributes:
-        kind: "change" of a network's weights, or "gradient" at the design.
         ring: the design.
-        raw: Euclidean norm of the change, or of the gradient of chi-square / 2, over all weights of
-            a layer in m and rad, [layer].
+        raw: Euclidean norm of the change over all weights of a layer in m and rad, [layer].
         hypotheses: (effect, element) that act through one layer.
         layer: of each, [hypothesis].
-        amount: each effect alone, in its unit, along the measured trajectories, [hypothesis]; of a
-            gradient: the best amount of the linear model.
+        amount: each effect alone, in its unit, along the measured trajectories, [hypothesis].
         sigma: its standard deviation, launch projected out; inf if invisible.
         score: amount / sigma, signed; 0 if invisible.
         launches: fitted to the design, (x, px, y, py, delta), [shot, 5].
         chi2, readings: of the design with these launches; number of readings.
     """
 
-    kind: str
     ring: Ring = field(repr=False)
     raw: Array = field(repr=False)
     hypotheses: tuple[Hypothesis, ...] = field(repr=False)
@@ -86,9 +81,7 @@ class WeightReading:
 
     @cached_property
     def split(self) -> Split:
-        """Parts of the change; of a gradient those of the steepest step, -information^-1 gradient,
-        whose shares are meaningful but whose norms are not in sigma. Computed at the first call, in
-        some seconds on a large ring."""
+        """Parts of the change; computed at the first call, in some seconds on a large ring."""
         return self._take_apart()
 
     @property
@@ -141,32 +134,12 @@ class WeightReading:
             }
 
         return {
-            "kind": self.kind,
+            "kind": "change",
             "chi2": self.chi2,
             "readings": self.readings,
             "by_score": [entry(int(k)) for k in self.places("score")[:first]],
             "by_raw": [entry(int(k)) for k in self.places("raw")[:first]],
         }
-
-
-def read_gradient(
-    ring: Ring, measurement: Measurement, dimension: int = 4, effects: LayerEffects | None = None
-) -> WeightReading:
-    """Return the gradient of the loss at the design, layer by layer, without fine-tuning.
-
-    An effect's score is -g^T d / sqrt(d^T F d), g the gradient of chi-square / 2 by the weights, d
-    the effect's direction, F the information: the signed root of the linear scan's statistic.
-
-    Args:
-        ring: the design.
-        measurement: its first turn is used; launches are fitted.
-        dimension: 4, or 6 where the energy matters.
-        effects: of `layer_effects`, to be shared by many measurements.
-
-    Raises:
-        MeasurementError: data that cannot be used: settings that differ from the design's.
-    """
-    return _read(ring, measurement, dimension, effects, None)
 
 
 def read_network(
@@ -187,16 +160,7 @@ def read_network(
         LatticeError: a network of another ring.
         MeasurementError: data that cannot be used: settings that differ from the design's.
     """
-    return _read(ring, measurement, network.dimension, effects, network)
-
-
-def _read(
-    ring: Ring,
-    measurement: Measurement,
-    n: int,
-    effects: LayerEffects | None,
-    network: TaylorNetwork | None,
-) -> WeightReading:
+    n = network.dimension
     if measurement.settings:
         raise MeasurementError(
             "a network has one set of weights for all shots, and these were taken with different "
@@ -208,8 +172,7 @@ def _read(
         raise ValueError("these effects are of another ring or of other coordinates")
     measurement.states(n)  # raises if four coordinates are too few
     seen = Trajectories(ring, measurement.select(turns=[0]), n)
-    if network is not None:
-        change = _change(seen.model, network)
+    change = _change(seen.model, network)
     directions_ = (effects.D0, effects.D1, effects.D2)
 
     kicks = seen.kicks(effects.layer, directions_)
@@ -217,20 +180,13 @@ def _read(
     norm = np.einsum("shi,shij,shj->h", kicks, M, kicks)
     whole = np.einsum("shi,shij,shj->h", kicks, seen.whole[:, effects.layer], kicks)
     visible = (norm > MIN_VISIBLE**2 * whole) & (norm > 0)
-    if network is None:
-        inner = np.einsum("shi,shi->h", kicks, seen.pull[:, effects.layer])
-        gradient = seen.gradient()
-        raw = _euclidean(gradient)
-    else:
-        own = seen.kicks(np.arange(len(ring.magnets)), change)[:, effects.layer]
-        inner = np.einsum("shi,shij,shj->h", kicks, M, own)
-        raw = _euclidean(change)
+    own = seen.kicks(np.arange(len(ring.magnets)), change)[:, effects.layer]
+    inner = np.einsum("shi,shij,shj->h", kicks, M, own)
     safe = np.where(visible, norm, 1.0)
-    rows = stacked(gradient if network is None else change)
+    rows = stacked(change)
     return WeightReading(
-        kind="gradient" if network is None else "change",
         ring=ring,
-        raw=raw,
+        raw=np.sqrt((rows**2).sum(axis=(1, 2))),
         hypotheses=effects.hypotheses,
         layer=effects.layer,
         amount=np.where(visible, inner / safe, 0.0),
@@ -239,7 +195,7 @@ def _read(
         launches=seen.launches,
         chi2=seen.chi2,
         readings=seen.readings,
-        _take_apart=partial(split, seen, effects, rows, network is None),
+        _take_apart=partial(split, seen, effects, rows),
     )
 
 
@@ -256,7 +212,3 @@ def _change(model: Model, network: TaylorNetwork) -> tuple[Array, Array, Array]:
         )
     W0, W1, W2 = network.weights()
     return W0 - theirs.W0, W1 - theirs.W1, W2 - theirs.W2
-
-
-def _euclidean(weights: Sequence[Array]) -> Array:
-    return np.asarray(np.sqrt((stacked(weights) ** 2).sum(axis=(1, 2))))

@@ -36,7 +36,6 @@ from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import (
     AnyMeasurement,
-    Measurement,
     OrbitResponse,
     TuneReading,
     folder,
@@ -126,6 +125,8 @@ def bring_in(
         raise MeasurementError(
             f"{shown}: fields have other types or sizes than a reader knows ({said}); save it again"
         ) from error
+    if options.stated is not None and options.stated.bad:
+        brought = _without_bad(brought, options.stated)
     data = brought.measurement
     if options.noise is not None and not isinstance(data, TuneReading) and data.noise is None:
         noise = np.full((len(data.monitors), 2), options.noise)
@@ -185,6 +186,25 @@ def import_data(
     )
     every: Any = [source] if one else source
     return bring_in(every, options)
+
+
+def _without_bad(brought: Imported, stated: Stated) -> Imported:
+    """Without the monitors that are stated to be bad.
+
+    Raises:
+        UnknownNameError: a pattern of no monitor, of the data or of the lattice.
+    """
+    data: Any = brought.measurement
+    if isinstance(data, TuneReading):
+        return brought
+    devices = {name: getattr(data, "devices", {}).get(name, name) for name in data.monitors}
+    ring = [] if brought.ring is None else [monitor.name for monitor in brought.ring.monitors]
+    bad = stated.bad_among(devices, ring)
+    if not bad:
+        return brought
+    kept = [name for name in data.monitors if name not in bad]
+    brought = replace(brought, measurement=data.select(monitors=kept))
+    return brought.saying(f"bad monitors, left out as stated: {counted(bad)}")
 
 
 def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
@@ -294,11 +314,7 @@ def _with_conventions(brought: Imported, ring: Ring | None, options: Options) ->
     for name in wanted:
         if name not in ASSUMPTIONS:
             raise unknown_name("assumption", name, ASSUMPTIONS)
-    first, response = isinstance(data, Measurement), isinstance(data, OrbitResponse)
-    own = [
-        name for name in wanted
-        if (first and ASSUMPTIONS[name].trajectory) or (response and ASSUMPTIONS[name].response)
-    ]  # fmt: skip
+    own = [name for name in wanted if isinstance(data, ASSUMPTIONS[name].kinds)]
     if left := [name for name in wanted if name not in own]:
         brought = brought.saying(f"of no meaning for these data, not undone: {', '.join(left)}")
     if not own:

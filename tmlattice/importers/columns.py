@@ -17,6 +17,7 @@ import numpy as np
 from tmlattice.errors import MeasurementError
 from tmlattice.input_files import content_of
 from tmlattice.lattice.mat_file import read_apart
+from tmlattice.measurement.rows import not_csv
 
 CSV, HDF5, SDDS = (".csv", ".tsv", ".txt", ".dat"), (".h5", ".hdf5", ".hdf"), (".sdds",)
 
@@ -162,16 +163,16 @@ def _csv(path: Path) -> list[Column]:
     decimal = len(last.split()) > 1 and all(map(_DECIMAL.match, commas))
     separator = next((sign for sign in ";\t" if sign in last), " " if decimal else ",")
 
-    def cut(line: str) -> list[str]:
+    def cut(line: str, number: int) -> list[str]:
         if separator == " ":
             return re.sub(r"\s+([\[(])", r"\1", line.lstrip("* ")).split()
         try:
             fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
         except csv.Error as error:
-            raise MeasurementError(f"{path}: no table that is read ({error})") from error
+            raise not_csv(path, number, error) from error
         return [field.strip() for field in fields]
 
-    rows = [(i, cut(line)) for i, line in lines]
+    rows = [(i, cut(line, i)) for i, line in lines]
     usual = Counter(len(row) for _, row in rows).most_common(1)[0][0]
     start = next(k for k, (_, row) in enumerate(rows) if len(row) == usual)
     if len(rows) > start + 1 and not any(map(_is_number, rows[start][1])):
@@ -180,7 +181,7 @@ def _csv(path: Path) -> list[Column]:
     above = [line.lstrip(f"{_COMMENT}* \t") for i, line in numbered if i < first]
     if above and any(_is_number(field) for field in header):
         rows.insert(0, (first, header))
-        header = cut(above[-1])
+        header = cut(above[-1], first - 1)
     elif rows and {field.strip("[]()").lower() for field in rows[0][1]} <= _UNITS:
         units = [field.strip("[]()-") for field in rows.pop(0)[1]]
         header = [f"{name} [{unit}]" if unit else name

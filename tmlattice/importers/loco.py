@@ -14,7 +14,7 @@ would find what LOCO left: by default the model is the one before the fit.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ LETTERS = {"x": "H", "y": "V"}
 FURTHEST = 1e9
 """No list of places goes there."""
 SAME = 1e-6
-"""Relative difference of the lattice's numbers and the last iteration's: they are the same."""
+"""Relative difference of the lattice's numbers and an iteration's: they are the same."""
 COMPUTED = 1e-4
 """Relative difference of a dispersion and LOCO's first model's: it was computed, not measured. The
 measured ones of ten rings differ by 0.04 to 1."""
@@ -177,38 +177,51 @@ def _elements(
     if not steps:
         return elements, as_it_is, unknown
     try:
-        last, first = (_settings(step) for step in (steps[-1], steps[0]))
-        there = [_number_of(elements, setting) for setting in last]
-        same = all(
-            abs(a - b) <= SAME * max(abs(a), abs(b)) for a, (*_, b) in zip(there, last, strict=True)
-        )
-        if not same:
+        tables = [_settings(step) for step in steps]
+        agreed = [k for k, table in enumerate(tables) if _agree(elements, table)]
+        if not agreed:
             return (
                 elements,
-                f"{as_it_is}: its numbers are not those of the fit's last iteration",
+                f"{as_it_is}: its numbers are those of no iteration of the fit",
                 unknown,
             )
         if iteration == "last":
             return (
                 elements,
-                f"{as_it_is}, with the {len(last)} parameters that LOCO fitted to these data in "
-                f"{len(steps) - 1} iterations (--iteration first: the model before the fit)",
+                f"{as_it_is}, with the {len(tables[agreed[-1]])} parameters that LOCO fitted to "
+                f"these data in {agreed[-1]} iterations (--iteration first: the model before the "
+                "fit)",
                 "fitted lattice",
             )
-        for setting in first:
+        for setting in (own for table in reversed(tables) for own in table):
             _put(elements, setting)
     except (ArithmeticError, KeyError, IndexError, TypeError, ValueError):
         return elements, f"{as_it_is}: the fit's parameters cannot be followed", unknown
     return (
         elements,
-        f"the model is RINGData with the {len(first)} parameters of FitParameters(1), with which "
-        f"the fit began: RINGData itself has those of its last iteration (--iteration last)",
+        f"the model is RINGData with the {len(tables[0])} parameters of FitParameters(1), with "
+        f"which the fit began: RINGData itself has those of its iteration {agreed[-1]} "
+        "(--iteration last)",
         "model before the fit",
     )
 
 
-Setting = tuple[int, str, int, float]
-"""Place, field, number within it, value."""
+class Setting(NamedTuple):
+    """A number of an element as a fit has it.
+
+    Attributes:
+        place, field: of the element.
+        at: the number within the field.
+        value: the number, or the whole field before the fit.
+        stated: whether the number is the parameter's; else a function of it (a roll), and `value`
+            is that before the fit.
+    """
+
+    place: int
+    field: str
+    at: int
+    value: Any
+    stated: bool
 
 
 def _settings(step: Fields) -> list[Setting]:
@@ -223,20 +236,26 @@ def _settings(step: Fields) -> list[Setting]:
             places = np.ravel(np.asarray(one["ElemIndex"], dtype=float))
             if at < 0 or not (places >= 1).all():
                 raise IndexError("places and fields count from 1")
-            places = places.astype(np.int64) - 1
-            settings += [(place, str(one["FieldName"]), at, value) for place in places.tolist()]
+            function = one.get("Function")
+            stated = not isinstance(function, Mapping) or function.get("expr", "x") == "x"
+            own = str(one["FieldName"]), at, value if stated else one["SavedValue"], stated
+            settings += [Setting(int(place) - 1, *own) for place in places.tolist()]
     return settings
 
 
-def _number_of(elements: Sequence[Fields], setting: Setting) -> float:
-    place, field, at, _ = setting
-    return float(np.ravel(elements[place][field])[at])
+def _agree(elements: Sequence[Fields], table: Sequence[Setting]) -> bool:
+    """Whether the elements have an iteration's numbers."""
+    pairs = [
+        (float(np.ravel(elements[own.place][own.field])[own.at]), own.value)
+        for own in table if own.stated
+    ]  # fmt: skip
+    return all(abs(a - b) <= SAME * max(abs(a), abs(b)) for a, b in pairs)
 
 
-def _put(elements: list[dict[str, Any]], setting: Setting) -> None:
-    place, field, at, value = setting
+def _put(elements: Sequence[dict[str, Any]], setting: Setting) -> None:
+    place, field, at, value, _ = setting
     old = elements[place][field]
-    if isinstance(old, np.ndarray):
+    if isinstance(old, np.ndarray) and np.size(value) == 1:
         new = old.astype(float)
         new.ravel()[at] = value
         elements[place][field] = new
@@ -407,9 +426,9 @@ def _computed(data: Fields, models: Any, good: Mapping[str, NDArray[np.bool_]]) 
     model = numbers(first.get("Eta", ()), "LocoModel.Eta").ravel()
     if model.size < eta.size:  # of the monitors of the good lists
         eta = eta[np.concatenate([good["x"], good["y"]])]
-    if model.size != eta.size or not eta.any():
+    if model.size != eta.size or not np.nan_to_num(eta).any():
         return []
-    apart = np.abs(eta - model).max() / np.abs(eta).max()
+    apart = np.nanmax(np.abs(eta - model)) / np.nanmax(np.abs(eta))
     if apart > COMPUTED:
         return []
     return [

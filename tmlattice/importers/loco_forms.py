@@ -19,6 +19,15 @@ SAME_RF = 0.02
 """Share by which a frequency may differ from the one that the ring's length and harmonic make."""
 TINY_STEP = 1e-9
 """Relative step of the RF that no beam would show: it is written in MHz."""
+SCALARS = ("RF", "DeltaRF", "CavityFrequency", "CavityHarmNumber", "Energy")
+HIGHEST_ENERGY = 250.0
+"""GeV, of an electron ring; a number above it is in MeV, and above 1e5 in eV."""
+LEAST_KICK = 3e-4
+"""mrad; such a step moves the beam by some micrometres, and nobody measures a response with it."""
+LEAST_NOISE = 5e-6
+"""mm; no BPM has less, so it is stated in m."""
+HIGHEST_M = 1e3
+"""m/rad, of a response."""
 USUAL_ENERGY = 3.0
 """GeV, where no file states it."""
 
@@ -32,12 +41,13 @@ def usual_form(content: Fields, energy: float | None = None) -> tuple[dict[str, 
     """
     said: list[str] = []
     new = dict(content)
-    if not isinstance(new.get("RINGData"), Mapping | list) and isinstance(new.get("THERING"), list):
-        new["RINGData"] = new["THERING"]
-        said.append("there is no RINGData: the lattice is THERING")
     ring = new.get("RINGData")
     if isinstance(ring, list) and ring and _first(ring).get("Lattice") is None:
-        new["RINGData"] = {"Lattice": ring}  # the ring itself
+        ring = {"Lattice": ring}  # the ring itself
+    if isinstance(new.get("THERING"), list) and "Lattice" not in _first(ring):
+        ring = {**_first(ring), "Lattice": new["THERING"]}
+        said.append("there is no RINGData.Lattice: the lattice is THERING")
+    new["RINGData"] = ring
     for name in ("LocoMeasData", "BPMData", "CMData", "LocoFlags", "RINGData"):
         if isinstance(new.get(name), Mapping | list):
             new[name] = dict(_first(new[name])) or new[name]
@@ -47,12 +57,18 @@ def usual_form(content: Fields, energy: float | None = None) -> tuple[dict[str, 
         return new, said
     if isinstance(new.get("LocoFlags"), dict):
         new["LocoFlags"] = {k: v for k, v in new["LocoFlags"].items() if np.size(v)}
+    for own in (data, new["RINGData"]):  # one number, repeated
+        for name, value in own.items():
+            many = _array(value) if name in SCALARS else None
+            if many is not None and many.size and (many == many.flat[0]).all():
+                own[name] = float(many.flat[0])
     _energy(new, energy, said)
     _rf(new, said)
     _monitors(monitors, said)
     _places(correctors, said)
     _good_lists(monitors, correctors, said)
     _shapes(data, monitors, correctors, said)
+    _units(data, correctors, said)
     return new, said
 
 
@@ -73,7 +89,12 @@ def _energy(new: dict[str, Any], energy: float | None, said: list[str]) -> None:
     if energy is not None:
         ring["Energy"] = energy
         return
-    if any(is_positive(own.get("Energy")) for own in (ring, *_elements(ring))):
+    stated = [own.get("Energy") for own in (ring, *_elements(ring))]
+    stated = [own for own in stated if is_positive(own)]
+    if stated:
+        if HIGHEST_ENERGY < stated[0] < 1e5:
+            ring["Energy"] = 1e-3 * stated[0]
+            said.append(f"the energy of {stated[0]:g} is taken in MeV")
         return
     others = [own.get("E0") for own in (_first(new.get("GLOBVAL")), *_elements(ring))]
     found = next((own for own in others if is_positive(own)), None)
@@ -105,6 +126,7 @@ def _rf(new: dict[str, Any], said: list[str]) -> None:
         for name in names:  # an empty one, NaN or 0 states nothing
             if not is_positive(own.get(name)):
                 own.pop(name, None)
+    cavities.sort(key=lambda own: own.get("HarmNumber", np.inf))  # the main one first
     stated = (data.get("RF"), ring.get("CavityFrequency"), *(e.get("Frequency") for e in cavities))
     frequencies = [own for own in stated if own is not None]
     stated = (ring.get("CavityHarmNumber"), *(e.get("HarmNumber") for e in cavities))
@@ -150,7 +172,7 @@ def _frequency(
 def _step(new: Fields, data: dict[str, Any], said: list[str]) -> None:
     """`DeltaRF`, in Hz."""
     fitted = _first(new.get("FitParameters")).get("DeltaRF")
-    if data.get("DeltaRF") == 0:  # not stepped, or not written down
+    if is_number(data.get("DeltaRF")) and data["DeltaRF"] == 0:  # not stepped, or not written down
         del data["DeltaRF"]
     if not is_number(data.get("DeltaRF")) and is_number(fitted) and np.size(data.get("Eta", ())):
         data["DeltaRF"] = fitted
@@ -188,14 +210,16 @@ def _places(correctors: dict[str, Any], said: list[str]) -> None:
         kicks = _array(correctors.get(f"{letter}CMKicks"))
         if kicks is not None and np.isnan(kicks).any():
             correctors[f"{letter}CMKicks"] = np.nan_to_num(kicks)
-        index = _array(correctors.get(f"{letter}CMIndex"))
-        if index is None or index.ndim != 2 or kicks is None:
+        index = correctors.get(f"{letter}CMIndex")
+        rows = index if isinstance(index, list) else _array(index)
+        if rows is None or kicks is None or (isinstance(rows, np.ndarray) and rows.ndim != 2):
             continue
-        if index.shape[0] != kicks.size and index.shape[1] == kicks.size:
-            index = index.T
-        if index.shape[0] != kicks.size:
+        if isinstance(rows, np.ndarray) and len(rows) != kicks.size:
+            rows = rows.T
+        if len(rows) != kicks.size:
             continue
-        there = [row[np.isfinite(row) & (row > 0)] for row in index]
+        rows = [np.ravel(np.asarray(row, dtype=float)) for row in rows]
+        there = [row[np.isfinite(row) & (row > 0)] for row in rows]
         if all(len(row) for row in there):
             correctors[f"{letter}CMIndex"] = np.array([row[len(row) // 2] for row in there])
             said.append(f"of {letter}CMIndex, of several elements a corrector, the middle is taken")
@@ -236,6 +260,8 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
             data["M"] = np.full(shape, np.nan)
             data["M"][np.ix_(rows, columns)] = M
             said.append("M has the rows and columns of the good lists alone")
+    if np.shape(data.get("M")) == shape:
+        _unread(data, x, _count(correctors, "H", "CM"), said)
     for name in ("Eta", "BPMSTD"):
         given = _array(data.get(name))
         if given is None or given.size in (0, 1):
@@ -257,7 +283,49 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
         elif not np.nan_to_num(given).any():
             said.append(f"{name} is zero everywhere, and is left out")
             given = np.zeros(0)
-        data[name] = given
+        data[name] = np.where(given == 0, np.nan, given)
+
+
+def _unread(data: dict[str, Any], x: int, horizontal: int, said: list[str]) -> None:
+    """NaN where all that a BPM read of one plane's correctors, or all that was read of a corrector
+    in one plane, is exactly zero: no reading is."""
+    M = np.array(data["M"], dtype=float)
+    for rows in (slice(x), slice(x, None)):
+        for columns in (slice(horizontal), slice(horizontal, None)):
+            block = M[rows, columns]
+            zero = block == 0
+            block[zero.all(axis=1)[:, None] | zero.all(axis=0)] = np.nan
+    if count := np.count_nonzero(np.isnan(M) & (np.asarray(data["M"]) == 0)):
+        data["M"] = M
+        said.append(
+            f"{count} numbers of M are zero for a whole BPM or corrector: they were not measured"
+        )
+
+
+def _units(data: dict[str, Any], correctors: dict[str, Any], said: list[str]) -> None:
+    """Orbits in mm and kicks in mrad, where both are in m and rad; `BPMSTD` that is a noise."""
+    M, noise = _array(data.get("M")), _array(data.get("BPMSTD"))
+    if M is None or not np.isfinite(M).any():
+        return
+    kicks = {name: _array(correctors.get(name)) for name in ("HCMKicks", "VCMKicks")}
+    largest = max((np.abs(k).max(initial=0) for k in kicks.values() if k is not None), default=0)
+    if 0 < largest < LEAST_KICK and np.nanmax(np.abs(M)) < HIGHEST_M * largest:
+        for structure, names in ((data, ("M", "Eta", "BPMSTD")), (correctors, tuple(kicks))):
+            for name in names:
+                if (own := _array(structure.get(name))) is not None:
+                    structure[name] = 1e3 * own
+        said.append("kicks are below 1 µrad: they are taken in rad; M, Eta, BPMSTD in m")
+    elif noise is not None and np.isfinite(noise).any():
+        typical = np.nanmedian(noise)
+        if 0 < typical < LEAST_NOISE:
+            data["BPMSTD"] = 1e3 * noise
+            said.append(f"a BPMSTD of {1e6 * typical:.2g} nm is that of no BPM: it is taken in m")
+        elif typical > np.sqrt(np.nanmean(M**2)) / 2:
+            data["BPMSTD"] = np.zeros(0)
+            said.append(
+                f"a BPMSTD of {typical:g} mm is as large as the response: it holds weights, and is "
+                "left out"
+            )
 
 
 def _goods(structure: Fields, kind: str) -> NDArray[np.int64]:

@@ -171,7 +171,10 @@ def ring_of_elements(
     messages: Counter[str] = Counter()
     with warnings.catch_warnings():  # AT's own, of what it finds in old files
         warnings.simplefilter("ignore")
-        made = [at_element(fields, i, energy, messages) for i, fields in enumerate(elements)]
+        made = [
+            _as_it_passes(at_element(fields, i, energy, messages))
+            for i, fields in enumerate(elements)
+        ]
     of_family = _planes_of_families(made, roles.kicks)
     sequence: list[Any] = []
     where: dict[tuple[int, str], int] = {}  # (place, "" or plane) -> in the sequence
@@ -254,6 +257,15 @@ def _names(ring: Ring, families: Sequence[str], places: Iterable[int]) -> dict[i
             )
         names[place] = there[family][number[place]]
     return names
+
+
+def _as_it_passes(element: Any) -> Any:
+    """No drift, where AT made one of the length alone and its pass method is another's."""
+    import at
+
+    if not isinstance(element, at.Drift) or "Drift" in element.PassMethod:
+        return element
+    return at.Element(element.FamName, **{k: v for k, v in vars(element).items() if k != "FamName"})
 
 
 def _family(element: Any) -> str:

@@ -27,7 +27,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.arrays import METRES
 from tmlattice.measurement.lost_beam import about_sums, no_beam
-from tmlattice.measurement.rows import LARGEST_READING
+from tmlattice.measurement.monitors import LARGEST_READING
 
 Array = NDArray[np.float64]
 
@@ -132,8 +132,6 @@ def bring_readings(
     readings[silent] = np.nan
     said_of_large = _without_large(path, readings, names)
     left = [device for device in devices if monitor.get(device) is None]
-    bad = sorted({names[at] for at in finder.bad if np.isfinite(readings[:, :, at]).any()})
-    taken[:, :, sorted(finder.bad)] = False
     read = np.flatnonzero(taken[..., :SUM].any(axis=(0, 1, 3)))
     noise = None if stated.noise is None else np.full((len(read), 2), stated.noise)
     hints = (None, None) if ring is None else (ring.name, ring.energy)
@@ -161,8 +159,6 @@ def bring_readings(
         of_unit, beam, of_noise, *finder.said, *sums, *missing, *said_of_large,
         *_unused(columns, stated),
     ]  # fmt: skip
-    if bad:
-        said.append(f"bad monitors, left out as stated: {counted(bad)}")
     doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
     return Imported(data, ring, tuple(said), doubts, guessed)
 
@@ -408,9 +404,7 @@ class _Finder:
         self._plain = _unique(_norm, self._names)
         self._told: dict[str, int] = {}
         self._in_order = stated.in_order
-        self._stated = stated
         others = {name.casefold() for name in elements}
-        self.bad: set[int] = set()
         self.said: list[str] = []
         for device, name in stated.names.items():
             plain = name if name.casefold() in self._exact else name.rpartition(" ")[0]
@@ -450,11 +444,6 @@ class _Finder:
                 f"names are matched: '{loose[0]}' is '{self._names[at]}'"
                 + (f", and so on for {len(loose)}" if len(loose) > 1 else "")
             )
-        for device, at in found.items():
-            if at is None:
-                continue
-            if self._stated.is_bad(device, self._names[at]):
-                self.bad.add(at)
         return found
 
     def _same(self, device: str, at: int) -> bool:

@@ -1,10 +1,12 @@
 """What a user states of files of readings (the machine file): names, unit, noise, bad monitors."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
+
+from tmlattice.errors import unknown_name
 
 COLUMNS = ("monitor", "plane", "value", "shot", "turn")
 
@@ -36,13 +38,27 @@ class Stated:
         plain = device.casefold()
         return next((own for key, own in self.names.items() if key.casefold() == plain), device)
 
-    def is_bad(self, *names: str) -> bool:
-        """Whether a pattern of the bad monitors is like one of the names."""
-        return any(
-            fnmatchcase(name.casefold(), pattern.casefold())
-            for name in names
-            for pattern in self.bad
-        )
+    def bad_among(self, monitors: Mapping[str, str], others: Iterable[str] = ()) -> list[str]:
+        """The monitors that are bad, as stated.
+
+        Args:
+            monitors: of the data, and the device of each.
+            others: of the lattice, which the data need not have.
+
+        Raises:
+            UnknownNameError: a pattern of no monitor, and of no name that is stated.
+        """
+        found, others = [], [*others, *self.names]
+        for pattern in self.bad:
+            like = [
+                own for own, device in {**dict.fromkeys(others, ""), **monitors}.items()
+                if any(fnmatchcase(n.casefold(), pattern.casefold()) for n in (own, device))
+            ]  # fmt: skip
+            if not like:
+                known = [*others, *monitors, *monitors.values()]
+                raise unknown_name("monitor", pattern, dict.fromkeys(known))
+            found += like
+        return [own for own in monitors if own in found]
 
 
 def machine_text(

@@ -254,15 +254,13 @@ def _response(
 ) -> Imported:
     every = dict.fromkeys(m for _, own in columns.values() for m in own)
     of = {device: ring[stated.name_of(device)].name for device in (*columns, *every)}
-    bad = [m for m in every if stated.is_bad(m, of[m])]
-    monitors = list(dict.fromkeys(of[m] for m in every if m not in bad))
+    monitors = list(dict.fromkeys(of[m] for m in every))
     index = {name: i for i, name in enumerate(monitors)}
 
     def orbit(own: dict[str, tuple[float, float]]) -> Array:
         spread = np.full((len(monitors), 2), np.nan)
         for name, xy in own.items():
-            if of[name] in index:
-                spread[index[of[name]]] = xy
+            spread[index[of[name]]] = xy
         return spread
 
     planes = []
@@ -276,8 +274,6 @@ def _response(
         "the RF frequency stood still while correctors were stepped",
         "no noise is given",
     ]
-    if bad:
-        more.append(f"bad monitors, left out as stated: {counted(bad)}")
     return Imported(
         OrbitResponse(
             correctors=tuple(of[name] for name in columns),

@@ -111,6 +111,8 @@ class CombinedProblem(Problem):
 
     def everywhere(self) -> "CombinedProblem":
         """Return the problem with causes that act in all parts."""
+        if self.alone:  # they do, and the models of the parts are made
+            return self
         parts = tuple(part.everywhere() for part in self.parts)
         return replace(self, parts=parts, active=(True,) * len(parts))
 

@@ -300,20 +300,28 @@ class FittedErrors:
     Attributes:
         problem: with these errors.
         plain: without them, with the noise as estimated.
-        before: fit of the nuisances alone.
-        sizes, errors: rms by effect; relative error of each.
+        sizes, errors: rms by effect; relative error of each that was estimated.
         log_evidence: over no distributed errors.
+        log_marginal: log marginal likelihood of the sampled rows.
         outlier_evidence: log evidence that the one cause is a fault rather than a member of its
             family of errors; None: not computed.
+        fitted: see `before`.
     """
 
     problem: DistributedProblem
     plain: Problem
-    before: Fit
     sizes: Mapping[str, float]
-    errors: Mapping[str, float]
-    log_evidence: float
+    errors: Mapping[str, float] = field(default_factory=dict)
+    log_evidence: float = 0.0
+    log_marginal: float = 0.0
     outlier_evidence: float | None = None
+    fitted: Fit | None = None
+
+    @property
+    def before(self) -> Fit:
+        """Fit of the nuisances alone."""
+        assert self.fitted is not None
+        return self.fitted
 
 
 def fit_distributed_errors(
@@ -344,54 +352,88 @@ def fit_distributed_errors(
     Raises:
         UnstableRingError: no beam is stored with the most probable errors.
     """
-    names, belongs = families_of(known)
     amounts = known.amounts if linearised_at is None else linearised_at
     stored = amounts if stored is None else stored
-    evidence, errors, opened, outlier_evidence = 0.0, dict[str, float](), None, None
-    for turn in range(LINEARISATIONS if linearised_at is None else 1):
-        inner, alone, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
-        assert alone.projection is not None
+    for left in reversed(range(LINEARISATIONS if linearised_at is None else 1)):
+        inner, point, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
         stored = amounts
-        slopes = signatures_of(inner, alone, known.hypotheses)
+        slopes = signatures_of(inner, point, known.hypotheses)
         slopes *= chain_factors(known, amounts)[:, None]
-        shift = (amounts - known.amounts) @ slopes
-        spread = known.correlated(known.rms[:, None] * slopes)
-        if learn:
-            moved = alone.residual + inner.as_rows(shift.reshape(inner.valid.shape))
-            keep = sampled_rows(len(moved))
-            rows = inner.as_rows(spread.reshape(-1, *inner.valid.shape))
-            noise = [part[keep] for part in inner.noise_rows()] if noisy else []
-            directions = alone.projection.matrix()[keep]
-            found = components_of_rows(moved[keep], directions, rows[:, keep], belongs, noise)
-            if weigh:  # as a member of its family
-                i = known.hypotheses.index((causes[0].effect, causes[0].element))
-                some, amount = rows[:, keep], causes[0].amount
-                some[i] *= find(causes[0].effect).chain(amount)
-                whole = moved[keep] + amount / known.rms[i] * some[i]
-                other = components_of_rows(whole, directions, some, belongs, noise)
-                outlier_evidence = found.log_marginal - other.log_marginal
-            if noise:
-                problem, inner = (own.noisier(found.noise) for own in (problem, inner))
-            evidence = found.log_evidence if turn == 0 else evidence
-            errors = dict(zip(names, found.error.tolist(), strict=True))
-            opened = (belongs, found.covariance)
-            known = replace(known, rms=known.rms * found.scale[belongs])
-            spread *= found.scale[belongs][:, None]
+        shift = ((amounts - known.amounts) @ slopes).reshape(inner.valid.shape)
+        spread = known.correlated(known.rms[:, None] * slopes).reshape(-1, *inner.valid.shape)
         among = DistributedProblem(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
             judgement=problem.judgement, inner=inner, known=known, linearised_at=amounts,
-            spread=spread.reshape(-1, *inner.valid.shape),
-            shift=shift.reshape(inner.valid.shape), open=opened,
+            spread=spread, shift=shift,
         )  # fmt: skip
-        point = fit_nuisances(among, causes, alone.nuisances)
+        fitted = FittedErrors(among, problem, _sizes(known))
+        if learn and not left:
+            fitted = _scaled(fitted, point, causes, noisy, weigh)
+        point = fit_nuisances(fitted.problem, causes, point.nuisances)
         assert point.projection is not None
         nuisances = point.nuisances
-        amounts = among.estimate(point.projection.out(point.residual))
-    before = fit(among, (), nuisances)
+        if left:
+            amounts = among.estimate(point.projection.out(point.residual))
+    return _with_nuisances(fitted, nuisances)
+
+
+def rescaled(
+    errors: FittedErrors, causes: Sequence[Cause], nuisances: Array, noisy: bool
+) -> FittedErrors:
+    """Return the same linearisation with scales estimated together with causes.
+
+    Args:
+        errors: distributed errors, linearised at or near the causes.
+        causes, nuisances, noisy: see `fit_distributed_errors`.
+    """
+    point = fit_nuisances(errors.problem.inner, causes, nuisances)
+    return _with_nuisances(_scaled(errors, point, causes, noisy, False), point.nuisances)
+
+
+def _scaled(
+    errors: FittedErrors, point: Point, causes: Sequence[Cause], noisy: bool, weigh: bool
+) -> FittedErrors:
+    """Estimate the scales, and the noise, at a point of the problem without distributed errors."""
+    problem, inner, known = errors.problem, errors.problem.inner, errors.problem.known
+    assert point.projection is not None
+    names, belongs = families_of(known)
+    keep = sampled_rows(len(point.residual))
+    moved = point.residual[keep] + inner.as_rows(np.asarray(problem.shift))[keep]
+    rows = problem.rows[:, keep]
+    noise = [part[keep] for part in inner.noise_rows()] if noisy else []
+    directions = point.projection.matrix()[keep]
+    found = components_of_rows(moved, directions, rows, belongs, noise)
+    outlier_evidence = None
+    if weigh:  # as a member of its family
+        i = known.hypotheses.index((causes[0].effect, causes[0].element))
+        amount = causes[0].amount
+        rows[i] *= find(causes[0].effect).chain(amount)
+        whole = moved + amount / known.rms[i] * rows[i]
+        other = components_of_rows(whole, directions, rows, belongs, noise)
+        outlier_evidence = found.log_marginal - other.log_marginal
+    plain, scale = errors.plain, found.scale[belongs]
+    if noise:
+        plain, inner = (own.noisier(found.noise) for own in (plain, inner))
+    known = replace(known, rms=known.rms * scale)
+    spread = problem.spread * scale.reshape(-1, *[1] * (problem.spread.ndim - 1))
+    opened = (belongs, found.covariance)
+    return FittedErrors(
+        replace(problem, inner=inner, known=known, spread=spread, open=opened), plain,
+        _sizes(known), dict(zip(names, found.error.tolist(), strict=True)),
+        found.log_evidence, found.log_marginal, outlier_evidence,
+    )  # fmt: skip
+
+
+def _sizes(known: DistributedErrors) -> dict[str, float]:
+    return {name: rms for (name, _), rms in zip(known.hypotheses, known.rms.tolist(), strict=True)}
+
+
+def _with_nuisances(errors: FittedErrors, nuisances: Array) -> FittedErrors:
+    """Fit the nuisances alone."""
+    before = fit(errors.problem, (), nuisances)
     if before.point.lost:
         raise UnstableRingError(f"{before.point.lost} with distributed errors, without the causes")
-    sizes = {name: float(known.rms[belongs == i][0]) for i, name in enumerate(names)}
-    return FittedErrors(among, problem, before, sizes, errors, evidence, outlier_evidence)
+    return replace(errors, fitted=before)
 
 
 def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
@@ -513,8 +555,7 @@ class Posterior:
     @property
     def sizes(self) -> dict[str, float]:
         """Estimated rms by effect."""
-        own = zip(self.before.hypotheses, self.before.rms.tolist(), strict=True)
-        return {name: rms for (name, _), rms in own}
+        return _sizes(self.before)
 
     @cached_property
     def known(self) -> DistributedErrors:

@@ -3,8 +3,11 @@
 >>> Judgement(false_alarm=0.001)
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+
+from tmlattice.inference.chi2 import MAD
 
 
 @dataclass(frozen=True)
@@ -21,13 +24,13 @@ class Judgement:
         window, drift: log evidence below the leader of the linear scan at which no hypothesis is
             refitted, and the share of the statistic added to it, as the scan errs by a share.
         starts: shares of a curved effect's largest fault from which it is refitted.
-        nearly: share of a free kick's fall in chi-square, which has a parameter per shot, above
-            which an effect of the catalogue that explains it is tried first.
-        most_outliers, outlier_prior: single readings rejected at most; log probability of one.
+        most_outliers: single readings rejected at most.
         same: largest relative change of amount and orbit with which a slope is reused.
         silent: share of BPMs without signal above which they are taken as not installed.
         noise: p-values of the residual for a warning, and for no verdict.
-        retaken: times that distributed errors are linearised again at a strong fault.
+        sparse: median misfit between neighbouring BPMs, in units of the noise, up to which faults
+            may be sparse: there errors between neighbours are as large as the noise, which alone
+            makes 0.674, the median of |N(0, 1)|.
         rarer: factor by which each cause beyond the first is less probable than the one before.
     """
 
@@ -41,14 +44,26 @@ class Judgement:
     window: float = 12.0
     drift: float = 0.03
     starts: tuple[float, ...] = (-1.0, -0.5, -0.2, 0.2, 0.5, 1.0)
-    nearly: float = 0.5
     most_outliers: int = 40
-    outlier_prior: float = -16.0
     same: float = 0.02
     silent: float = 0.2
     noise: tuple[float, float] = (1e-4, 1e-6)
-    retaken: int = 2
+    sparse: float = math.sqrt(2) / MAD
     rarer: float = 1.0
+
+    @property
+    def log_odds(self) -> float:
+        """Log Bayes factor that a hypothesis without a significance of its own has to reach.
+
+        Under the simpler hypothesis a Bayes factor exceeds 1 / p with a probability of p at most
+        (Markov's inequality).
+        """
+        return -math.log(self.false_alarm)
+
+    def outlier_prior(self, readings: int) -> float:
+        """Log probability that one of these readings is an outlier: one in a data set at the rate
+        of its false alarms, without another source."""
+        return math.log(self.rate("reading") / max(readings, 1))
 
     def rate(self, kind: str) -> float:
         """False-alarm probability of one kind of finding."""

@@ -109,7 +109,8 @@ def outlier(problem: Problem, point: Point, already: int) -> list[Option]:
     if not seen.p_value < rate:
         return []
     # a log-uniform amount, as for every other cause
-    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + thresholds.outlier_prior
+    prior = thresholds.outlier_prior(problem.valid.size)
+    gain = 0.5 * value - 0.5 * np.log(max(value, 1.0)) - np.log(4.0) + prior
     return [Option("reading", f"reading {worst}", float(gain), seen, reading=worst)]
 
 
@@ -125,7 +126,7 @@ class Search:
         by_marginal_likelihood: the marginal likelihood alone decides on a first cause, not the
             false-alarm rate: for the most probable explanation, significant or not.
         labelled_first: effects of the catalogue go before a free kick. Else that is tried if a free
-            kick was preferred to an effect that nearly explains it, and the evidence decides.
+            kick was preferred to a significant effect, and the evidence decides.
         enough: chi-square below which the search ends.
         established: hypotheses whose presence is known.
         keep: a cause may be replaced, not removed.
@@ -167,7 +168,7 @@ class State:
         outliers: rejected single readings.
         dropped: all rejected readings, of the problem's shape.
         effective: number of independent hypotheses in pure noise; None: not yet simulated.
-        kick_preferred: whether a free kick was preferred to an effect that nearly explains it.
+        kick_preferred: whether a free kick was preferred to an effect of the catalogue.
     """
 
     problem: Problem
@@ -264,7 +265,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         options = [] if over else _options(search, state, scans)
         beyond = next((option.alternatives for option in options if option.kind == "named"), ())
         # the false-alarm rate decides on a first finding, the evidence on further ones
-        accepted = () if seen or search.by_marginal_likelihood else ("named",)
+        accepted = () if seen or so_far or search.by_marginal_likelihood else ("named",)
         options = [option for option in options if option.gain > 0 or option.kind in accepted]
         seen.add(state.names)
         visited.add(state.choices)
@@ -296,22 +297,12 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
 
 
 def _weighed(search: Search, one: State, other: State) -> float:
-    """Log evidence of an explanation on the readings that neither rejects."""
-    return on_readings(search.problem.without(one.dropped | other.dropped), one)[0]
-
-
-def on_readings(problem: Problem, state: State) -> tuple[float, Fit]:
-    """Log evidence of an explanation refitted on a problem's readings; and that fit.
-
-    Args:
-        problem: with the readings on which explanations are compared.
-        state: one of them.
-    """
-    refitted = fit(problem, state.fit.causes, state.fit.nuisances, state.fit.kicks)
-    aside = problem.unknown_prior(len(problem.monitors)) * len(state.monitors)
-    return refitted.log_evidence + aside + problem.judgement.outlier_prior * len(
-        state.outliers
-    ), refitted
+    """Log evidence of an explanation refitted on the readings that neither rejects."""
+    problem = search.problem.without(one.dropped | other.dropped)
+    refitted = fit(problem, one.fit.causes, one.fit.nuisances, one.fit.kicks)
+    monitors = problem.unknown_prior(len(problem.monitors)) * len(one.monitors)
+    outliers = problem.judgement.outlier_prior(problem.valid.size) * len(one.outliers)
+    return refitted.log_evidence + monitors + outliers
 
 
 # --- looking ----
@@ -387,8 +378,7 @@ def _choice(search: Search, state: State, options: Sequence[Option]) -> tuple[Op
     if named and best.kind == "kick":
         if search.labelled_first:
             return named[0], state
-        nearly = named[0].gain > state.problem.judgement.nearly * best.gain
-        state = replace(state, kick_preferred=state.kick_preferred or nearly)
+        state = replace(state, kick_preferred=True)
     return best, state
 
 

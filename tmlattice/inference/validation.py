@@ -15,6 +15,9 @@ from tmlattice.inference import chi2
 
 Array = NDArray[np.float64]
 
+DETERMINED = 5.0
+"""Standard errors of a gap from which on the share that is explained is determined, to a fifth."""
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -181,7 +184,7 @@ def _explained(
     spread_bottom = 2 * twice + 4 * max(float(one.residual @ moved_one) - twice, 0.0)
     spread_top = 2 * twice + 4 * max(float(other.residual @ moved_other) - twice, 0.0)
     shared = 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
-    if bottom < 5 * np.sqrt(spread_bottom):
+    if bottom < DETERMINED * np.sqrt(spread_bottom):
         return None, None
     left = max(top, 0.0) / bottom
     variance = (spread_top + left**2 * spread_bottom - 2 * left * shared) / bottom**2

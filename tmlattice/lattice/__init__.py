@@ -7,11 +7,10 @@
 """
 
 from tmlattice.lattice.default_magnet import middle_of_first_arc
-from tmlattice.lattice.json_file import save_ring
 from tmlattice.lattice.load import builtin_lattices, load_ring
 from tmlattice.lattice.marked import marked
 from tmlattice.lattice.ring import Element, Kind, Ring
-from tmlattice.lattice.write import write_ring
+from tmlattice.lattice.write import save_ring
 
 __all__ = [
     "Element",
@@ -22,5 +21,4 @@ __all__ = [
     "marked",
     "middle_of_first_arc",
     "save_ring",
-    "write_ring",
 ]

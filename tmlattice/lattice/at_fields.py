@@ -176,13 +176,18 @@ def bend(
         e2=float(getattr(element, "ExitAngle", 0.0)),
         tilt=roll,
         gap=float(getattr(element, "FullGap", 0.0)),
-        fint=float(getattr(element, "FringeInt1", 0.0)),
-        fintx=float(getattr(element, "FringeInt2", 0.0)),
+        fint=_fringe(element, "FringeInt1", "FringeBendEntrance"),
+        fintx=_fringe(element, "FringeInt2", "FringeBendExit"),
         h_pole1=float(getattr(element, "H1", 0.0)),
         h_pole2=float(getattr(element, "H2", 0.0)),
         eid=family,
     )
     return "bend", source
+
+
+def _fringe(element: Any, integral: str, model: str) -> float:
+    """The fringe integral of a face; model 0 has none."""
+    return float(getattr(element, integral, 0.0)) if getattr(element, model, 1) else 0.0
 
 
 def with_coils(element: Any, family: str, source: Any) -> list[Place]:

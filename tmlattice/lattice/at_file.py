@@ -16,6 +16,7 @@ Coordinates of a matrix element are turned from AT's (.., delta, ct) into OCELOT
 tau = ct, p = beta0 delta.
 """
 
+import cmath
 import logging
 import math
 import re
@@ -81,24 +82,24 @@ def read_at(
     if path.suffix.lower() == ".mat":
         check_mat(path)
     try:
-        with quiet_at() as told, nothing_run(), TemporaryDirectory() as folder:
+        with quiet_at() as caught, nothing_run(), TemporaryDirectory() as folder:
             source = path
             if path.suffix.lower() == ".m":
                 source = Path(folder) / path.name
                 source.write_text(_list_of_m(path))
             lattice = at.load_lattice(str(source), **options)
-            for said in (str(warning.message) for warning in told):
-                if "skipped" in said or "Unknown class" in said:
-                    raise LatticeError(f"AT's reader leaves an element out: {said}")
+            for message in (str(warning.message) for warning in caught):
+                if "skipped" in message or "Unknown class" in message:
+                    raise LatticeError(f"AT's reader leaves an element out: {message}")
     except Exception as error:  # each of AT's readers fails in its own way
-        said = plain(str(error), 300) or type(error).__name__
-        if "energy is not defined" in said:
+        message = plain(str(error), 300) or type(error).__name__
+        if "energy is not defined" in message:
             raise LatticeError(f"'{path}' states no beam energy; give energy= (GeV)") from error
         advice = "save it with AT's save_lattice, or name its variable with sequence="
         if isinstance(error, LatticeError):
             advice = "correct it"
         raise LatticeError(
-            f"'{path}' cannot be read as an AT lattice ({said}); {advice}"
+            f"'{path}' cannot be read as an AT lattice ({message}); {advice}"
         ) from error
     return ring_from_at(lattice, name, energy)
 
@@ -131,10 +132,10 @@ def _list_of_m(path: Path) -> str:
 @contextmanager
 def quiet_at() -> Iterator[list[warnings.WarningMessage]]:
     """What AT warns of stays in the log: it is about AT's tracking, or about words of a file."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        yield told
-    for warning in told:
+        yield caught
+    for warning in caught:
         log.info("AT: %s", warning.message)
 
 
@@ -233,9 +234,36 @@ def _places(
     if isinstance(element, at.Corrector) and not _acts(element):
         return _correctors(element, family, mad)
     kind, source = _convert(element, family, mad, energy, left_out, tracker)
+    own: list[Place] = [(family, kind, source)]
     if kind == "bend":
-        return with_coils(element, family, source)
-    return [(family, kind, source)]
+        own = with_coils(element, family, source)
+    if kind not in ("matrix", "wiggler"):  # those are all that AT makes of the element
+        own = _with_fringes(element, family, own, energy, tracker)
+    return own
+
+
+def _with_fringes(
+    element: Any, family: str, own: list[Place], energy: float, tracker: Tracker
+) -> list[Place]:
+    """An element between the matrices of its linear quadrupole fringes (AT's model 2)."""
+    sides = [s for s in ("Entrance", "Exit") if getattr(element, f"FringeQuad{s}", 0) == 2]
+    if not sides or not all(hasattr(element, f"fringeInt{sign}0") for sign in "MP"):
+        return own
+
+    def without(*off: str) -> Array:
+        other = element.deepcopy()
+        for side in off:
+            setattr(other, f"FringeQuad{side}", 0)
+        return tracker.map(other)[0]
+
+    bare = np.linalg.inv(without("Entrance", "Exit"))
+    fringes = {"Entrance": bare @ without("Exit"), "Exit": without("Entrance") @ bare}
+    made: dict[str, Place] = {
+        side: (f"{family}_fringe", *_matrix(fringes[side], f"{family}_fringe", 0.0, energy))
+        for side in sides
+    }
+    first, last = ([made[s]] if s in made else [] for s in ("Entrance", "Exit"))
+    return [*first, *own, *last]
 
 
 def _convert(
@@ -329,7 +357,9 @@ def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     given = np.asarray(element.KickAngle, dtype=float).ravel()[:2]
     if element.PassMethod.startswith(("Corrector", *_FIELDS)):  # else it is switched off
         kicks[: len(given)] = given
-    x, y = kicks.tolist()
+    R1, _ = _rotations(element)
+    turned = complex(*kicks) * cmath.exp(1j * math.atan2(R1[0, 2], R1[0, 0]))
+    x, y = turned.real, turned.imag
     names = (str(element.FamName), family)
     horizontal = mad == "HKICKER" or any(_HORIZONTAL.search(name) for name in names)
     vertical = mad == "VKICKER" or any(_VERTICAL.search(name) for name in names)

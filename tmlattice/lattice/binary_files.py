@@ -435,8 +435,8 @@ def main() -> None:
     try:
         importlib.import_module(_NEEDS[kind])
         limit(seconds)
-        said: tuple[str, Any] = ("read", READERS[kind](path, *arguments))
-        answer = pickle.dumps(said, protocol=5)
+        result: tuple[str, Any] = ("read", READERS[kind](path, *arguments))
+        answer = pickle.dumps(result, protocol=5)
     except MemoryError:
         answer = pickle.dumps(("refused", f"it asks for more than {MEMORY >> 20} MB of memory"))
     except RefusedError as error:

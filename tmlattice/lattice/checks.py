@@ -33,9 +33,9 @@ def reading(path: Path) -> Iterator[None]:
     except RecursionError as error:
         raise LatticeError(f"'{path}' is nested too deeply; write it out") from error
     except Exception as error:
-        said = plain(str(error), 200) or type(error).__name__
+        reason = plain(str(error), 200) or type(error).__name__
         raise LatticeError(
-            f"'{path}' holds no ring that can be read ({said}); correct it"
+            f"'{path}' holds no ring that can be read ({reason}); correct it"
         ) from error
 
 
@@ -115,8 +115,8 @@ def no_whole_turn(ring: Ring) -> str | None:
         return None
     if share < CLOSED:
         return f"the bends of '{ring.name}' sum to 0: it is taken for a ring all the same"
-    said = f"'{ring.name}' bends by {math.degrees(total):.4g} degrees in all"
+    bends = f"'{ring.name}' bends by {math.degrees(total):.4g} degrees in all"
     cells = round(1 / share)
     if cells > 1 and abs(cells * share - 1) < CLOSED:
-        return f"{said}, 1/{cells} of a turn: it is taken for a ring of one such cell"
-    return f"{said} and not by 360: it is taken for a ring all the same"
+        return f"{bends}, 1/{cells} of a turn: it is taken for a ring of one such cell"
+    return f"{bends} and not by 360: it is taken for a ring all the same"

@@ -69,32 +69,38 @@ _INERT: dict[str, dict[str, float]] = {
 _MOVED = ("DX", "DY", "DZ", "TILT")
 _STEERED = ("HKICK", "VKICK", "HCALIBRATION", "VCALIBRATION")
 _BENDS = ("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND", "CCBEND")
-_OWN: dict[tuple[str, ...], tuple[str, ...]] = {
-    ("QUAD", "KQUAD"): ("L", "K1", "FSE", "BORE", "B", *_MOVED, *_STEERED),
-    ("QUFRINGE",): ("L", "K1", "FSE", "DIRECTION", *_MOVED),
-    ("DQCOR",): ("L", "K1", "J1", "FSE", *_MOVED, *_STEERED),
-    ("SEXT", "KSEXT"): ("L", "K1", "K2", "J1", "FSE", "BORE", "B", *_MOVED, *_STEERED),
-    ("KQUSE",): ("L", "K1", "K2", "FSE1", "FSE2", *_MOVED),
-    ("OCTU", "KOCT"): ("L", "K3", "FSE", "BORE", "B", *_MOVED),
-    ("MULT",): ("L", "KNL", "ORDER", "FACTOR", "BORE", "BTIPL", *_MOVED),
-    _BENDS: (
+_OWN: dict[tuple[str, ...], tuple[str, tuple[str, ...]]] = {
+    ("QUAD", "KQUAD"): ("quadrupole", ("L", "K1", "FSE", "BORE", "B", *_MOVED, *_STEERED)),
+    ("QUFRINGE",): ("quadrupole", ("L", "K1", "FSE", "DIRECTION", *_MOVED)),
+    ("DQCOR",): ("quadrupole", ("L", "K1", "J1", "FSE", *_MOVED, *_STEERED)),
+    ("SEXT", "KSEXT"): (
+        "sextupole", ("L", "K1", "K2", "J1", "FSE", "BORE", "B", *_MOVED, *_STEERED),
+    ),
+    ("KQUSE",): ("sextupole", ("L", "K1", "K2", "FSE1", "FSE2", *_MOVED)),
+    ("OCTU", "KOCT"): ("octupole", ("L", "K3", "FSE", "BORE", "B", *_MOVED)),
+    ("MULT",): ("multipole", ("L", "KNL", "ORDER", "FACTOR", "BORE", "BTIPL", *_MOVED)),
+    _BENDS: ("bend", (
         "L", "ANGLE", "K1", "K2", "E1", "E2", "H1", "H2", "HGAP", "FINT", "FINT1", "FINT2", "FSE",
         "FSE_DIPOLE", "FSE_QUADRUPOLE", "ETILT", "ETILT_SIGN", "EDGE1_EFFECTS", "EDGE2_EFFECTS",
         "USE_BN", "B1", "B2", "XKICK", "YKICK", "YAW", *_MOVED,
-    ),
-    ("HKICK", "VKICK", "EHKICK", "EVKICK"): ("L", "KICK", "TILT", "CALIBRATION"),
-    ("KICKER", "EKICKER"): ("L", "TILT", *_STEERED),
-    ("MONI", "HMON", "VMON"): ("L",),
-    ("RFCA", "RFCW", "MODRF", "RAMPRF"): ("L", "VOLT", "FREQ", "CHANGE_P0"),
-    ("SOLE",): ("L", "KS", "B", "DX", "DY", "DZ"),
-    ("EMATRIX",): ("L", "TILT", "DX", "DY", "DZ", "DELTAP", *(f"C{i}" for i in range(1, 7)),
-                   *(f"R{i}{j}" for i in range(1, 7) for j in range(1, 7))),
-    ("ROTATE",): ("TILT", "EXCLUDE_OPTICS"),
-    ("WIGGLER",): ("L", "RADIUS", "K", "B", "POLES", *_MOVED),
-    (*_DRIFTS, *_SILENT, *_COLLECTIVE): ("L",),
+    )),
+    ("HKICK", "VKICK", "EHKICK", "EVKICK"): ("corrector", ("L", "KICK", "TILT", "CALIBRATION")),
+    ("KICKER", "EKICKER"): ("corrector", ("L", "TILT", *_STEERED)),
+    ("MONI", "HMON", "VMON"): ("monitor", ("L",)),
+    ("RFCA", "RFCW", "MODRF", "RAMPRF"): ("cavity", ("L", "VOLT", "FREQ", "CHANGE_P0")),
+    ("SOLE",): ("solenoid", ("L", "KS", "B", "DX", "DY", "DZ")),
+    ("EMATRIX",): ("matrix", (
+        "L", "TILT", "DX", "DY", "DZ", "DELTAP", *(f"C{i}" for i in range(1, 7)),
+        *(f"R{i}{j}" for i in range(1, 7) for j in range(1, 7)),
+    )),
+    ("ROTATE",): ("rotation", ("TILT", "EXCLUDE_OPTICS")),
+    ("WIGGLER",): ("wiggler", ("L", "RADIUS", "K", "B", "POLES", *_MOVED)),
+    (*_DRIFTS, *_SILENT, *_COLLECTIVE): ("drift", ("L",)),
 }  # fmt: skip
+"""What converts the elements of some classes, and the attributes that it has."""
+_FAMILY = {cls: family for classes, (family, _) in _OWN.items() for cls in classes}
 MODELLED: dict[str, frozenset[str]] = {
-    cls: frozenset(own) for classes, own in _OWN.items() for cls in classes
+    cls: frozenset(own) for classes, (_, own) in _OWN.items() for cls in classes
 } | {cls: frozenset({"L", "ON_PASS", *values}) for cls, values in _INERT.items()}
 """Attributes that the model has, by class."""
 ALL_CLASSES = (*MODELLED, *_REFUSED)
@@ -690,20 +696,6 @@ class _Reader:
         return Part(name if "wig" in name else f"{name}_wiggler", "matrix", values, element.where)
 
 
-_FAMILY = {
-    **dict.fromkeys(("QUAD", "KQUAD", "QUFRINGE", "DQCOR"), "quadrupole"),
-    **dict.fromkeys(("SEXT", "KSEXT", "KQUSE"), "sextupole"),
-    **dict.fromkeys(("OCTU", "KOCT"), "octupole"),
-    "MULT": "multipole",
-    **dict.fromkeys(_BENDS, "bend"),
-    **dict.fromkeys(("HKICK", "VKICK", "EHKICK", "EVKICK", "KICKER", "EKICKER"), "corrector"),
-    **dict.fromkeys(("MONI", "HMON", "VMON"), "monitor"),
-    **dict.fromkeys(("RFCA", "RFCW", "MODRF", "RAMPRF"), "cavity"),
-    "SOLE": "solenoid",
-    "EMATRIX": "matrix",
-    "ROTATE": "rotation",
-    "WIGGLER": "wiggler",
-}
 _FAMILY_WITHOUT: dict[str, tuple[str, ...]] = {
     "EDGE1_EFFECTS": ("QUAD", "KQUAD"), "EDGE2_EFFECTS": ("QUAD", "KQUAD"),
     "B2": ("HKICK", "VKICK", "KICKER"), "PITCH": ("QUAD", "KQUAD", "KSEXT", "KOCT"),

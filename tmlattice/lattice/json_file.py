@@ -31,7 +31,7 @@ CLASSES = (
 """OCELOT's element classes that a file may name, and the package's own of them."""
 
 
-def save_ring(ring: Ring, path: str | Path) -> None:
+def save_json(ring: Ring, path: str | Path) -> None:
     """Write a ring as the package's JSON (schema: `tmlattice/schemas/lattice.schema.json`).
 
     Args:
@@ -45,8 +45,6 @@ def save_ring(ring: Ring, path: str | Path) -> None:
     """
     from tmlattice import __version__
 
-    if Path(path).suffix.lower() != ".json":
-        raise LatticeError(f"'{path}' does not end in .json; name a .json file")
     families = [element.family for element in ring.elements]
     if number_names(families) != [element.name for element in ring.elements]:
         raise LatticeError(
@@ -113,7 +111,7 @@ def is_xsuite(path: Path) -> bool:
 
 
 def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
-    """The ring of a file that `save_ring` wrote.
+    """The ring of a file that `save_json` wrote.
 
     Args:
         path: of the file.
@@ -127,12 +125,12 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
     if content.get("format") != FORMAT:
         raise LatticeError(
             f"'{path}' has the format {content.get('format')!r}, which is no lattice; give a file "
-            f"of save_ring ('{FORMAT}') or an AT lattice (.json)"
+            f"of save_json ('{FORMAT}') or an AT lattice (.json)"
         )
     if content.get("version") != VERSION:
         raise LatticeError(
             f"'{path}' has version {content.get('version')!r} of '{FORMAT}', and this package "
-            f"reads version {VERSION}; save it again with save_ring"
+            f"reads version {VERSION}; save it again with save_json"
         )
     check_shape(path, content, "lattice", LatticeError)
     definitions = content["definitions"]

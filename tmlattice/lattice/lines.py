@@ -1,11 +1,13 @@
-"""Lines of lines, as MAD-X and elegant write them; and which line of a file is the ring."""
+"""Lines of lines, elements by their positions, and which line of a file is the ring."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tmlattice.errors import LatticeError, plain, unknown_name
+
+T = TypeVar("T")
 
 Items = list[tuple[int, bool, Any]]
 """Of a line: how often, reversed, and a name or the items of a bracket."""
@@ -116,6 +118,47 @@ def _names(
             own = [(name, way)]
         names += times * own
     return names
+
+
+def with_gaps(
+    placed: Iterable[tuple[T, str, float, float]],
+    whole: str,
+    end: float | None,
+    rounding: float,
+    least: float,
+) -> list[T | float]:
+    """Return elements in beam order, and between them the lengths of gaps, m.
+
+    Args:
+        placed: each element with its name, start and length, m, by rising position.
+        whole: name of the sequence.
+        end: of the whole, m; None: that of the last element.
+        rounding: overlap that positions may have, m.
+        least: a gap that is not larger is none, m.
+
+    Raises:
+        LatticeError: elements that overlap.
+    """
+    laid: list[T | float] = []
+    at, last = 0.0, "the start"
+
+    def gap(to: float, begins: str) -> None:
+        if to - at < -rounding:
+            raise LatticeError(
+                f"in {whole} {begins} at {to:.6f} m, before the end of {last} at {at:.6f} m; "
+                "correct the positions or lengths"
+            )
+        if abs(to - at) > least:
+            laid.append(round(to - at, 12))
+
+    for item, name, start, length in placed:
+        named = f"'{plain(name, 60)}'"
+        gap(start, f"{named} begins")
+        laid.append(item)
+        at, last = start + length, named
+    if end is not None:
+        gap(end, "its length ends")
+    return laid
 
 
 def chosen(

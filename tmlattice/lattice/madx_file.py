@@ -19,7 +19,7 @@ import numpy as np
 
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
 from tmlattice.input_files import content_of
-from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_out
+from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_out, with_gaps
 from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.madx_language import (
     CONSTANTS,
@@ -52,6 +52,8 @@ MOST_FILES = 1000
 MOST_BYTES = 200_000_000
 ROUNDING = 1e-6
 """m; elements may overlap by this much, as positions are rounded."""
+SHORTEST_GAP = 1e-9
+"""m"""
 
 NO_STATEMENT = frozenset({
     "title", "assign", "value", "show", "print", "printf", "help", "plot", "survey", "twiss",
@@ -961,8 +963,8 @@ class _Reader:
         inside += [name for items in self.lines.values() for name in inner_names(items)]
         return chosen(path, self.order, wanted, self.used, inside)
 
-    def parts(self, use: str) -> list[Part]:
-        """The elements of the ring in beam order, drifts included."""
+    def parts(self, use: str) -> list[Part | float]:
+        """The elements of the ring in beam order, and the gaps between them."""
         beam = self.beam(use)
         if use in self.sequences:
             sequence = self.sequences[use]
@@ -970,7 +972,7 @@ class _Reader:
         self._in_line = True
         names = [name for name, _ in laid_out(self.lines[use], self.lines)]
         self.work(len(names))
-        parts: list[Part] = []
+        parts: list[Part | float] = []
         circumference = sum(self._length(name) for name in names)
         for name in names:
             if name in self.sequences:
@@ -979,29 +981,16 @@ class _Reader:
                 parts.append(self._part(name, self._length(name), beam, circumference))
         return parts
 
-    def _laid_out(self, sequence: _Sequence, beam: Beam, circumference: float) -> list[Part]:
-        parts: list[Part] = []
-        at, last = 0.0, "the start"
-        drifts: dict[float, Part] = {}
-
-        def drift(to: float, name: str) -> None:
-            way = to - at
-            if way < -ROUNDING:
-                raise LatticeError(
-                    f"in the sequence '{sequence.name}' {name} at {to:.6f} m, before the "
-                    f"end of {last} at {at:.6f} m; correct the positions or lengths"
-                )
-            if abs(way) > 1e-9:
-                way = round(way, 12)
-                parts.append(drifts.setdefault(way, Part("drift", "drift", {"l": way})))
-
-        for slot in self._flat(sequence):
-            start = slot.centre - slot.length / 2
-            drift(start, f"'{plain(slot.name, 60)}' begins")
-            parts.append(self._part(slot.name, slot.length, beam, circumference))
-            at, last = start + slot.length, f"'{plain(slot.name, 60)}'"
-        drift(self._length(sequence.name), "L ends")
-        return parts
+    def _laid_out(
+        self, sequence: _Sequence, beam: Beam, circumference: float
+    ) -> list[Part | float]:
+        placed = [
+            (self._part(slot.name, slot.length, beam, circumference), slot.name,
+             slot.centre - slot.length / 2, slot.length)
+            for slot in self._flat(sequence)
+        ]  # fmt: skip
+        end = self._length(sequence.name)
+        return with_gaps(placed, f"the sequence '{sequence.name}'", end, ROUNDING, SHORTEST_GAP)
 
     def _part(self, name: str, length: float, beam: Beam, circumference: float) -> Part:
         if name not in self.elements:
@@ -1048,7 +1037,8 @@ class _Reader:
 
 _NOT_IN_TWISS: dict[str, tuple[str, ...]] = {
     "sbend": ("k0s", "k1s", "knl", "ksl"),
-    **dict.fromkeys(("quadrupole", "sextupole", "octupole", "solenoid"), ("knl", "ksl")),
+    "quadrupole": ("k0", "knl", "ksl"),
+    **dict.fromkeys(("sextupole", "octupole", "solenoid"), ("knl", "ksl")),
 }
 """What MAD-X's TWISS leaves out of thick magnets: it is for PTC and MAKETHIN."""
 _REFERENCE = {"entry": 0.5, "exit": -0.5}

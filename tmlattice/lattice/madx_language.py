@@ -5,6 +5,7 @@ operations, powers, and the functions listed here. The work that a file asks for
 """
 
 import math
+import operator
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -77,8 +78,26 @@ def compiled(text: str) -> Evaluate:
     return _Parser(text).whole()
 
 
+def _quotient(a: float, b: float) -> float:
+    return a / b if b else 0.0  # as MAD-X has it
+
+
+OPERATIONS: dict[str, tuple[int, Callable[[float, float], float]]] = {
+    "+": (1, operator.add), "-": (1, operator.sub), "*": (2, operator.mul), "/": (2, _quotient),
+    "^": (3, math.pow),
+}  # fmt: skip
+"""How tightly they bind, and what they do; each from the left, as in MAD-X."""
+SIGNED = 2
+"""A sign binds more tightly than this, and less than a power."""
+
+
+def _binary(sign: str, left: Evaluate, right: Evaluate) -> Evaluate:
+    operation = OPERATIONS[sign][1]
+    return lambda names: operation(left(names), right(names))
+
+
 class _Parser:
-    """Operator precedence: sum, product, sign, power, atom; each from the left, as in MAD-X."""
+    """Operator precedence."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -108,42 +127,33 @@ class _Parser:
         return ""
 
     def whole(self) -> Evaluate:
-        value = self._sum()
+        value = self._expression()
         if self._at < len(self._tokens):
             raise self._error()
         return value
 
-    def _sum(self) -> Evaluate:
-        self._depth += 1
-        if self._depth > DEEPEST:
-            raise LatticeError(f"'{self._text[:40]}' has more than {DEEPEST} nested brackets")
-        left = self._product()
-        while sign := self._take("+", "-"):
-            left = _binary(sign, left, self._product())
-        self._depth -= 1
-        return left
-
-    def _product(self) -> Evaluate:
-        left = self._signed()
-        while sign := self._take("*", "/"):
-            left = _binary(sign, left, self._signed())
-        return left
-
-    def _signed(self) -> Evaluate:
+    def _expression(self, level: int = 0) -> Evaluate:
+        """What is bound together more tightly than a level."""
         minus = False
         while sign := self._take("+", "-"):
             minus ^= sign == "-"
-        value = self._power()
-        return (lambda names: -value(names)) if minus else value
+        left = self._chain(self._atom(), max(level, SIGNED))
+        return self._chain((lambda names: -left(names)) if minus else left, level)
 
-    def _power(self) -> Evaluate:
-        base = self._atom()
-        while self._take("^"):
-            minus = False
-            while sign := self._take("+", "-"):
-                minus ^= sign == "-"
-            base = _power(base, self._atom(), -1 if minus else 1)
-        return base
+    def _chain(self, left: Evaluate, level: int) -> Evaluate:
+        """What operations make of it that bind more tightly than a level, from the left."""
+        while OPERATIONS.get(self._next(), (0,))[0] > level:
+            sign = self._take(*OPERATIONS)
+            left = _binary(sign, left, self._expression(OPERATIONS[sign][0]))
+        return left
+
+    def _bracket(self) -> Evaluate:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise LatticeError(f"'{self._text[:40]}' has more than {DEEPEST} nested brackets")
+        inner = self._expression()
+        self._depth -= 1
+        return inner
 
     def _atom(self) -> Evaluate:
         if self._at >= len(self._tokens):
@@ -158,7 +168,7 @@ class _Parser:
         if kind == "sign":
             if word != "(":
                 raise self._error()
-            inner = self._sum()
+            inner = self._bracket()
             if not self._take(")"):
                 raise self._error()
             return inner
@@ -173,7 +183,7 @@ class _Parser:
     def _call(self, word: str) -> Evaluate:
         arguments = []
         while not self._take(")"):
-            arguments.append(self._sum())
+            arguments.append(self._bracket())
             if not self._take(","):
                 if not self._take(")"):
                     raise self._error()
@@ -191,27 +201,6 @@ class _Parser:
             return float(function(*(argument(names) for argument in arguments)))
 
         return value
-
-
-def _power(base: Evaluate, exponent: Evaluate, sign: int) -> Evaluate:
-    return lambda names: math.pow(base(names), sign * exponent(names))
-
-
-def _binary(sign: str, left: Evaluate, right: Evaluate) -> Evaluate:
-    match sign:
-        case "+":
-            return lambda names: left(names) + right(names)
-        case "-":
-            return lambda names: left(names) - right(names)
-        case "*":
-            return lambda names: left(names) * right(names)
-        case _:
-
-            def divide(names: Names) -> float:
-                divisor = right(names)
-                return left(names) / divisor if divisor else 0.0  # as MAD-X has it
-
-            return divide
 
 
 def holds(condition: str, names: Names) -> bool:

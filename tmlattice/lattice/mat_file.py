@@ -58,8 +58,8 @@ def read_apart(
     if verdict == "refused":
         raise error(f"'{path}': {plain(content, 300)}")
     if verdict == "failed":
-        said = plain(content, 200)
-        raise error(f"'{path}' cannot be read as {what} ({said}); save it again")
+        reason = plain(content, 200)
+        raise error(f"'{path}' cannot be read as {what} ({reason}); save it again")
     return content
 
 

@@ -149,7 +149,7 @@ def _flatten(sequence: Any) -> Iterator[Any]:
             yield from _flatten(item)
 
 
-def _mend(source: Any) -> Any:
+def _modelled(source: Any) -> Any:
     """The element; a copy of a matrix element that was born without a longitudinal block, or of a
     displaced one without its offset; a thin bend in the place of a multipole that bends the design
     orbit."""
@@ -194,8 +194,8 @@ def _name_places(places: list[Any], variables: Mapping[str, Any]) -> tuple[Eleme
         else str(source.id)
         for source in places
     ]
-    mended = {id(source): _mend(source) for source in {id(p): p for p in places}.values()}
-    elements = place_elements(families, [mended[id(source)] for source in places])
+    modelled = {id(source): _modelled(source) for source in {id(p): p for p in places}.values()}
+    elements = place_elements(families, [modelled[id(source)] for source in places])
     return tuple(
         e.with_errors(dx=float(source.dx), dy=float(source.dy)) if _displaced(source) else e
         for e, source in zip(elements, places, strict=True)

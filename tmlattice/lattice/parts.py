@@ -134,7 +134,7 @@ class Report:
 
 
 def ring_of_parts(
-    parts: Sequence[Part],
+    parts: Sequence[Part | float],
     name: str,
     energy: float,
     mass: float = ELECTRON_GEV,
@@ -144,7 +144,7 @@ def ring_of_parts(
     """The ring of these elements in beam order; one `Part` may stand in many places.
 
     Args:
-        parts: drifts included.
+        parts: elements, and lengths of the gaps between them, m.
         name: of the ring.
         energy: of a particle, rest energy included, GeV.
         mass: rest energy, GeV.
@@ -162,16 +162,18 @@ def ring_of_parts(
     mass = ELECTRON_GEV if mass < 2 * ELECTRON_GEV else mass
     design = Ring(name, (), energy, mass=mass)
     report = report or Report()
-    known: dict[int, list[Place]] = {}
+    known: dict[int | float, list[Place]] = {}
     errors: dict[int, dict[str, Any]] = {}
     places: list[Place] = []
     for part in parts:
-        if id(part) not in known:
-            own = known[id(part)] = _places(part, design, abs(charge), report)
-            if amounts := _errors(part):
+        key = part if isinstance(part, float) else id(part)
+        if key not in known:
+            one = Part("drift", "drift", {"l": part}) if isinstance(part, float) else part
+            own = known[key] = _places(one, design, abs(charge), report)
+            if amounts := _errors(one):
                 errors |= {id(source): amounts for _, _, source in own}
-            own += _exit_of_displaced(part)
-        places += known[id(part)]
+            own += _exit_of_displaced(one)
+        places += known[key]
     report.warn(name)
     return assembled(design, places, errors)
 
@@ -308,8 +310,8 @@ def _integrated(part: Part, attribute: str) -> Array:
     return np.concatenate([given, np.zeros(max(0, 4 - len(given)))])
 
 
-def strengths(part: Part) -> NDArray[np.complex128]:
-    """(k_n + i k_ns) / n! of each order, four at least; integrated where the element is thin."""
+def fields(part: Part) -> NDArray[np.complex128]:
+    """k_n + i k_ns of each order, four at least; integrated where the element is thin."""
     length = part.number("l")
     normal, skew = _integrated(part, "knl"), _integrated(part, "ksl")
     total = np.zeros(max(len(normal), len(skew)), dtype=complex)
@@ -318,6 +320,12 @@ def strengths(part: Part) -> NDArray[np.complex128]:
     if length:
         total /= length
         total[:4] += [complex(part.number(f"k{n}"), part.number(f"k{n}s")) for n in range(4)]
+    return total
+
+
+def strengths(part: Part) -> NDArray[np.complex128]:
+    """`fields` over n!, as AT has them."""
+    total = fields(part)
     total /= np.array([math.factorial(n) for n in range(len(total))], dtype=float)
     return total
 
@@ -352,14 +360,13 @@ def _places(part: Part, ring: Ring, charge: float, report: Report) -> list[Place
             return [(name, "multipole", _thin(part, report))]
         case "quadrupole" | "sextupole" | "octupole" | "multipole":
             own = {"quadrupole": 1, "sextupole": 2, "octupole": 3}.get(keyword)
-            fields = strengths(part)
             if not length:  # K L of a thin magnet is nothing; KNL acts
                 return [(name, "multipole", _thin(part, report))]
 
             def left_out(reason: str) -> None:
                 report.left_out(reason, name)
 
-            kind, source = straight_magnet(fields, own, length, tilt, name, left_out)
+            kind, source = straight_magnet(strengths(part), own, length, tilt, name, left_out)
             return [(name, kind, source)]
     if length:
         return [(name, "drift", ocelot.Drift(l=length, eid=name))]
@@ -397,14 +404,14 @@ def _thin(part: Part, report: Report) -> Any:
     """
     from tmlattice.lattice.combined import CombinedMultipole
 
-    fields = strengths(part)
-    if np.any(fields[3:]):
+    own = fields(part)
+    if np.any(own[3:]):
         report.left_out("fields above the sextupole", part.name)
-    k = [complex(f) * math.factorial(n) for n, f in enumerate(fields[:3])]
+    k = own[:3].tolist()
     given, turn = part.values.get("angle"), 0.0
     if given is None and k[0].imag:  # it bends in a plane of its own
         turn = -cmath.phase(k[0])
-        k = [field * cmath.exp(1j * (n + 1) * turn) for n, field in enumerate(k)]
+        k = [one * cmath.exp(1j * (n + 1) * turn) for n, one in enumerate(k)]
         k[0] = complex(k[0].real)
     angle = k[0].real if given is None else float(given)
     if angle and (k[1] or k[2]):
@@ -420,8 +427,8 @@ def _thin(part: Part, report: Report) -> Any:
 def _bend(part: Part, report: Report) -> Any:
     from tmlattice.lattice.ocelot import elements as ocelot
 
-    fields = strengths(part)
-    if np.any(fields[3:]) or fields[2].imag:
+    own = fields(part)
+    if np.any(own[3:]) or own[2].imag:
         report.left_out("fields above the gradient, but for the normal sextupole,", part.name)
     values: dict[str, float] = {
         k: part.number(k) for k in ("e1", "e2", "h1", "h2", "fint", "fintx")
@@ -435,8 +442,8 @@ def _bend(part: Part, report: Report) -> Any:
     return ocelot.SBend(
         l=part.number("l"),
         angle=part.number("angle"),
-        k1=fields[1].real,
-        k2=2 * fields[2].real,
+        k1=own[1].real,
+        k2=own[2].real,
         e1=values["e1"],
         e2=values["e2"],
         tilt=part.number("tilt"),
@@ -502,5 +509,10 @@ def _matrix(part: Part, ring: Ring) -> Place:
     source.r = r
     if "b" in part.values:
         source.b = np.asarray(part.values["b"], dtype=float).reshape(6, 1)
+        if source.b[5, 0]:
+            raise LatticeError(
+                f"the matrix '{plain(part.name, 60)}' changes the energy in every turn, which is "
+                "not modelled; set that to 0"
+            )
     kind: Kind = "solenoid" if part.keyword == "solenoid" else "matrix"
     return part.name, "wiggler" if "wig" in part.name.casefold() else kind, source

@@ -3,6 +3,9 @@
 What a magnet's errors do is written into what every format has: a roll is a tilt, a kick of a
 corrector its angle, thin gradients in a quadrupole its k1 and tilt, in a matrix element its matrix.
 A format that has more (misalignments, field errors) names what it holds; the rest is stated.
+
+A writer takes elements as the readers make them, in MAD-X's words (`part_of`), and has its own
+names for these.
 """
 
 import cmath
@@ -16,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import first_of
+from tmlattice.lattice.parts import Part
 from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring
 
 Array = NDArray[np.float64]
@@ -46,13 +50,15 @@ def plain(ring: Ring, holds: Holds = lambda element: ()) -> tuple[Ring, tuple[st
         holds: which of an element's errors the writer writes itself.
     """
     changed: dict[int, Element] = {}
-    told: dict[str, list[str]] = {}
+    affected: dict[str, list[str]] = {}
     for place, element in enumerate(ring.elements):
         if element.errors != NO_ERRORS:
             changed[place], lacks = _plain(element, holds(element))
             for what in lacks:
-                told.setdefault(what, []).append(element.name)
-    return ring.with_elements(changed), tuple(w.replace("{}", _some(n)) for w, n in told.items())
+                affected.setdefault(what, []).append(element.name)
+    return ring.with_elements(changed), tuple(
+        w.replace("{}", _some(n)) for w, n in affected.items()
+    )
 
 
 def error_fields(element: Element) -> tuple[complex, complex]:
@@ -62,6 +68,66 @@ def error_fields(element: Element) -> tuple[complex, complex]:
     dipole, gradient = complex(-e.kick_x, e.kick_y), complex(e.k1l, e.k1sl)
     turn = cmath.exp(1j * element.tilt)
     return dipole * turn, gradient * turn**2
+
+
+def part_of(element: Element) -> Part | None:
+    """An element without its errors in MAD-X's words; None of one that is a matrix everywhere."""
+    source, length = element.source, element.length
+    keyword, values = "drift" if length else "marker", dict[str, Any]()
+
+    def own(names: str) -> dict[str, Any]:
+        return {name: float(getattr(source, name)) for name in names.split()}
+
+    if element.kind == "monitor":
+        return Part(element.family, "monitor", {"l": length})
+    match type(source).__name__:
+        case "Quadrupole":
+            keyword, values = element.kind, own("k1 k2 tilt")
+        case "Sextupole":
+            keyword, values = "sextupole", own("k2 tilt")
+        case "Octupole":
+            keyword, values = "octupole", own("k3 tilt")
+        case "CombinedMultipole" if length:
+            keyword, values = element.kind, own("k0 k0s k1 k1s k2 k2s tilt")
+        case "CombinedMultipole":
+            keyword, values = "multipole", own("angle lrad tilt")
+            normal, skew = own("k0 k1 k2"), own("k0s k1s k2s")
+            values |= {"knl": [*normal.values()], "ksl": [*skew.values()]}
+        case "Multipole" if not length:
+            keyword, values = "multipole", {"knl": np.array(source.kn, float), **own("tilt")}
+        case "SBend" | "RBend" | "Bend":
+            keyword, values = "sbend", own("angle k1 k2 e1 e2 fint fintx tilt")
+            values |= {"hgap": source.gap / 2, "h1": source.h_pole1, "h2": source.h_pole2}
+        case "Hcor" | "Vcor":
+            keyword = "hkicker" if element.kind == "hcorrector" else "vkicker"
+            kick = element.angle * cmath.exp(1j * element.tilt)
+            x, y = (k if abs(k) > 1e-12 * abs(kick) else 0.0 for k in (kick.real, kick.imag))
+            if y if keyword == "hkicker" else x:
+                keyword = "kicker"
+            values = {"hkick": x, "vkick": y}
+        case "Cavity":
+            keyword = "rfcavity"
+            values = {"volt": 1e3 * float(source.v), "freq": 1e-6 * float(source.freq)}
+        case "Solenoid":
+            keyword, values = "solenoid", {"ks": 2 * float(source.k)}
+        case "Drift" | "Marker" | "Monitor":
+            pass
+        case _:
+            return None
+    return Part(element.family, keyword, {"l": length, **values})
+
+
+def first_order(element: Element, energy: float) -> Array:
+    """The matrix of an element in OCELOT's coordinates, [6, 6]."""
+    total = np.eye(6)
+    for part in element.source.R(energy):
+        total = np.asarray(part) @ total
+    return total
+
+
+def second_order(source: Any) -> bool:
+    """Whether a matrix element does more than its matrix."""
+    return bool(np.any(source.t) or np.any(source.b) or source.delta_e)
 
 
 def definitions(
@@ -119,7 +185,7 @@ def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]
     left: dict[str, Any] = {
         name: value for name, value in vars(errors).items() if value != getattr(NO_ERRORS, name)
     }
-    told = []
+    lacks = []
     bare = replace(element, errors=NO_ERRORS, source=element.data or element.source)
     if element.kind in ("hcorrector", "vcorrector"):
         bare = _corrector(bare, errors)
@@ -130,7 +196,7 @@ def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]
             left.pop(name, None)
     if element.kind == "quadrupole" and element.length and (errors.k1l or errors.k1sl):
         bare = _quadrupole(bare, errors)
-        told.append("thin gradients in the middle of {} are written as fields of their bodies")
+        lacks.append("thin gradients in the middle of {} are written as fields of their bodies")
         for name in ("k1l", "k1sl"):
             left.pop(name, None)
     if element.kind in _TURNS and "roll" in left and "roll" not in held:
@@ -146,8 +212,8 @@ def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]
         for name in ("k1l", "k1sl", "entrance_k1l", "entrance", "middle"):
             left.pop(name, None)
     kept = {name: left.pop(name) for name in [*left] if name in held}
-    told += [f"{name} of {{}} cannot be written; the package's own JSON holds it" for name in left]
-    return replace(bare, errors=replace(NO_ERRORS, **kept)), told
+    lacks += [f"{name} of {{}} cannot be written; the package's own JSON holds it" for name in left]
+    return replace(bare, errors=replace(NO_ERRORS, **kept)), lacks
 
 
 def _quadrupole(element: Element, errors: Errors) -> Element:

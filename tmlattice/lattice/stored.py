@@ -135,7 +135,7 @@ def save(key: str, ring: Ring) -> None:
 
 def _text(element: Element, back: dict[str, Any]) -> str:
     """An element's source as data, from which the same comes back: `back` has what did."""
-    if element.errors != NO_ERRORS or element.length < -1e-6:  # the latter is told of
+    if element.errors != NO_ERRORS or element.length < -1e-6:  # the latter is warned of
         raise LatticeError("not kept")
     content = described(element)
     text = json.dumps([content["class"], content["parameters"]], sort_keys=True)

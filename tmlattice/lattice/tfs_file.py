@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tmlattice.errors import LatticeError, plain
+from tmlattice.lattice.lines import with_gaps
 from tmlattice.lattice.parts import MODELLED, Part, Report, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 from tmlattice.lattice.stated import Stated, contradiction, curvatures
@@ -54,8 +55,8 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     try:
         table = tfs.read(str(path))
     except Exception as error:  # its own errors, and pandas'
-        said = " ".join(str(error).split())
-        raise LatticeError(f"'{path}' cannot be read as a table of MAD-X ({said})") from error
+        reason = " ".join(str(error).split())
+        raise LatticeError(f"'{path}' cannot be read as a table of MAD-X ({reason})") from error
     table.columns = [str(column).upper() for column in table.columns]
     missing = [column for column in NEEDED if column not in table.columns]
     if missing:
@@ -164,8 +165,8 @@ def _number(header: dict[str, Any], key: str) -> float | None:
 
 def _with_drifts(
     path: Path, rows: list[Row], length: float | None, half: bool, report: Report
-) -> list[Part]:
-    """The elements in their order, with drifts where the table has none."""
+) -> list[Part | float]:
+    """The elements in their order, and the gaps between them."""
     close = CLOSE + DIGITS * (length or float(rows[-1]["S"]) if rows else 0.0)
     starts = {share: [r["S"] - share * r["L"] for r in rows] for share in (1.0, 0.5)}
     fits = []
@@ -187,16 +188,11 @@ def _with_drifts(
                 f"'{path}' has nothing from {end:.6g} m to {start:.6g} m, before "
                 f"'{plain(name, 60)}', and lists its drifts: a row is missing; write it again"
             )
-    parts: list[Part] = []
-    at = 0.0
-    for row, start in zip(rows, starts[fits[0]], strict=True):
-        if start - at > close:
-            parts.append(Part("drift", "drift", {"l": start - at}))
-        parts.append(_part(path, row, half, report))
-        at = start + row["L"]
-    if length is not None and length - at > close:
-        parts.append(Part("drift", "drift", {"l": length - at}))
-    return parts
+    placed = [
+        (_part(path, row, half, report), name, start, float(row["L"]))
+        for row, (name, start) in zip(rows, begins, strict=True)
+    ]
+    return with_gaps(placed, f"'{path}'", length, close, close)
 
 
 def _part(path: Path, row: Row, half: bool, report: Report) -> Part:

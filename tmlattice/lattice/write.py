@@ -1,11 +1,11 @@
 """Rings in the formats of other packages: files by their suffix, and objects.
 
->>> lacks = write_ring(ring, "estimated.at.json")       # what the file does not hold
+>>> lacks = save_ring(ring, "estimated.at.json")       # what the file does not hold
 >>> lattice = ring.to_at()                              # warns of what AT does not hold
 """
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
@@ -13,11 +13,17 @@ from typing import Any
 
 from tmlattice.errors import LatticeError, MissingPackageError
 from tmlattice.files import output_file
-from tmlattice.lattice.json_file import save_ring
-from tmlattice.lattice.plain import Holds, plain
+from tmlattice.lattice.json_file import save_json
+from tmlattice.lattice.plain import plain
 from tmlattice.lattice.ring import Ring
 
-Writer = Callable[[Ring, Path], tuple[str, ...]]
+FORMATS = {
+    ".at.json": "write_at", ".xsuite.json": "write_xsuite", ".madx": "write_madx",
+    ".seq": "write_madx", ".py": "write_ocelot",
+}  # fmt: skip
+"""Modules by suffix. Each states the errors that its format `holds` of an element. Its `made` is
+the package's object of a ring of plain elements, its `write` a file; both state what they leave
+out."""
 
 SUFFIXES = (
     ".json (the package's own), .at.json (AT), .xsuite.json (Xsuite), .madx or .seq (MAD-X), .py "
@@ -25,7 +31,7 @@ SUFFIXES = (
 )
 
 
-def write_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
+def save_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
     """Write a ring in the format that the suffix names, whole or not at all.
 
     `.json` is the package's own file, and holds everything. `.at.json` is AT's (`at.load_lattice`),
@@ -46,39 +52,25 @@ def write_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
     path = Path(path)
     name = path.name.lower()
     if name.endswith(".json") and not name.endswith((".at.json", ".xsuite.json")):
-        save_ring(ring, path)
+        save_json(ring, path)
         return ()
-    holds, write = _writer(path)
-    bare, lacks = plain(ring, holds)
+    module = _module(name)
+    if module is None:
+        raise LatticeError(f"'{path}' names no format; end it in {SUFFIXES}")
+    bare, lacks = plain(ring, module.holds)
     with output_file(path) as temporary:
-        return (*lacks, *write(bare, temporary))
+        return (*lacks, *module.write(bare, temporary))
 
 
 def knows(path: str | Path) -> bool:
     """Whether the suffix names a format."""
-    return Path(path).name.lower().endswith((".json", ".madx", ".seq", ".py"))
+    return Path(path).name.lower().endswith((".json", *FORMATS))
 
 
-def _writer(path: Path) -> tuple[Holds, Writer]:
-    """The errors that a format holds, and its writer."""
-    name = path.name.lower()
-    if name.endswith(".at.json"):
-        from tmlattice.lattice import write_at
-
-        return write_at.holds, write_at.write_at
-    if name.endswith(".xsuite.json"):
-        from tmlattice.lattice import write_xsuite
-
-        return write_xsuite.holds, write_xsuite.write_xsuite
-    if name.endswith((".madx", ".seq")):
-        from tmlattice.lattice import write_madx
-
-        return write_madx.holds, write_madx.write_madx
-    if name.endswith(".py"):
-        from tmlattice.lattice import write_ocelot
-
-        return write_ocelot.holds, write_ocelot.write_ocelot
-    raise LatticeError(f"'{path}' names no format; end it in {SUFFIXES}")
+def _module(name: str) -> Any:
+    """What writes a format; None: no suffix of one."""
+    found = next((own for suffix, own in FORMATS.items() if name.endswith(suffix)), None)
+    return found and import_module(f"tmlattice.lattice.{found}")
 
 
 def to_at(ring: Ring) -> Any:
@@ -88,9 +80,7 @@ def to_at(ring: Ring) -> Any:
     Warns:
         Once, of all that AT does not hold.
     """
-    from tmlattice.lattice.write_at import at_lattice, holds
-
-    return _object(ring, "AT", holds, at_lattice)
+    return _object(ring, "AT", ".at.json")
 
 
 def to_ocelot(ring: Ring) -> Any:
@@ -100,9 +90,7 @@ def to_ocelot(ring: Ring) -> Any:
     Warns:
         Once, of all that OCELOT does not hold.
     """
-    from tmlattice.lattice.write_ocelot import holds, magnetic_lattice
-
-    return _object(ring, "OCELOT", holds, magnetic_lattice)
+    return _object(ring, "OCELOT", ".py")
 
 
 def to_xtrack(ring: Ring) -> Any:
@@ -120,11 +108,9 @@ def to_xtrack(ring: Ring) -> Any:
     except ImportError as error:
         raise MissingPackageError(
             "to_xtrack needs the package 'xtrack', which is not installed: `pip install xsuite` "
-            "brings it; write_ring(ring, 'ring.xsuite.json') does without"
+            "brings it; save_ring(ring, 'ring.xsuite.json') does without"
         ) from error
-    from tmlattice.lattice.write_xsuite import holds, line_of
-
-    content = _object(ring, "Xsuite", holds, line_of)
+    content = _object(ring, "Xsuite", ".xsuite.json")
     return xtrack.Line.from_dict(content, with_progress=False)
 
 
@@ -138,9 +124,7 @@ def to_madx(ring: Ring, calibration: Iterable[Any] = ()) -> str:
     Warns:
         Once, of all that MAD-X does not hold.
     """
-    from tmlattice.lattice.write_madx import holds, madx_text
-
-    return str(_object(ring, "MAD-X", holds, lambda bare: madx_text(bare, calibration)))
+    return str(_object(ring, "MAD-X", ".madx", calibration))
 
 
 def to_dataframe(ring: Ring) -> Any:
@@ -161,11 +145,11 @@ def to_dataframe(ring: Ring) -> Any:
     return pandas.DataFrame(rows, index=pandas.Index([e.name for e in ring.elements], name="name"))
 
 
-def _object(
-    ring: Ring, package: str, holds: Holds, make: Callable[[Ring], tuple[Any, tuple[str, ...]]]
-) -> Any:
-    bare, lacks = plain(ring, holds)
-    made, more = make(bare)
-    if lacks or more:
-        warnings.warn(f"'{ring.name}' in {package}: {'; '.join((*lacks, *more))}", stacklevel=3)
+def _object(ring: Ring, package: str, suffix: str, *more: Any) -> Any:
+    module = _module(suffix)
+    bare, lacks = plain(ring, module.holds)
+    made, more_lacks = module.made(bare, *more)
+    if lacks or more_lacks:
+        text = "; ".join((*lacks, *more_lacks))
+        warnings.warn(f"'{ring.name}' in {package}: {text}", stacklevel=3)
     return made

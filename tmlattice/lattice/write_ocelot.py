@@ -37,7 +37,7 @@ def displaced(ring: Ring) -> Ring:
     return ring.with_elements(moved)
 
 
-def magnetic_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
+def made(ring: Ring) -> tuple[Any, tuple[str, ...]]:
     """OCELOT's `MagneticLattice` with elements of its own, and what it lacks.
 
     Args:
@@ -55,27 +55,27 @@ def magnetic_lattice(ring: Ring) -> tuple[Any, tuple[str, ...]]:
             source = elements.Drift(l=element.length) if element.length else elements.Marker()
         source.id = element.family
         sequence.append(source)
-    told = (f"{off} cavities are off, as drifts or markers",) if off else ()
+    lacks = (f"{off} cavities are off, as drifts or markers",) if off else ()
     lattice = lattices.MagneticLattice(tuple(sequence), method={"global": SecondTM})
-    return lattice, (*_lacks(ring), *told)
+    return lattice, (*_lacks(ring), *lacks)
 
 
 def _lacks(ring: Ring) -> tuple[str, ...]:
-    told = []
+    lacks = []
     if not ring.radiates:
-        told.append(
+        lacks.append(
             f"the energy of its maps is that of an electron as fast: {ring.map_energy:.9g} GeV"
         )
     if any(type(e.source).__name__ == "CombinedMultipole" for e in ring.elements):
-        told.append("magnets of several fields are tmlattice's own, which is imported for them")
+        lacks.append("magnets of several fields are tmlattice's own, which is imported for them")
     # by the name that the element has there: a source that comes from the cache has none
     other = sum(e.kind != source_kind(e.source, e.family) for e in ring.elements)
     if other:
-        told.append(f"OCELOT's classes do not state the kind of {other} elements")
-    return tuple(told)
+        lacks.append(f"OCELOT's classes do not state the kind of {other} elements")
+    return tuple(lacks)
 
 
-def write_ocelot(ring: Ring, path: Path) -> tuple[str, ...]:
+def write(ring: Ring, path: Path) -> tuple[str, ...]:
     """Write plain elements as code; what it lacks.
 
     Args:

@@ -6,17 +6,26 @@ Monitors and correctors are those of the line's steering: `line.steering_monitor
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmlattice.files import write_json
-from tmlattice.lattice.plain import BENDS, FIELDS, STRAIGHT, definitions, error_fields
+from tmlattice.lattice.parts import Part, fields
+from tmlattice.lattice.plain import (
+    BENDS,
+    FIELDS,
+    STRAIGHT,
+    definitions,
+    error_fields,
+    first_order,
+    part_of,
+)
 from tmlattice.lattice.ring import Element, Ring
 from tmlattice.lattice.stated import slip
-from tmlattice.lattice.write_at import first_order, kicks, second_order
 
 STEERING = {
     "monitor": ("steering_monitors_x", "steering_monitors_y"),
@@ -32,14 +41,14 @@ def holds(element: Element) -> tuple[str, ...]:
     return ("dx", "dy", "ds", *FIELDS) if cls in STRAIGHT | BENDS else ()
 
 
-def write_xsuite(ring: Ring, path: Path) -> tuple[str, ...]:
-    """Write plain elements as the JSON of a line; what it lacks. See `line_of`."""
-    content, told = line_of(ring)
+def write(ring: Ring, path: Path) -> tuple[str, ...]:
+    """Write plain elements as the JSON of a line; what it lacks. See `made`."""
+    content, lacks = made(ring)
     write_json(path, content)
-    return told
+    return lacks
 
 
-def line_of(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
+def made(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
     """The dictionary of an `xtrack.Line` of plain elements, and what it lacks.
 
     Args:
@@ -47,7 +56,7 @@ def line_of(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
     """
     left_out: Counter[str] = Counter()
     texts = [json.dumps(_element(element, ring, left_out)) for element in ring.elements]
-    made, line, names = definitions(ring.elements, texts)
+    defined, line, names = definitions(ring.elements, texts)
     steering: dict[str, list[str]] = {}
     for element, name in zip(ring.elements, line, strict=True):
         for key in STEERING.get(element.kind, ()):
@@ -55,7 +64,7 @@ def line_of(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
                 steering[key].append(name)
     content = {
         "__class__": "Line",
-        "elements": {name: json.loads(text) for name, text in made.items()},
+        "elements": {name: json.loads(text) for name, text in defined.items()},
         "element_names": line,
         "particle_ref": {
             "mass0": 1e9 * ring.mass,
@@ -64,67 +73,56 @@ def line_of(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
         },
         "_extra_config": steering,
     }
-    told = (f"{what} ({count} elements)" for what, count in left_out.items())
-    return content, (*told, *names)
+    lacks = (f"{what} ({count} elements)" for what, count in left_out.items())
+    return content, (*lacks, *names)
+
+
+ORDER = {"quadrupole": 1, "sextupole": 2, "octupole": 3}
 
 
 def _element(element: Element, ring: Ring, left_out: Counter[str]) -> dict[str, Any]:
-    source, length = element.source, element.length
-    if element.kind == "monitor":
-        return _passive(length)
-    own = type(source).__name__
-    match own:
-        case "Quadrupole" | "Sextupole":
-            order = 1 if own == "Quadrupole" else 2
-            knl = [0.0, 0.0, 0.0 if order == 2 else element.k2 * length]
-            main: Any = {f"k{order}": element.k1 if order == 1 else element.k2}
-            return _magnet(own, element, knl, length=length, **main)
-        case "Octupole":
-            return _magnet("Octupole", element, [], length=length, k3=float(source.k3))
-        case "SBend" | "RBend" | "Bend":
-            return _bend(element, left_out)
-        case "Hcor" | "Vcor":
-            x, y = kicks(element)
+    part, length = part_of(element), element.length
+    if part is None:
+        return _matrix(element, ring, left_out)
+    number = part.number
+    match part.keyword:
+        case "monitor" | "drift" | "marker":
+            return {"__class__": "Drift", "length": length} if length else {"__class__": "Marker"}
+        case "hkicker" | "vkicker" | "kicker":
             thick = {"length": length, "isthick": True} if length else {}
-            return {"__class__": "Multipole", "knl": [-x], "ksl": [y], **thick}
-        case "CombinedMultipole":
-            return _combined(element)
-        case "Multipole" if not length:
-            return _magnet("Multipole", element, [float(k) for k in source.kn])
-        case "Cavity":
+            kicks = {"knl": [-number("hkick")], "ksl": [number("vkick")]}
+            return {"__class__": "Multipole", **kicks, **thick}
+        case "rfcavity":
             return _cavity(element, ring)
-        case "Solenoid":
-            return {"__class__": "UniformSolenoid", "length": length, "ks": 2 * float(source.k)}
-        case "Drift" | "Marker" | "Monitor":
-            return _passive(length)
-        case "Matrix":
-            if second_order(source) and (np.any(source.t) or source.delta_e):
-                left_out["what matrix elements do beyond their first order is left out"] += 1
-        case _:
-            left_out["elements that Xsuite has not are written as first-order matrices"] += 1
-    turn = np.diag([1.0, 1.0, 1.0, 1.0, -ring.beta, 1 / ring.beta])  # zeta = -beta tau
-    matrix = turn @ first_order(element, ring.map_energy) @ np.linalg.inv(turn)
-    content = {"__class__": "FirstOrderTaylorMap", "length": length, "m1": matrix.tolist()}
-    if own == "Matrix" and np.any(source.b):
-        content["m0"] = (turn @ np.ravel(source.b)).tolist()
-    return content
-
-
-def _passive(length: float) -> dict[str, Any]:
-    return {"__class__": "Drift", "length": length} if length else {"__class__": "Marker"}
+        case "solenoid":
+            return {"__class__": "UniformSolenoid", "length": length, "ks": number("ks")}
+        case "sbend":
+            if number("h1") or number("h2"):
+                left_out["curvatures of pole faces are left out"] += 1
+            values = {"length": length, "angle": element.angle, "k1": number("k1"),
+                      "k2": number("k2"), **_edges(part)}  # fmt: skip
+            return _magnet("Bend", element, np.zeros(2), values)
+    own = fields(part)
+    if not length:
+        own[0] += number("angle")
+        values = {"hxl": number("angle"), "length": number("lrad")}
+        return _magnet("Multipole", element, own, {k: v for k, v in values.items() if v})
+    main = ORDER.get(part.keyword, 1)
+    values = {"length": length, f"k{main}": own[main].real, f"k{main}s": own[main].imag}
+    own[main] = 0.0
+    cls = part.keyword if part.keyword in ORDER else "quadrupole"
+    return _magnet(cls.capitalize(), element, length * own, values)
 
 
 def _magnet(
-    cls: str, element: Element, normal: Sequence[float], skew: Sequence[float] = (), **values: Any
+    cls: str, element: Element, integrated: NDArray[Any], values: Mapping[str, float]
 ) -> dict[str, Any]:
     """An element of a class with its alignment and its integrated fields, those of its errors
     included."""
-    fields = np.zeros(max(len(normal), 2), dtype=complex)
-    fields[: len(normal)] += normal
-    fields[: len(skew)] += 1j * np.asarray(skew, dtype=float)
-    fields[:2] += error_fields(element)
+    total = integrated.astype(complex)
+    total[:2] += error_fields(element)
     content: dict[str, Any] = {"__class__": cls, **values}
-    for key, own in (("knl", fields.real), ("ksl", fields.imag)):
+    for key, own in (("knl", total.real), ("ksl", total.imag)):
         if own.any() or (cls == "Multipole" and key == "knl"):
             content[key] = own.tolist()
     errors = element.errors
@@ -133,36 +131,30 @@ def _magnet(
     return {**content, **{key: value for key, value in moved.items() if value}}
 
 
-def _combined(element: Element) -> dict[str, Any]:
-    """A thin one with its bend, or a thick one of the class of its kind."""
-    source, length = element.source, element.length
-    normal, skew = ([float(getattr(source, f"k{n}{what}")) for n in range(3)] for what in ("", "s"))
-    if not length:
-        normal[0] += element.bending
-        return _magnet("Multipole", element, normal, skew, hxl=element.bending,
-                       length=float(source.lrad))  # fmt: skip
-    order = 2 if element.kind == "sextupole" else 1
-    main: Any = {f"k{order}": normal[order], f"k{order}s": skew[order]}
-    normal, skew = ([0.0 if n == order else length * k for n, k in enumerate(own)]
-                    for own in (normal, skew))  # fmt: skip
-    cls = "Sextupole" if order == 2 else "Quadrupole"
-    return _magnet(cls, element, normal, skew, length=length, **main)
-
-
-def _bend(element: Element, left_out: Counter[str]) -> dict[str, Any]:
-    source = element.source
-    if source.h_pole1 or source.h_pole2:
-        left_out["curvatures of pole faces are left out"] += 1
+def _edges(part: Part) -> dict[str, Any]:
+    """Faces of a bend; and how its gradient is tracked, as by default it is in a few kicks."""
+    names = {"entry": ("e1", "hgap", "fint"), "exit": ("e2", "hgap", "fintx")}
     edges: dict[str, Any] = {
-        f"edge_{side}_{key}": float(value)
-        for side, e, fint in (("entry", source.e1, source.fint), ("exit", source.e2, source.fintx))
-        for key, value in (("angle", e), ("hgap", source.gap / 2), ("fint", fint))
-        if value
-    }
-    if element.k1:  # else its gradient is in a few kicks
-        edges["model"] = "mat-kick-mat"
-    return _magnet("Bend", element, [], length=element.length, angle=element.angle,
-                   k1=element.k1, k2=element.k2, **edges)  # fmt: skip
+        f"edge_{side}_{key}": part.number(name)
+        for side, own in names.items()
+        for key, name in zip(("angle", "hgap", "fint"), own, strict=True) if part.number(name)
+    }  # fmt: skip
+    return {**edges, **({"model": "mat-kick-mat"} if part.number("k1") else {})}
+
+
+def _matrix(element: Element, ring: Ring, left_out: Counter[str]) -> dict[str, Any]:
+    source = element.source
+    own = type(source).__name__ == "Matrix"
+    if own and (np.any(source.t) or source.delta_e):
+        left_out["what matrix elements do beyond their first order is left out"] += 1
+    elif not own:
+        left_out["elements that Xsuite has not are written as first-order matrices"] += 1
+    turn = np.diag([1.0, 1.0, 1.0, 1.0, -ring.beta, 1 / ring.beta])  # zeta = -beta tau
+    matrix = turn @ first_order(element, ring.map_energy) @ np.linalg.inv(turn)
+    content = {"__class__": "FirstOrderTaylorMap", "length": element.length, "m1": matrix.tolist()}
+    if own and np.any(source.b):
+        content["m0"] = (turn @ np.ravel(source.b)).tolist()
+    return content
 
 
 def _cavity(element: Element, ring: Ring) -> dict[str, Any]:

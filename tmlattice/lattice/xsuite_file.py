@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tmlattice.errors import LatticeError, plain
 from tmlattice.input_files import json_of
 from tmlattice.lattice.expressions import Arithmetic
-from tmlattice.lattice.lines import chosen
+from tmlattice.lattice.lines import chosen, with_gaps
 from tmlattice.lattice.parts import Part, Report, edge_focusing, fringe_of, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
 
@@ -137,13 +137,13 @@ def ring_of_content(
         content: the dictionary.
         name, sequence, energy: see `read_xsuite`.
     """
-    beside: Mapping[str, Any] = {}
+    outer: Mapping[str, Any] = {}
     if isinstance(content.get("line"), dict):
-        content, beside = content["line"], content
+        content, outer = content["line"], content
     line = content
     if isinstance(content.get("lines"), dict):
         line = content["lines"][chosen(path, list(content["lines"]), sequence)]
-    mass, charge, stated = _particle(line, content, beside)
+    mass, charge, stated = _particle(line, content, outer)
     if energy is None and stated is None:
         raise LatticeError(f"'{path}' has no reference particle; give energy= (GeV)")
     energy = float(stated or 0.0) if energy is None else energy
@@ -279,18 +279,16 @@ class _Reader:
         self._made: dict[str, list[Part]] = {}
         self._length = 0.0
 
-    def parts(self) -> list[Part]:
-        """The line's elements in beam order, drifts included."""
+    def parts(self) -> list[Part | float]:
+        """The line's elements in beam order, and the gaps between them."""
         placed = self._names(self.line, 0)
         self._length = sum(
             item if isinstance(item, float) else self._element_length(item) for item in placed
         )
-        drifts: dict[float, Part] = {}
-        parts: list[Part] = []
+        parts: list[Part | float] = []
         for item in placed:
             if isinstance(item, float):
-                way = round(item, 12)
-                parts.append(drifts.setdefault(way, Part("drift", "drift", {"l": way})))
+                parts.append(item)
                 continue
             if item not in self._made:
                 own = self._converted(self._fields(item), item.lower())
@@ -394,24 +392,8 @@ class _Reader:
             raise LatticeError(f"the position of '{plain(str(item), 60)}' refers to no element")
         placed = [float(start or 0.0) for start in starts]
         order = sorted(range(len(items)), key=lambda k: round(placed[k] + ways[k] / 2, 9))
-        laid: list[str | float] = []
-        at = 0.0
-        for k in order:
-            gap = placed[k] - at
-            if gap < -tolerance:
-                raise LatticeError(
-                    f"'{plain(str(items[k][0]), 60)}' begins at {placed[k]:.9g} m, before the end "
-                    f"of the element before it at {at:.9g} m"
-                )
-            if gap > tolerance:
-                laid.append(gap)
-            laid.append(items[k][0])
-            at = placed[k] + ways[k]
-        if total is not None and total < at - tolerance:
-            raise LatticeError(f"the elements end at {at:.9g} m, after the line's {total:.9g} m")
-        if total is not None and total > at + tolerance:
-            laid.append(total - at)
-        return laid
+        own = ((items[k][0], str(items[k][0]), placed[k], ways[k]) for k in order)
+        return with_gaps(own, "the line", total, tolerance, tolerance)
 
     def _start(
         self, k: int, ways: Sequence[float], starts: Sequence[float | None],

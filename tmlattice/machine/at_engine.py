@@ -17,7 +17,7 @@ velocity's contribution is added before the cavities and at the end, where it co
 import copy
 import functools
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import at
@@ -260,6 +260,25 @@ class AtEngine:
     def one_pass(self, line: list[Any], beam: Array) -> Array:
         """Return readings of the first state of [6, shot]; all are moved to the line's end."""
         return np.asarray(self.run(line, beam.T, 1, beam)[0, 0])
+
+    def centroids(
+        self, line: list[Any], beam: Array, turns: int, first: int = 0
+    ) -> Iterator[tuple[Array, Array]]:
+        """Yield of each turn the mean of the particles, [monitor, 2], and their part that is not
+        lost, [monitor].
+
+        Args:
+            line: of `stored_line`.
+            beam: the particles, [6, particle]; they are moved.
+            turns: number of turns.
+            first: number of the first one.
+        """
+        block = max(TURNS_AT_ONCE // (beam.shape[1] * len(self._monitors)), 1)
+        for turn in range(0, turns, block):
+            seen = self.run(line, beam.T, min(block, turns - turn), beam, first + turn)
+            alive = np.isfinite(seen[..., 0]).mean(axis=0)
+            mean = np.nansum(seen, axis=0) / np.maximum(alive * len(seen), 1)[..., None]
+            yield from zip(mean, alive, strict=True)
 
     def lattice(self) -> Any:
         """Return the line as an AT lattice, without RF, for AT's tools (`at.get_optics`).

@@ -1,4 +1,4 @@
-"""A stored beam in AT: turns after a kick, of one particle or of many, and tunes."""
+"""A stored beam: turns after a kick, of one particle or of many, and tunes."""
 
 import functools
 from dataclasses import dataclass
@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine, Settings
+from tmlattice.machine.network_engine import NetworkEngine
 
 Array = NDArray[np.float64]
 
 TRANSVERSE, ALL = (0, 1, 2, 3), (0, 1, 2, 3, 4, 5)
 ENERGY = 1e-3
 """Half the step in energy of a chromaticity."""
-AT_ONCE = 2**21
-"""States in memory: 100 MB, whatever the number of particles and turns."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Beam:
 
 
 def turns_of(
-    engine: AtEngine,
+    engine: AtEngine | NetworkEngine,
     kicked: Array,
     turns: int,
     settings: Settings,
@@ -62,7 +61,7 @@ def turns_of(
     """
     line, with_rf, late = engine.stored_line(settings)
     state = _orbit(engine, line, late)
-    rf = any(isinstance(element, at.RFCavity) for element in with_rf)
+    rf = with_rf != line
     if rf:
         state = at_orbit.closed(functools.partial(engine.one_pass, with_rf), state, ALL, late)
     states = np.tile(state, (beam.particles, 1))
@@ -70,15 +69,8 @@ def turns_of(
         states += _matched(engine, with_rf, state, rf, beam, random)
     states[:, :4] += kicked
     moving = np.asfortranarray(states.T)
-    readings = np.empty((turns, len(engine.ring.monitors), 2))
-    block = max(AT_ONCE // (beam.particles * len(engine.ring.monitors)), 1)
-    for first in range(0, turns, block):
-        number = min(block, turns - first)
-        seen = engine.run(with_rf, moving.T, number, moving, first)
-        alive = np.isfinite(seen[..., 0]).mean(axis=0)
-        mean = np.nansum(seen, axis=0) / np.maximum(alive * beam.particles, 1)[..., None]
-        readings[first : first + number] = np.where(alive[..., None] > 0.5, mean, np.nan)
-    return readings
+    seen = engine.centroids(with_rf, moving, turns)
+    return np.array([np.where(alive[:, None] > 0.5, mean, np.nan) for mean, alive in seen])
 
 
 def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
@@ -98,7 +90,7 @@ def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
     return tune, (slopes[0] - slopes[1]) / (2 * ENERGY)
 
 
-def _orbit(engine: AtEngine, line: list[Any], late: float) -> Array:
+def _orbit(engine: AtEngine | NetworkEngine, line: Any, late: float) -> Array:
     """State of the stored beam at the start of the line, without RF, [6]."""
     turn = functools.partial(engine.one_pass, line)
     start, solve = at_orbit.stored(turn)
@@ -122,8 +114,8 @@ def _modes(matrix: Array) -> tuple[Array, Any]:
 
 
 def _matched(
-    engine: AtEngine,
-    line: list[Any],
+    engine: AtEngine | NetworkEngine,
+    line: Any,
     state: Array,
     rf: bool,
     beam: Beam,

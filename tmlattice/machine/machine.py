@@ -87,7 +87,7 @@ class StoredSimulation(Errors):
 def errors(
     ring: Ring,
     causes: Sequence[Cause],
-    background: Mapping[str, float | None] | None,
+    background: str | Mapping[str, float | None] | None,
     seed: int,
     machine_seed: int | None,
     **more: Any,
@@ -133,14 +133,14 @@ class Engine(Protocol):
         """Return (x, y) at every monitor, [shot, turn, monitor, 2], from launches [shot, 6]."""
 
 
-def check_engine(name: str) -> None:
-    """Check the name of an engine.
+def check_engine(name: str, known: Sequence[str] = ENGINES) -> None:
+    """Check the name of an engine, of those that a kind of measurement has.
 
     Raises:
         TmlatticeError: it is unknown.
     """
-    if name not in ENGINES:
-        raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(ENGINES)}")
+    if name not in known:
+        raise TmlatticeError(f"no engine '{name}' here; there are {' and '.join(known)}")
 
 
 def _engine(name: str, ring: Ring, causes: Sequence[Cause], radiation: bool) -> Engine:

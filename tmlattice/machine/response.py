@@ -40,7 +40,7 @@ def simulate_response(
     kick: float = 1e-4,
     rf_step: float | None = None,
     one_sided: bool = False,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     noise: float | Sequence[float] = NOISE,
     engine: str = "at",
     seed: int = 0,

@@ -82,7 +82,7 @@ def simulate(
     ring: Ring,
     causes: Sequence[Cause] = (),
     *,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     shots: int = 6,
     turns: int = 1,
     amplitude: float = 1e-3,

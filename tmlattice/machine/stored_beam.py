@@ -16,11 +16,18 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, Settings, monitors_with
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.at_stored import Beam, tunes_of, turns_of
-from tmlattice.machine.machine import StoredSimulation, errors, rms_of, stated_noise
+from tmlattice.machine.machine import (
+    StoredSimulation,
+    check_engine,
+    errors,
+    rms_of,
+    stated_noise,
+)
+from tmlattice.machine.network_engine import NetworkEngine
 from tmlattice.machine.response import NOISE, energies, rf_step_of, spread_of
 from tmlattice.machine.shots import draw_shots, each_setting, stream
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
@@ -41,7 +48,7 @@ class _Machine:
         self,
         ring: Ring,
         causes: Sequence[Cause],
-        background: Mapping[str, float | None] | None,
+        background: str | Mapping[str, float | None] | None,
         seed: int,
         machine_seed: int | None,
         radiation: bool = False,
@@ -75,9 +82,10 @@ def simulate_turns(
     emittance: Sequence[float] = (1e-9, 1e-11),
     spread: float = 1e-3,
     radiation: bool = False,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     noise: Noise = TURN_NOISE,
     settings: Sequence[Settings] = (),
+    engine: str = "at",
     seed: int = 0,
     machine_seed: int | None = None,
 ) -> StoredSimulation:
@@ -98,13 +106,15 @@ def simulate_turns(
         background: distributed errors: effect -> rms (None: the catalogue's), or "all".
         noise: rms of one reading, m, one number or (x, y).
         settings: of each shot; () for the design's.
+        engine: "at"; or "network": the ring's second-order network, for 100,000 particles and more,
+            on a graphics card where there is one; without radiation and settings.
         seed: of kicks, particles and noise.
         machine_seed: of the background; else `seed`.
 
     Raises:
         EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
         LatticeError: a ring without monitors.
-        TmlatticeError: an energy spread of a single particle.
+        TmlatticeError: an energy spread of a single particle; or what the network does not have.
         UnstableRingError: no closed orbit, or no stable motion.
         MeasurementError: too few or too many turns.
     """
@@ -121,11 +131,13 @@ def simulate_turns(
     beam = Beam(particles, (emittance[0], emittance[1]), float(np.hypot(spread, own)))
     each = each_setting(settings, shots)
     monitors, further = machine.monitors, turns + machine.monitors.ahead
+    check_engine(engine, ("at", "network"))
+    if radiation and engine == "network":
+        raise EffectError("the network has no radiation; take the engine 'at'")
+    tracker = machine.engine if engine == "at" else NetworkEngine(ring, machine.every)
     readings = np.stack(
         [
-            turns_of(
-                machine.engine, kicked[i], further, each[i], beam, stream(seed, "particles", i)
-            )
+            turns_of(tracker, kicked[i], further, each[i], beam, stream(seed, "particles", i))
             for i in range(shots)
         ]
     )
@@ -141,7 +153,9 @@ def simulate_turns(
         readings=readings, noise=known, settings=each if settings else (), **machine.fields
     )
     many = {"emittance": list(beam.emittance), "spread": beam.spread} if particles > 1 else {}
-    return machine.simulation(measured, particles=particles, radiation=radiation, **many)
+    return machine.simulation(
+        measured, engine=engine, particles=particles, radiation=radiation, **many
+    )
 
 
 def simulate_orbits(
@@ -150,7 +164,7 @@ def simulate_orbits(
     *,
     shots: int = 1,
     radiation: bool = False,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     noise: Noise = NOISE,
     settings: Sequence[Settings] = (),
     seed: int = 0,
@@ -184,7 +198,7 @@ def simulate_dispersion(
     *,
     steps: Sequence[float] | None = None,
     one_sided: bool = False,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     noise: Noise = NOISE,
     seed: int = 0,
     machine_seed: int | None = None,
@@ -225,7 +239,7 @@ def simulate_tunes(
     *,
     shots: int = 1,
     chromaticity: bool = True,
-    background: Mapping[str, float | None] | None = None,
+    background: str | Mapping[str, float | None] | None = None,
     noise: Sequence[float] = TUNE_NOISE,
     settings: Sequence[Settings] = (),
     seed: int = 0,

@@ -2,11 +2,12 @@
 
 >>> assume(measurement, ["x-reversed", "launches-in-mm"])
 
-Each assumption is a wrong sign, unit, order or name that the data may have everywhere, and what
-undoes it. The data checks try them all; a user goes on with those that he has confirmed.
+Each assumption is a wrong sign, unit, order or name that the data may have everywhere, and its
+correction for the kinds of measurement where it has a meaning. The data checks try them all; a user
+goes on with those that he has confirmed.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,13 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
+from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import OrbitResponse
+from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.trajectory import Measurement
+from tmlattice.measurement.tune_reading import TuneReading
 
 Array = NDArray[np.float64]
 Order = NDArray[np.intp]
-Data = TypeVar("Data", Measurement, OrbitResponse)
+Data = TypeVar("Data")
+WORDS: Mapping[type, str] = {
+    Measurement: "first turns",
+    OrbitResponse: "an orbit response",
+    TurnByTurn: "a turn-by-turn measurement",
+    ClosedOrbit: "a closed orbit",
+    Dispersion: "a dispersion measurement",
+    TuneReading: "a tune measurement",
+}
+"""What each kind of measurement is, for a sentence."""
 
 
 @dataclass(frozen=True)
@@ -32,21 +45,21 @@ class Assumption:
     Attributes:
         words: what is wrong, a clause.
         correction: what to do about it in the data, an order.
-        trajectory, response: what undoes it in first turns, in an orbit response; None where it
-            has no meaning there.
+        kinds: of measurements where it has a meaning.
+        change: corrects it in one of these.
     """
 
     words: str
     correction: str
-    trajectory: Callable[[Measurement], Measurement] | None = None
-    response: Callable[[OrbitResponse], OrbitResponse] | None = None
+    kinds: tuple[type, ...]
+    change: Callable[[Any], Any]
 
 
 def assume(data: Data, names: Iterable[str], ring_monitors: Sequence[str]) -> Data:
     """The data with what is assumed undone, one after another.
 
     Args:
-        data: first turns or an orbit response.
+        data: a measurement of any kind.
         names: of `ASSUMPTIONS`.
         ring_monitors: names of the ring's monitors, in beam order.
 
@@ -61,11 +74,11 @@ def assume(data: Data, names: Iterable[str], ring_monitors: Sequence[str]) -> Da
         known = ASSUMPTIONS.get(name)
         if known is None:
             raise unknown_name("assumption", name, ASSUMPTIONS)
-        own = known.trajectory if isinstance(data, Measurement) else known.response
-        if own is None:
-            kind = "first turns" if isinstance(data, Measurement) else "an orbit response"
-            raise MeasurementError(f"the assumption '{name}' has no meaning for {kind}")
-        data = own(data)  # type: ignore[arg-type]
+        if not isinstance(data, known.kinds):
+            raise MeasurementError(
+                f"the assumption '{name}' has no meaning for {WORDS[type(data)]}"
+            )
+        data = known.change(data)
     return data
 
 
@@ -75,13 +88,14 @@ def in_beam_order(data: Data, ring_monitors: Sequence[str]) -> Data:
     Raises:
         UnknownNameError: a monitor that the ring does not have.
     """
-    if data.monitors == tuple(ring_monitors):
+    own: Any = data
+    if isinstance(data, TuneReading) or own.monitors == tuple(ring_monitors):
         return data
     names = Names("monitor", ring_monitors)
-    at = [names[name] for name in data.monitors]
+    at = [names[name] for name in own.monitors]
     if at == sorted(at):
         return data
-    return data.select(monitors=[data.monitors[i] for i in np.argsort(at)])
+    return own.select(monitors=[own.monitors[i] for i in np.argsort(at)])  # type: ignore[no-any-return]
 
 
 # --- readings -------------------------------------------------------------------------------------
@@ -107,37 +121,48 @@ def _of_unit(size: Array, of: Array, factor: Array | float) -> Array:
     return size * factor if same else size
 
 
-def _read(data: Data, change: Callable[[Array], Array]) -> Data:
+def read_of(data: Any) -> Array:
+    """What the monitors read, m, [..., monitor, 2]: readings, orbits, or orbit changes."""
+    if isinstance(data, OrbitResponse):
+        return data.response
+    return data.orbits if isinstance(data, Dispersion) else np.asarray(getattr(data, data.READ))
+
+
+def _read(data: Any, change: Callable[[Array], Array]) -> Any:
     """With a change of everything that was read, [..., monitor, 2]."""
-    if isinstance(data, Measurement):
-        return _with(data, readings=change(data.readings))
+    if isinstance(data, Dispersion):
+        steps = (replace(own, orbit=change(np.asarray(own.orbit))) for own in data.steps)
+        return _with(data, steps=tuple(steps))
+    if not isinstance(data, OrbitResponse):
+        return _with(data, **{data.READ: change(read_of(data))})
     rf = data.rf
     if rf is not None and rf.orbit is not None:
         rf = replace(rf, orbit=change(rf.orbit))
     return _with(data, response=change(data.response), rf=rf)
 
 
-def _values(data: Measurement | OrbitResponse) -> Array:
-    return data.readings if isinstance(data, Measurement) else data.response
-
-
-def _sign(data: Data, x: float, y: float) -> Data:
+def _sign(data: Any, x: float, y: float) -> Any:
     return _read(data, lambda values: values * np.array([x, y]))
 
 
-def _unit(data: Data, factor: float) -> Data:
+def _unit(data: Any, factor: float) -> Any:
     scaled = _read(data, lambda values: values * factor)
     if data.noise is None:
         return scaled
-    return _with(scaled, noise=_of_unit(data.noise, _values(data), factor))
+    return _with(scaled, noise=_of_unit(data.noise, read_of(data), factor))
 
 
-def _exchanged(data: Data) -> Data:
+def _exchanged(data: Any) -> Any:
+    if isinstance(data, TuneReading):
+        return _with(data, **{
+            name: None if values is None else values[:, ::-1]
+            for name, values in vars(data).items() if name.startswith(("tune", "chromaticity"))
+        })  # fmt: skip
     noise = None if data.noise is None else data.noise[:, ::-1]
     return _with(_read(data, lambda values: values[..., ::-1]), noise=noise)
 
 
-def _reordered(data: Data, order: Callable[[Sequence[str]], Order]) -> Data:
+def _reordered(data: Any, order: Callable[[Sequence[str]], Order]) -> Any:
     """The readings of the monitor i are those that stand at order[i]."""
     at = order(data.monitors)
     noise = None if data.noise is None else data.noise[at]
@@ -189,7 +214,7 @@ def _no_launches(data: Measurement) -> Measurement:
     return _with(data, launch_sigma=sigma)
 
 
-def _kicks_set(data: Measurement, factor: float) -> Measurement:
+def _kicks_set(data: Any, factor: float) -> Any:
     """All kicks that were set in the shots."""
     changed = tuple(
         {
@@ -232,35 +257,46 @@ def _columns_shifted(data: OrbitResponse, by: int) -> OrbitResponse:
     return _with(data, response=data.response[order])
 
 
-def _rf(data: OrbitResponse, factor: float) -> OrbitResponse:
+def _rf(data: Any, factor: float) -> Any:
+    if isinstance(data, Dispersion):
+        return _with(data, steps=tuple(replace(s, step=s.step * factor) for s in data.steps))
     if data.rf is None:
         raise MeasurementError("there is no RF step of which anything could be assumed")
     return _with(data, rf=replace(data.rf, step=data.rf.step * factor))
 
 
+# --- turns and tunes of a stored beam ------------------------------------------------------------
+def _last_first(data: TurnByTurn) -> TurnByTurn:
+    return _with(data, readings=data.readings[:, ::-1])
+
+
+def _folded(data: TuneReading, x: bool, y: bool) -> TuneReading:
+    return _with(data, tune=np.where([x, y], (1 - data.tune) % 1, data.tune))
+
+
 # --- the list -------------------------------------------------------------------------------------
-def _both(words: str, correction: str, change: Callable[..., Any], *values: Any) -> Assumption:
-    """Of readings, whatever they are."""
-    return Assumption(words, correction, *[lambda data: change(data, *values)] * 2)
+_FIRST, _RESPONSE = (Measurement,), (OrbitResponse,)
+_CHANGES = (OrbitResponse, ClosedOrbit, Dispersion)
+"""Compared with the design's as orbits: sign and size are known."""
+_ORBITS = (*_FIRST, *_CHANGES)
+_READ = (*_ORBITS, TurnByTurn)
 
 
-def _first(
-    words: str, correction: str, change: Callable[..., Measurement], *values: float
+def _of(
+    kinds: tuple[type, ...], words: str, correction: str, change: Callable[..., Any], *values: Any
 ) -> Assumption:
-    return Assumption(words, correction, lambda data: change(data, *values))
+    return Assumption(words, correction, kinds, lambda data: change(data, *values))
 
 
-def _columns(
-    words: str, correction: str, change: Callable[..., OrbitResponse], *values: float
-) -> Assumption:
-    return Assumption(words, correction, None, lambda data: change(data, *values))
+_first, _columns = partial(_of, _FIRST), partial(_of, _RESPONSE)
 
 
 def _shifts() -> dict[str, Assumption]:
     found = {}
     for by in (1, -1, 2, -2, 3, -3):
         count = f"{abs(by)} place{'s' * (abs(by) > 1)} {'down' if by > 0 else 'up'}stream"
-        found[f"monitors-shifted={by}"] = _both(
+        found[f"monitors-shifted={by}"] = _of(
+            _READ,
             f"the names of the monitors are shifted: what was read stands {count} of its monitor",
             "give each reading its own monitor's name",
             _reordered, partial(_shift, by=by),
@@ -272,86 +308,164 @@ SIGN = "change the sign of {}"
 UNIT = "give {} in {}"
 
 ASSUMPTIONS: dict[str, Assumption] = {
-    "x-reversed": _both("x has the wrong sign at every monitor", SIGN.format("x"), _sign, -1, 1),
-    "y-reversed": _both("y has the wrong sign at every monitor", SIGN.format("y"), _sign, 1, -1),
-    "readings-reversed": _both(
-        "x and y have the wrong sign at every monitor", SIGN.format("x and y"), _sign, -1, -1
+    "x-reversed": _of(
+        _ORBITS, "x has the wrong sign at every monitor", SIGN.format("x"), _sign, -1, 1
     ),
-    "planes-exchanged": _both(
-        "x and y are exchanged at every monitor", "exchange the columns x and y", _exchanged
+    "y-reversed": _of(
+        _ORBITS, "y has the wrong sign at every monitor", SIGN.format("y"), _sign, 1, -1
     ),
-    "readings-in-mm": _both("the readings are in mm", UNIT.format("them", "m"), _unit, 1e-3),
-    "readings-in-um": _both("the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
-    "readings-in-km": _both(
-        "the readings are a thousand times too small", UNIT.format("them", "m"), _unit, 1e3
+    "readings-reversed": _of(
+        _ORBITS,
+        "x and y have the wrong sign at every monitor",
+        SIGN.format("x and y"),
+        _sign,
+        -1,
+        -1,
     ),
-    "readings-doubled": _both(
-        "the readings are twice what they should be", "halve them", _unit, 0.5
+    "planes-exchanged": _of(
+        (*_READ, TuneReading), "x and y are exchanged everywhere", "exchange x and y", _exchanged
     ),
-    "readings-halved": _both(
-        "the readings are half of what they should be", "double them", _unit, 2.0
+    "readings-in-mm": _of(_ORBITS, "the readings are in mm", UNIT.format("them", "m"), _unit, 1e-3),
+    "readings-in-um": _of(_ORBITS, "the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
+    "readings-in-km": _of(
+        _ORBITS, "the readings are a thousand times too small", UNIT.format("them", "m"), _unit, 1e3
+    ),
+    "readings-in-Mm": _of(
+        _CHANGES, "the readings are a million times too small", UNIT.format("them", "m"), _unit, 1e6
+    ),
+    "readings-doubled": _of(
+        (*_FIRST, *_RESPONSE),
+        "the readings are twice what they should be",
+        "halve them",
+        _unit,
+        0.5,
+    ),
+    "readings-halved": _of(
+        (*_FIRST, *_RESPONSE),
+        "the readings are half of what they should be",
+        "double them",
+        _unit,
+        2.0,
     ),
     **_shifts(),
-    "monitors-backwards": _both(
-        "the monitors stand in the reverse order", "give each reading its own monitor's name",
-        _reordered, _reverse,
+    "monitors-backwards": _of(
+        _READ,
+        "the monitors stand in the reverse order",
+        "give each reading its own monitor's name",
+        _reordered,
+        _reverse,
     ),
-    "monitors-alphabetical": _both(
-        "the readings stand in the order of the sorted names", "give each reading its own "
-        "monitor's name", _reordered, _alphabet,
+    "monitors-alphabetical": _of(
+        _READ,
+        "the readings stand in the order of the sorted names",
+        "give each reading its own monitor's name",
+        _reordered,
+        _alphabet,
     ),
     "beam-backwards": _first(
         "the beam runs against the lattice, from its end to its start",
-        "reverse the lattice, or start it where the beam is launched", _backwards,
+        "reverse the lattice, or start it where the beam is launched",
+        _backwards,
     ),
     "turns-from-1": _first(
         "turns are counted from 1", "count them from 0: turn 0 is the first", _earlier
     ),
     "launches-reversed": _first(
-        "the launches have the wrong sign", SIGN.format("x, px, y and py of every launch"),
-        _launches, -1, -1, -1, -1,
+        "the launches have the wrong sign",
+        SIGN.format("x, px, y and py of every launch"),
+        _launches,
+        -1,
+        -1,
+        -1,
+        -1,
     ),
     "launches-x-reversed": _first(
-        "the launches have the wrong sign in x and px", SIGN.format("x and px of every launch"),
-        _launches, -1, -1, 1, 1,
+        "the launches have the wrong sign in x and px",
+        SIGN.format("x and px of every launch"),
+        _launches,
+        -1,
+        -1,
+        1,
+        1,
     ),
     "launches-y-reversed": _first(
-        "the launches have the wrong sign in y and py", SIGN.format("y and py of every launch"),
-        _launches, 1, 1, -1, -1,
+        "the launches have the wrong sign in y and py",
+        SIGN.format("y and py of every launch"),
+        _launches,
+        1,
+        1,
+        -1,
+        -1,
     ),
     "slopes-reversed": _first(
-        "px and py of the launches have the wrong sign", SIGN.format("px and py of every launch"),
-        _launches, 1, -1, 1, -1,
+        "px and py of the launches have the wrong sign",
+        SIGN.format("px and py of every launch"),
+        _launches,
+        1,
+        -1,
+        1,
+        -1,
     ),
     "slopes-x-reversed": _first(
-        "px of the launches has the wrong sign", SIGN.format("px of every launch"),
-        _launches, 1, -1, 1, 1,
+        "px of the launches has the wrong sign",
+        SIGN.format("px of every launch"),
+        _launches,
+        1,
+        -1,
+        1,
+        1,
     ),
     "slopes-y-reversed": _first(
-        "py of the launches has the wrong sign", SIGN.format("py of every launch"),
-        _launches, 1, 1, 1, -1,
+        "py of the launches has the wrong sign",
+        SIGN.format("py of every launch"),
+        _launches,
+        1,
+        1,
+        1,
+        -1,
     ),
     "launches-exchanged": _first(
         "x, px and y, py of the launches are exchanged", "exchange them", _launches_exchanged
     ),
     "launches-in-mm": _first(
-        "the launches are in mm and mrad", UNIT.format("them", "m and rad"),
-        _launches, 1e-3, 1e-3, 1e-3, 1e-3,
+        "the launches are in mm and mrad",
+        UNIT.format("them", "m and rad"),
+        _launches,
+        1e-3,
+        1e-3,
+        1e-3,
+        1e-3,
     ),
     "launches-in-um": _first(
-        "the launches are in µm and µrad", UNIT.format("them", "m and rad"),
-        _launches, 1e-6, 1e-6, 1e-6, 1e-6,
+        "the launches are in µm and µrad",
+        UNIT.format("them", "m and rad"),
+        _launches,
+        1e-6,
+        1e-6,
+        1e-6,
+        1e-6,
     ),
     "positions-in-mm": _first(
         "x and y of the launches are in mm", UNIT.format("them", "m"), _launches, 1e-3, 1, 1e-3, 1
     ),
     "slopes-in-mrad": _first(
-        "px and py of the launches are in mrad", UNIT.format("them", "rad"),
-        _launches, 1, 1e-3, 1, 1e-3,
+        "px and py of the launches are in mrad",
+        UNIT.format("them", "rad"),
+        _launches,
+        1,
+        1e-3,
+        1,
+        1e-3,
     ),
     "energies-reversed": _first(
-        "delta of the launches has the wrong sign", SIGN.format("delta of every launch"),
-        _launches, 1, 1, 1, 1, -1,
+        "delta of the launches has the wrong sign",
+        SIGN.format("delta of every launch"),
+        _launches,
+        1,
+        1,
+        1,
+        1,
+        -1,
     ),
     "energies-in-percent": _first(
         "delta of the launches is in per cent", "divide it by 100", _launches, 1, 1, 1, 1, 0.01
@@ -359,13 +473,19 @@ ASSUMPTIONS: dict[str, Assumption] = {
     "launches-unknown": _first(
         "the launches are not what is stated", "correct them, or their launch_sigma", _no_launches
     ),
-    "settings-reversed": _first(
-        "the kicks in the shots' settings have the wrong sign", SIGN.format("all of them"),
-        _kicks_set, -1,
+    "settings-reversed": _of(
+        (Measurement, ClosedOrbit),
+        "the kicks in the shots' settings have the wrong sign",
+        SIGN.format("all of them"),
+        _kicks_set,
+        -1,
     ),
-    "settings-in-mrad": _first(
-        "the kicks in the shots' settings are in mrad", UNIT.format("them", "rad"),
-        _kicks_set, 1e-3,
+    "settings-in-mrad": _of(
+        (Measurement, ClosedOrbit),
+        "the kicks in the shots' settings are in mrad",
+        UNIT.format("them", "rad"),
+        _kicks_set,
+        1e-3,
     ),
     "settings-not-there": _first(
         "the kicks in the shots' settings were not there", "take them out", _kicks_set, 0
@@ -382,35 +502,77 @@ ASSUMPTIONS: dict[str, Assumption] = {
     "kicks-y-reversed": _columns(
         "the vertical kicks have the wrong sign", SIGN.format("them"), _kicks, 1, -1
     ),
-    "kicks-in-mrad": _columns("the kicks are in mrad", UNIT.format("them", "rad"),
-                              _kicks, 1e-3, 1e-3),
-    "kicks-in-urad": _columns("the kicks are in µrad", UNIT.format("them", "rad"),
-                              _kicks, 1e-6, 1e-6),
+    "kicks-in-mrad": _columns(
+        "the kicks are in mrad", UNIT.format("them", "rad"), _kicks, 1e-3, 1e-3
+    ),
+    "kicks-in-urad": _columns(
+        "the kicks are in µrad", UNIT.format("them", "rad"), _kicks, 1e-6, 1e-6
+    ),
     "kicks-in-krad": _columns(
         "the kicks are a thousand times too small", UNIT.format("them", "rad"), _kicks, 1e3, 1e3
     ),
     "kicks-doubled": _columns(
-        "the kicks are half of those that were made", "give the whole step, from one side to the "
-        "other", _kicks, 2, 2,
+        "the kicks are half of those that were made",
+        "give the whole step, from one side to the other",
+        _kicks,
+        2,
+        2,
     ),
     "kicks-halved": _columns(
-        "the kicks are twice those that were made", "give the step that the orbit change belongs "
-        "to", _kicks, 0.5, 0.5,
+        "the kicks are twice those that were made",
+        "give the step that the orbit change belongs to",
+        _kicks,
+        0.5,
+        0.5,
     ),
     "correctors-shifted=1": _columns(
-        "the columns of each plane stand one corrector too late", "give each its own corrector's "
-        "name", _columns_shifted, 1,
+        "the columns of each plane stand one corrector too late",
+        "give each its own corrector's name",
+        _columns_shifted,
+        1,
     ),
     "correctors-shifted=-1": _columns(
-        "the columns of each plane stand one corrector too early", "give each its own corrector's "
-        "name", _columns_shifted, -1,
+        "the columns of each plane stand one corrector too early",
+        "give each its own corrector's name",
+        _columns_shifted,
+        -1,
     ),
-    "rf-reversed": _columns(
-        "the RF's step has the wrong sign", SIGN.format("step_hz"), _rf, -1
+    "rf-reversed": _of(
+        (OrbitResponse, Dispersion),
+        "the RF's step has the wrong sign",
+        SIGN.format("step_hz"),
+        _rf,
+        -1,
     ),
-    "rf-doubled": _columns("the RF's step is half of the one that was made", "give the whole step",
-                           _rf, 2),
-    "rf-halved": _columns("the RF's step is twice the one that was made", "give the step that the "
-                          "orbit change belongs to", _rf, 0.5),
-}  # fmt: skip
+    "rf-doubled": _columns(
+        "the RF's step is half of the one that was made", "give the whole step", _rf, 2
+    ),
+    "rf-halved": _columns(
+        "the RF's step is twice the one that was made",
+        "give the step that the orbit change belongs to",
+        _rf,
+        0.5,
+    ),
+    "turns-backwards": _of(
+        (TurnByTurn,),
+        "the turns are numbered backwards",
+        "number them from the kick on",
+        _last_first,
+    ),
+    **{
+        f"tune{name}-folded": _of(
+            (TuneReading,),
+            words,
+            f"give {what}: a spectrum does not separate Q from 1 - Q",
+            _folded,
+            x,
+            y,
+        )
+        for name, words, what, x, y in (
+            ("-x", "Qx is 1 - Qx", "1 - Qx", True, False),
+            ("-y", "Qy is 1 - Qy", "1 - Qy", False, True),
+            ("s", "both tunes are 1 - Q", "1 - Q", True, True),
+        )
+    },
+}
 """What may be assumed, by name."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement.arrays import Unit
+from tmlattice.measurement.assume import WORDS
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import check_table, located, read_document
 from tmlattice.measurement.header import FORMAT, number, read_noise
@@ -38,20 +39,11 @@ FEWEST, MOST_UNREAD = 100, 10
 SHORTEST = 4
 """Bytes of a row of a table at least."""
 
-_WORDS = {
-    Measurement: "first turns",
-    OrbitResponse: "an orbit response",
-    TurnByTurn: "a turn-by-turn measurement",
-    ClosedOrbit: "a closed orbit",
-    Dispersion: "a dispersion measurement",
-    TuneReading: "a tune measurement",
-}
-
 
 def in_words(measured: AnyMeasurement | type) -> str:
     """What a measurement, or a kind of it, is, for a sentence."""
     kind = measured if isinstance(measured, type) else type(measured)
-    return _WORDS.get(kind, kind.__name__)
+    return WORDS.get(kind, kind.__name__)
 
 
 def read_measurement(

@@ -7,15 +7,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.measurement.shots import TurnByTurn
 from tmlattice.measurement.trajectory import Measurement
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
+Data = TypeVar("Data", Measurement, TurnByTurn)
 
 FEWEST = 3
 """BPMs without signal, the last ones, from which the beam is lost: one or two may be frozen."""
@@ -30,18 +33,18 @@ REPEATED = 0.01
 
 
 @dataclass(frozen=True)
-class LostBeam:
+class LostBeam(Generic[Data]):
     """Where the signals of a measurement end.
 
     Attributes:
-        without: the measurement with the readings after that NaN, and with those of a plane that is
-            one constant.
+        without: the measurement with the readings after that NaN, and with those of a plane, or of
+            a turn, that is one constant.
         first: the first reading without signal, turn * monitors + monitor, [shot]; the number of
             readings where the signal goes on to the end.
         last: the last reading with a signal before that, [shot]; -1 where there is none.
     """
 
-    without: Measurement
+    without: Data
     first: Places
     last: Places
 
@@ -51,7 +54,7 @@ class LostBeam:
         return np.flatnonzero(self.first < self.without.readings[0].size // 2)
 
 
-def beam_lost(data: Measurement) -> LostBeam:
+def beam_lost(data: Data) -> LostBeam[Data]:
     """Where the signals of each shot end in a constant.
 
     No signal is a run of the last BPMs of a shot that read the same, to the last digit in both
@@ -59,7 +62,7 @@ def beam_lost(data: Measurement) -> LostBeam:
     shots is none.
 
     Args:
-        data: monitors in beam order.
+        data: first turns, or turns of a stored beam; monitors in beam order.
     """
     shots = len(data.readings)
     data = _planes(data)
@@ -74,24 +77,42 @@ def beam_lost(data: Measurement) -> LostBeam:
     first = np.minimum(first, _frozen_from(flat, there))
     after = np.arange(count) >= first[:, None]
     if not (after[..., None] & there).any():
-        return LostBeam(data, np.full(shots, count, dtype=np.intp), np.full(shots, count - 1))
+        none = np.full(shots, count, dtype=np.intp)
+        return LostBeam(_turns(data), none, np.full(shots, count - 1))
     kept = there & ~after[..., None]
     last = np.where(kept.any(axis=2), np.arange(count), -1).max(axis=1)
     readings = np.where(kept, flat, np.nan).reshape(data.readings.shape)
-    return LostBeam(replace(data, readings=readings), first, last)
+    return LostBeam(_turns(replace(data, readings=readings)), first, last)
 
 
-def _planes(data: Measurement) -> Measurement:
+def _planes(data: Data) -> Data:
     """Without a plane that is one constant at all BPMs in all shots, where the other one is none.
 
     Readings without noise may be so: the orbit of a flat ring.
     """
     values = [own[np.isfinite(own)] for own in np.moveaxis(data.readings, 3, 0)]
     constant = [len(own) > 1 and not np.ptp(own) for own in values]
-    exact = data.noise is not None and not np.nan_to_num(data.noise, nan=1.0).all()
-    if exact or sum(constant) != 1 or not all(len(own) for own in values):
+    if _exact(data) or sum(constant) != 1 or not all(len(own) for own in values):
         return data
     return replace(data, readings=np.where(constant, np.nan, data.readings))
+
+
+def _turns(data: Data) -> Data:
+    """Without turns in which all BPMs read one constant, where other turns of the shot are none."""
+    there = np.isfinite(data.readings)
+    high = np.where(there, data.readings, -np.inf).max(axis=2)
+    low = np.where(there, data.readings, np.inf).min(axis=2)
+    read = there.any(axis=(2, 3)) & (there.any(axis=3).sum(axis=2) >= FEWEST)
+    constant = read & ((high == low) | ~there.any(axis=2)).all(axis=2)
+    constant &= (read & ~constant).any(axis=1, keepdims=True)
+    if _exact(data) or not constant.any():
+        return data
+    return replace(data, readings=np.where(constant[..., None, None], np.nan, data.readings))
+
+
+def _exact(data: Data) -> bool:
+    """Whether readings have no noise, and so may repeat."""
+    return data.noise is not None and not np.nan_to_num(data.noise, nan=1.0).all()
 
 
 def _constant_from(readings: Array, there: Flags) -> int:

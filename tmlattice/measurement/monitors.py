@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, first_of, unknown_name
+from tmlattice.measurement.arrays import METRES
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
@@ -18,6 +19,10 @@ Values = TypeVar("Values", Array, None, Array | None)
 SETTINGS = ("kick", "k1_relative", "k2_relative", "frequency_relative")
 """What may be changed on purpose: rad, relative strengths, and the RF's relative frequency."""
 
+LARGEST_READING = 0.2
+"""m: more than any beam pipe has, less than any reading in mm that is worth a fit. Readers reject
+more; a record of Python holds it in any unit, for the data checks to name that."""
+IN_ANY_UNIT = LARGEST_READING / min(METRES.values())
 LARGEST_NOISE, SMALLEST_NOISE = 1.0, 1e-15
 """m; what is beyond is no noise of a reading in metres."""
 HIGHEST_ENERGY = 1e6
@@ -130,16 +135,33 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
 
 # --- what records have in common ------------------------------------------------------------------
 def check_values(values: Array, one: str) -> None:
-    """None is infinite, one at least is there.
+    """All are of a beam in some unit, one at least is there.
 
     Raises:
         MeasurementError: "a reading is infinite", where `one` is "reading".
     """
-    if np.isinf(values).any():
+    large = np.abs(values) > IN_ANY_UNIT
+    if large.any():
         article = "an" if one[0] in "aeiou" else "a"
-        raise MeasurementError(f"{article} {one} is infinite; a missing one is NaN")
+        size = "infinite" if np.isinf(values).any() else f"{values[large][0]:g} m"
+        raise MeasurementError(f"{article} {one} is {size}; a missing one is NaN")
     if not np.isfinite(values).any():
         raise MeasurementError(f"every {one} is missing; nothing can be fitted")
+
+
+def check_size(readings: Array, monitors: Sequence[str]) -> None:
+    """Readings [..., monitor, 2] are such that a reader takes them.
+
+    Raises:
+        MeasurementError: one above 0.2 m.
+    """
+    large = np.abs(readings) > LARGEST_READING  # false for NaN
+    if large.any():
+        *_, monitor, plane = np.argwhere(large)[0]
+        raise MeasurementError(
+            f"monitor '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
+            f"{LARGEST_READING} m, which no reader takes; readings are in metres"
+        )
 
 
 def check_energy(energy: float | None) -> None:

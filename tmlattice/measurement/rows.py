@@ -14,13 +14,10 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.input_files import check_regular
 from tmlattice.measurement.documents import not_utf8
-from tmlattice.measurement.monitors import Names, merge_spellings
+from tmlattice.measurement.monitors import LARGEST_READING, Names, merge_spellings
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-LARGEST_READING = 0.2
-"""m: more than any beam pipe has, less than any reading in mm that is worth a fit."""
 
 _MOST_CELLS = 50_000_000
 """Readings that an array may have without having a hundredth of them in the table: 0.8 GB."""
@@ -131,9 +128,7 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
         raise _encoding(path) from None
     except csv.Error as error:
         *_, line = _walk(path)  # it ends where the reader did
-        raise MeasurementError(
-            f"{path}, line {line}: not CSV ({error}); is a quotation mark left open?"
-        ) from None
+        raise not_csv(path, line, error) from None
     if not done:
         raise MeasurementError(f"{path}: no rows below the header; nothing was read")
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
@@ -146,6 +141,13 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
         whole={name: joined[name] for name in place if name in _WHOLE},
         names=names,
         xy=np.stack([joined[name] for name in place if name not in _WHOLE | _NAMES], axis=1),
+    )
+
+
+def not_csv(path: Path | str, line: int, error: csv.Error) -> MeasurementError:
+    """The error for a line that is no row of a CSV table."""
+    return MeasurementError(
+        f"{path}, line {line}: not CSV ({error}); is a quotation mark left open?"
     )
 
 
@@ -187,21 +189,6 @@ def dense(rows: Rows, shot: Integers, shots: int, monitor: Integers, monitors: i
     readings = np.full((shots, turns, monitors, 2), np.nan)
     readings[shot, turn, monitor] = rows.xy
     return readings
-
-
-def check_size(readings: Array, monitors: Sequence[str]) -> None:
-    """Readings [..., monitor, 2] are such that a reader takes them.
-
-    Raises:
-        MeasurementError: one above 0.2 m.
-    """
-    large = ~(np.abs(readings) <= LARGEST_READING) & ~np.isnan(readings)
-    if large.any():
-        *_, monitor, plane = np.argwhere(large)[0]
-        raise MeasurementError(
-            f"monitor '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
-            f"{LARGEST_READING} m, which no reader takes; readings are in metres"
-        )
 
 
 def _columns(

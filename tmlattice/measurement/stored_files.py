@@ -16,9 +16,9 @@ from tmlattice.errors import MeasurementError
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import located
 from tmlattice.measurement.header import header, read_noise
-from tmlattice.measurement.monitors import Settings, check_settings
+from tmlattice.measurement.monitors import Settings, check_settings, check_size
 from tmlattice.measurement.orbit_response import RfStep
-from tmlattice.measurement.rows import Rows, check_size, dense, match_names, read_rows
+from tmlattice.measurement.rows import Rows, dense, match_names, read_rows
 from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.tune_reading import TuneReading
 

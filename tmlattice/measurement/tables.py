@@ -12,8 +12,8 @@ from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement.arrays import Unit, metres
 from tmlattice.measurement.documents import located
-from tmlattice.measurement.monitors import Names, merge_spellings
-from tmlattice.measurement.rows import LARGEST_READING, dense, match_names, read_rows
+from tmlattice.measurement.monitors import LARGEST_READING, Names, merge_spellings
+from tmlattice.measurement.rows import dense, match_names, read_rows
 from tmlattice.measurement.trajectory import Measurement
 
 Array = NDArray[np.float64]

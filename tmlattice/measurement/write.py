@@ -15,9 +15,8 @@ from tmlattice.files import output_folder, write_json
 from tmlattice.measurement.documents import Digest
 from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
 from tmlattice.measurement.header import finite, header
-from tmlattice.measurement.monitors import Names, Settings, check_settings, noise_table
+from tmlattice.measurement.monitors import Names, Settings, check_settings, check_size, noise_table
 from tmlattice.measurement.orbit_response import OrbitResponse
-from tmlattice.measurement.rows import check_size
 from tmlattice.measurement.stored_files import (
     KINDS,
     TURNS,

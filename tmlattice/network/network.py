@@ -182,7 +182,7 @@ class TaylorNetwork(NetworkChain, Chain):
         passes = []
         for turn in range(turns or 1):
             readings, end = self._pass(x)
-            alive = (end.detach().abs() < APERTURE).all(dim=1)  # false for NaN
+            alive = self._inside(end.detach())
             if not alive.all():
                 if on_lost == OnLost.RAISE:
                     first = int(alive.to(torch.int8).argmin())
@@ -193,6 +193,26 @@ class TaylorNetwork(NetworkChain, Chain):
             if turns is not None and turn + 1 < turns:
                 x = monomials(end) @ self._closing.mT
         return passes[0] if turns is None else torch.stack(passes, dim=1)
+
+    @torch.no_grad()
+    def one_turn(self, launch: ArrayLike | Tensor) -> tuple[Tensor, Tensor]:
+        """Return readings of every monitor [batch, monitor, 2], and the states at the end of the
+        turn [batch, n]; NaN where the beam is lost in it. Not differentiable.
+
+        Args:
+            launch: states at the start of the ring, [batch, n].
+        """
+        readings, end = self._pass(self._launch(launch))
+        state = monomials(end) @ self._closing.mT
+        lost = ~self._inside(state)
+        state[lost] = readings[lost] = torch.nan
+        return readings, state
+
+    @staticmethod
+    def _inside(states: Tensor) -> Tensor:
+        """See `aperture.lost`."""
+        bounded = [i for i in range(states.shape[1]) if i != 4]
+        return (states[:, bounded].abs() < APERTURE).all(dim=1)  # false for NaN
 
     def _pass(self, launch: Tensor) -> tuple[Tensor, Tensor]:
         """Readings, and states behind the last layer."""

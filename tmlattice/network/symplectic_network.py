@@ -12,12 +12,11 @@ from tmlattice.beam.aperture import check_alive
 from tmlattice.beam.chain import Chain, merged, products
 from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
-from tmlattice.maps.taylor import second_derivatives, symplectic_form
+from tmlattice.maps.taylor import second_derivatives
 from tmlattice.network.base import NetworkChain
 from tmlattice.network.generators import (
     cubic_generator,
     field,
-    field_matrix,
     multipoles,
     nearest_symplectic,
     pull_field,
@@ -225,27 +224,3 @@ class SymplecticNetwork(NetworkChain):
         path, middle = states[0, :, :, 0], middles[0, :, :, 0]
         slopes = A + np.einsum("kaij,kj->kai", second_derivatives(Q), middle)
         return path, middle, slopes, W1
-
-    def signatures(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the effect of a small change of every generator on the trajectory from x [n].
-
-        Returns:
-            The exits' states [layer + 1, n]; M [layer + 1, n, n], the Jacobian of every exit by
-            the launch; D [layer, n, coefficient], the shift of the launch equivalent to a change of
-            the layer's generator. A reading R at exit a changes by layer k < a by R M[a] D[k]:
-            carried back by the symplectic inverse of M, forward by M.
-        """
-        path, middle, slopes, W1 = self._slopes(x)
-        layers = len(self.layers)
-        half, one = 0.5 * slopes[:layers], np.eye(self.dimension)
-        steps = np.linalg.solve(one - half, (one + half) @ W1[:layers])
-        M = products(np.asarray(steps, dtype=float))
-        i, j = np.triu_indices(self.dimension)
-        middle = middle[:layers]
-        monomials = np.concatenate(
-            [np.ones((layers, 1)), middle, middle[:, i] * middle[:, j]], axis=1
-        )
-        kicks = np.einsum("amc,km->kac", field_matrix(self.dimension), monomials)
-        S = symplectic_form(self.dimension)
-        back = S.T @ M[1:].swapaxes(1, 2) @ S
-        return path[: layers + 1], M, back @ np.linalg.solve(one - half, kicks)

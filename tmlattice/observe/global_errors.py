@@ -1,26 +1,42 @@
-"""Global errors of first turns: a wrong sign, unit or order of all readings or settings.
+"""Global errors: a wrong sign, unit or order of all readings or settings.
 
->>> search = GlobalErrors(ring, measurement)
+>>> search = OfTurns(ring, measurement)
 >>> search.verdict()                    # the correction that improves the data far
 
-Each assumption is corrected in the data, and the trajectories of all sections are fitted again. The
-score is their agreement with themselves, with the next section, and with the launches. Every term
-has its own scale, so that the section of a fault costs the logarithm of its misfit: a strong fault
-does not look global, and does not hide a global error.
+Each assumption (`measurement.assume`) is corrected in the data, and these are judged again, in
+every kind of measurement by the same search. Of first turns the trajectories of all sections are
+fitted again. The score is their agreement with themselves, with the next section, and with the
+launches. Every term has its own scale, so that the section of a fault costs the logarithm of its
+misfit: a strong fault does not look global, and does not hide a global error. What all passes have
+in common counts once, and is compared with the orbit of a ring with distributed kicks: a machine
+whose orbit is millimetres off is no global error.
 """
 
+from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.effects import Cause, Settings
 from tmlattice.errors import MeasurementError
+from tmlattice.inference import chi2
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
-from tmlattice.observe.sections import Passes, SectionFits, Sections, distance, log_uncertainty
+from tmlattice.observe.sections import (
+    DIVERGED_SIGMA,
+    Flags,
+    Passes,
+    SectionFits,
+    Sections,
+    distance,
+    log_uncertainty,
+    mean_pass,
+)
 
 Array = NDArray[np.float64]
 
@@ -50,59 +66,126 @@ Names = tuple[str, ...]
 GAIN, CERTAIN = 12.0, 15.0
 """Log evidence above which a global error is reported, and above which it is certain: no healthy
 measurement of `benchmarks/data_checks.py` gains as much."""
-SHARE = 0.65
-"""Share of all changed terms that an assumption must improve: the section of a fault may gain much
-by chance, but then many others lose."""
-CLEAR, CLEAR_UNIT, AGAINST = 3.0, 30.0, 10.0
-"""Factors by which chi-square must fall: of sections or launches, at least; with a unit corrected;
-and of sections where launches contradict. Units are powers of a thousand."""
-RIGHT = 5.0
-"""Chi-square of correct launches."""
-FINE, FINE_GAIN = 0.1, 30.0
-"""Share of the orbit below which sections agree in any case, and log evidence that curvature, or a
-few corrector settings, must then gain."""
+ERRORS = 4.0
+"""Independent numbers by which a fault changes what is read in a section, or at a joint, whatever
+the number of shots: a kick and a gradient in each plane."""
+SINGULAR = 1e-9
+"""Smallest relative variance of mismatches by noise."""
+KICKS = np.append(0.0, 10.0 ** np.arange(0, 11))
+"""Variances of distributed kicks that are tried: of a section's typical reading, over its noise's.
+"""
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Mismatches between the parts of a measurement, and their degrees of freedom.
+    """Mismatches between the parts of a measurement.
 
     Attributes:
-        local, joints: mean squares in units of the noise, within sections and where they meet;
-            those between turns are joints too.
-        freedom: of the sections' terms.
-        launch: mean squares of launches by plane, in units of noise and stated rms, by the scale of
-            the noise: see `GlobalErrors`.
-        stated: log of the stated noise over the estimated one, 0 if none is stated; log of the
-            orbit over a usual one; each in standard deviations.
+        cost: negative log likelihood of each term, with its own scale, at least the noise.
         blur: log uncertainty of launches and joints, which penalises vague readings.
-        level, share: of the sections: see `SectionFits`.
-        unit: chi-square per reading of a mean square of 1: of the stated noise, or of the best
-            assumption's.
+        levels, launch: chi-square per reading of the sections, and of the launches in the worse
+            plane (NaN if none is stated): of all that was read, and of its changes from pass to
+            pass, [2].
     """
 
-    local: Array
-    joints: Array
-    freedom: NDArray[np.int64]
-    launch: Array
-    stated: Array
+    cost: Array
     blur: float
-    level: float
-    share: float
-    unit: float
-
-    def cost(self, square: float) -> Array:
-        """Negative log likelihood of each term, with its own scale, at least the noise."""
-        return np.concatenate([
-            self.freedom / 2 * _robust(self.local / square),
-            2 * _robust(self.joints / square),
-            np.log(np.maximum(self.launch, 1.0)),  # their information differs
-            self.stated**2 / 2,
-        ])  # fmt: skip
+    levels: Array
+    launch: Array
 
 
-def _robust(misfit: Array) -> Array:
-    return np.where(misfit < 1, misfit - 1, np.log(np.maximum(misfit, 1.0)))
+@dataclass(frozen=True)
+class Split:
+    """Mismatches in two parts: what all passes have in common, as kicks of the ring have, and what
+    changes from pass to pass. The common part is a single piece of evidence.
+
+    Attributes:
+        common: mean over the passes, times the root of their number, [term, row].
+        spread: its covariance by noise, [term, row, row].
+        kicked: its change by unit kicks of the ring, [term, row, kick].
+        changes: sum of squares of the rest, [term].
+        freedom: of both, [2, term].
+        errors: degrees of freedom that a fault of the machine changes.
+    """
+
+    common: Array
+    spread: Array
+    kicked: Array
+    changes: Array
+    freedom: Array
+    errors: float
+
+    @classmethod
+    def of(
+        cls, miss: Array, spread: Array, kicked: Array, there: Flags,
+        freedom: Array | NDArray[np.int64], errors: float = ERRORS,
+    ) -> "Split":  # fmt: skip
+        """Split mismatches.
+
+        Args:
+            miss: [pass, term, row].
+            spread: their covariance by noise, [pass, term, row, row]; [1, 1, row, row] is that of
+                independent readings.
+            kicked: their change by unit kicks, [term, row, kick].
+            there: what was measured, [pass, term, row].
+            freedom: of each, [pass, term].
+        """
+        mean, count = mean_pass(miss, there), there.sum(axis=0)
+        rest = np.where(there, miss - mean, 0.0)
+        size = miss.shape[-1]
+        each = (rest**2).mean(axis=-1) if len(spread) < len(miss) else distance(rest, spread)
+        usual = np.broadcast_to(spread.mean(axis=0), (len(mean), size, size))
+        most = freedom.max(axis=0)
+        root = np.sqrt(count)
+        return cls(
+            mean * root, usual, np.nan_to_num(kicked) * root[..., None],
+            size * np.where(freedom > 0, each, 0.0).sum(axis=0),
+            np.stack([most, freedom.sum(axis=0) - most]), errors,
+        )  # fmt: skip
+
+    def cost(self, square: float, kicks: Array) -> Array:
+        """Negative log likelihood of all terms of both parts, with their own scales, [kicks, term].
+
+        Args:
+            square: variance of the noise, in units of the stated one.
+            kicks: variances of the kicks, in units of the noise's variance.
+        """
+        size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("tii->ti", self.spread)), 1e-60))
+        even = np.nan_to_num(self.spread / size[..., None] / size[:, None], posinf=0, neginf=0)
+        width, axes = np.linalg.eigh(even)
+        back = np.swapaxes(axes / np.sqrt(np.maximum(width, SINGULAR))[:, None], 1, 2)
+        kicked = back @ np.nan_to_num(self.kicked / size[..., None], posinf=0, neginf=0)
+        by_kicks, axes = np.linalg.eigh(kicked @ np.swapaxes(kicked, 1, 2))
+        limit = DIVERGED_SIGMA
+        common = np.clip(np.nan_to_num(self.common / size, nan=limit), -limit, limit)
+        along = np.swapaxes(axes, 1, 2) @ (back @ common[..., None])  # the axes of the kicks
+        own = along[..., 0] ** 2
+        wider = 1 + kicks[:, None, None] * np.maximum(by_kicks, 0.0)
+        free, changing = self.freedom
+        misfit = (own / wider).sum(axis=2) / np.maximum(free, 1) / square
+        changes = self.changes / np.maximum(changing, 1) / square
+        common_cost = _robust(misfit, free, self.errors) + np.log(wider).sum(axis=2) / 2
+        rest = np.broadcast_to(_robust(changes, changing, self.errors), common_cost.shape)
+        return np.concatenate([np.where(free > 0, common_cost, 0.0), rest], axis=1)
+
+    def level(self, worst: bool = False) -> float:
+        """Mean square of the changes from pass to pass in the typical term, or in the worst one;
+        NaN if there are none."""
+        changing = self.freedom[1]
+        some = changing > 0
+        if not some.any():
+            return float("nan")
+        each = self.changes[some] / changing[some]
+        usual = chi2.median_per_freedom(changing[some])
+        return float(each.max() if worst else np.median(each / usual))
+
+
+def _robust(misfit: Array, freedom: Array, errors: float) -> Array:
+    """Negative log likelihood of mean squares in units of the noise, by their degrees of freedom,
+    of which a fault of the machine makes no more than some."""
+    own = np.maximum(np.minimum(freedom, errors), 1)
+    large = own * np.log1p(freedom / own * np.maximum(misfit - 1, 0.0))
+    return np.asarray(np.where(misfit < 1, freedom * (misfit - 1), large) / 2)
 
 
 @dataclass(frozen=True)
@@ -112,74 +195,122 @@ class Verdict:
     Attributes:
         names: assumptions, together.
         gain: log evidence.
-        before, after: chi-square per reading of the sections, and of the launches (NaN if none is
-            stated), [2].
+        before, after: misfit as stated and corrected: chi-square per reading of first turns; else
+            the difference from the design, as `Compared.misfit`.
+        of: what has this misfit.
         alike: other assumptions that explain the data as well.
     """
 
     names: Names
     gain: float
-    before: tuple[float, float]
-    after: tuple[float, float]
+    before: float
+    after: float
+    of: str
     alike: tuple[Names, ...] = ()
 
-
-def certain(verdict: Verdict) -> bool:
-    """Whether the evidence is decisive."""
-    return worth(verdict) > CERTAIN
-
-
-def worth(verdict: Verdict) -> float:
-    """Log evidence; each assumption beyond the first must be certain by itself."""
-    return verdict.gain - CERTAIN * (len(verdict.names) - 1)
+    @property
+    def worth(self) -> float:
+        """Log evidence; each assumption beyond the first must be certain by itself."""
+        return self.gain - CERTAIN * (len(self.names) - 1)
 
 
-def widely(stated: Terms, other: Terms, square: float) -> bool:
-    """Whether an assumption improves nearly all terms that it changes."""
-    a, b = stated.cost(square), other.cost(square)
-    if len(a) != len(b):
-        return True
-    better, worse = np.maximum(a - b, 0).sum(), np.maximum(b - a, 0).sum()
-    return bool(better > SHARE * (better + worse))
-
-
-def believable(verdict: Verdict, share: float) -> bool:
-    """Whether the corrected terms are right, not only less wrong.
-
-    Args:
-        verdict: the global error.
-        share: of the orbit that the sections leave as stated.
-    """
-    (local, launch), (local_then, launch_then) = verdict.before, verdict.after
-    local_clears, launch_clears = local / max(local_then, 1e-12), launch / max(launch_then, 1e-12)
-    if launch_then > RIGHT and local_clears < AGAINST:  # false if no launch is stated
-        return False
-    unit = any("-in-" in name for name in verdict.names)
-    clear = CLEAR_UNIT if unit else CLEAR
-    if local_clears > clear or launch_clears > clear:
-        return True
-    return share < FINE and not unit and verdict.gain > FINE_GAIN
-
-
-def levels(terms: Terms) -> tuple[float, float]:
-    """Chi-square per reading of the sections, and of the launches in the worse plane."""
-    launch = terms.launch.reshape(-1, 2)
-    worse = float(np.median(launch, axis=0).max()) if len(launch) else float("nan")
-    return terms.unit * terms.level, worse
-
-
-@dataclass
-class GlobalErrors:
+@dataclass(frozen=True)
+class Search:
     """Search for global errors of one measurement.
 
     Args:
         ring: the design.
-        measurement: first turns, its monitors those of the ring.
-        known: causes in the model.
+        data: its monitors those of the ring.
     """
 
     ring: Ring
-    measurement: Measurement
+    data: Any
+
+    @cached_property
+    def monitors(self) -> list[str]:
+        """Monitors of the ring, in beam order."""
+        return [monitor.name for monitor in self.ring.monitors]
+
+    def assumed(self, names: Names) -> Any:
+        """Return the data with assumptions corrected."""
+        return assume(self.data, names, self.monitors)
+
+    def candidates(self) -> list[Names]:
+        """Return the assumptions that these data allow."""
+        return [(name,) for name, own in ASSUMPTIONS.items() if isinstance(self.data, own.kinds)]
+
+    @abstractmethod
+    def judged(self) -> list[Verdict]:
+        """Return the assumptions that improve the data far."""
+
+    @abstractmethod
+    def corrected(self, names: Names) -> Self:
+        """Return the search with assumptions corrected in the data."""
+
+    def shown(self, misfit: float) -> str:
+        """A misfit for a sentence."""
+        return f"{misfit:.2f}" if misfit < 100 else f"{misfit:.3g}"
+
+    def verdict(self) -> Verdict | None:
+        """Return the best assumption, if any improves the data far."""
+        found = self.judged()
+        if not found:
+            return None
+        order = list(ASSUMPTIONS)
+        best = max(own.worth for own in found)
+        alike = [own for own in found if own.worth > best - ALIKE]
+        first = min(alike, key=lambda own: [order.index(name) for name in own.names])
+        return replace(first, alike=tuple(own.names for own in alike if own is not first))
+
+
+def _verdict(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict:
+    """An assumption with the chi-square that falls most."""
+    pairs = []
+    for one, then in ((stated.levels, other.levels), (stated.launch, other.launch)):
+        which = int(np.nan_to_num(one / np.maximum(then, 1e-12)).argmax())
+        pairs.append((float(one[which]), float(then[which])))
+    (local, local_then), (launch, _) = pairs
+    # the sections may agree either way: then the launches decide
+    of_launch = not local > 2 * local_then and bool(np.isfinite(launch))
+    of = "chi-square per reading" + " of the launches" * of_launch
+    return Verdict(names, gain, *pairs[of_launch], of)
+
+
+def _parts(passes: Passes, found: SectionFits) -> tuple[Split, list[Split], list[Array]]:
+    """Mismatches of the sections, and of their joints, those between turns too; and the joints'
+    covariances."""
+    left = np.eye(found.left.shape[2])[None, None]
+    sections = Split.of(found.left, left, found.kicked, found.there, found.freedom)
+    pairs = [(found.start[:, 1:] - found.end[:, :-1],
+              found.covariance[:, 1:] + found.carried[:, :-1],
+              (found.start_kicked[1:], found.end_kicked[:-1]))]  # fmt: skip
+    follows = np.flatnonzero((np.diff(passes.shot) == 0) & (np.diff(passes.turn) == 1))
+    if len(follows):
+        pairs.append((found.start[follows + 1, :1] - found.end[follows, -1:],
+                      found.covariance[follows + 1, :1] + found.carried[follows, -1:],
+                      (found.start_kicked[:1], found.end_kicked[-1:])))  # fmt: skip
+    joints = []
+    for miss, spread, (behind, before) in pairs:
+        kicked = np.concatenate([behind, -before], axis=2)
+        free = np.full(miss.shape[:2], 4)
+        joints.append(Split.of(miss, spread, kicked, np.ones(miss.shape, dtype=bool), free))
+    return sections, joints, [spread for _, spread, _ in pairs]
+
+
+def _worse(launch: Array) -> float:
+    """The usual mean square [shot, plane] of the worse plane."""
+    return float(np.median(launch, axis=0).max()) if len(launch) else float("nan")
+
+
+@dataclass(frozen=True)
+class OfTurns(Search):
+    """Search for global errors of first turns, of which some shots and turns are used.
+
+    Args:
+        known: causes in the model.
+    """
+
+    data: Measurement
     known: Sequence[Cause] = ()
     _sections: dict[float, Sections] = field(default_factory=dict, repr=False)
     _found: dict[object, tuple[object, Passes, SectionFits]] = field(
@@ -188,15 +319,22 @@ class GlobalErrors:
     _made: dict[Names, Measurement] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        self.monitors = [monitor.name for monitor in self.ring.monitors]
-        self.measurement = _part(in_beam_order(self.measurement, self.monitors))
-        self.scale = _size(self.measurement)
-        self.kicks = _kicks(self.measurement.settings)
+        object.__setattr__(self, "data", _part(in_beam_order(self.data, self.monitors)))
+
+    @cached_property
+    def scale(self) -> float:
+        """rms of the readings, m."""
+        return _size(self.data)
+
+    @cached_property
+    def kicks(self) -> Array:
+        """All kicks that were set, rad."""
+        return _kicks(self.data.settings)
 
     def assumed(self, names: Names) -> Measurement:
         """Return the data with assumptions corrected."""
         if names not in self._made:
-            self._made[names] = assume(self.measurement, names, self.monitors)
+            self._made[names] = super().assumed(names)
         return self._made[names]
 
     # --- one assumption -------------------------------------------------------------------------
@@ -210,7 +348,7 @@ class GlobalErrors:
 
     def _times(self, data: Measurement) -> float:
         """Common factor of the shots' kicks."""
-        if data.settings is self.measurement.settings or not self.kicks.any():
+        if data.settings is self.data.settings or not self.kicks.any():
             return 1.0
         return float(_kicks(data.settings) @ self.kicks / (self.kicks @ self.kicks))
 
@@ -220,7 +358,7 @@ class GlobalErrors:
         read = np.isfinite(readings).any(axis=(1, 2))
         shot, turn = (own[read] for own in np.divmod(np.arange(len(readings)), turns))
         noise = np.full((len(data.monitors), 2), UNSTATED_NOISE)
-        if self.measurement.noise is not None:
+        if self.data.noise is not None:
             own = self._noise(data)
             noise = np.where(np.isfinite(own), own, np.nanmedian(own))
         factor = _size(data) / self.scale if self.scale > 0 else 1.0
@@ -233,7 +371,7 @@ class GlobalErrors:
         """Sections with the shots' kicks multiplied."""
         if 1.0 not in self._sections:
             at = {name.casefold(): i for i, name in enumerate(self.monitors)}
-            data = self.measurement
+            data = self.data
             places = np.array([at[self.ring[name].name.casefold()] for name in data.monitors])
             settings = data.settings or tuple({} for _ in data.launches)
             self._sections[1.0] = Sections(self.ring, settings, places, self.known)
@@ -243,10 +381,10 @@ class GlobalErrors:
 
     def _noise(self, data: Measurement) -> Array:
         """Stated noise, in the present order of the monitors."""
-        assert self.measurement.noise is not None
-        if data.noise is None or data.noise.shape != self.measurement.noise.shape:
-            return self.measurement.noise
-        ratio = np.nanmedian(data.noise) / np.nanmedian(self.measurement.noise)
+        assert self.data.noise is not None
+        if data.noise is None or data.noise.shape != self.data.noise.shape:
+            return self.data.noise
+        ratio = np.nanmedian(data.noise) / np.nanmedian(self.data.noise)
         return np.asarray(data.noise / ratio)
 
     def terms(self, names: Names, square: float) -> Terms:
@@ -258,41 +396,37 @@ class GlobalErrors:
         """
         data = self.assumed(names)
         passes, found = self.found(data)
-        spreads = [found.covariance[:, 1:] + found.carried[:, :-1]]
-        joints = [distance(found.start[:, 1:] - found.end[:, :-1], spreads[0]).ravel()]
-        follows = np.flatnonzero((np.diff(passes.shot) == 0) & (np.diff(passes.turn) == 1))
-        if len(follows):
-            miss = found.start[follows + 1, 0] - found.end[follows, -1]
-            spreads.append(found.covariance[follows + 1, 0] + found.carried[follows, -1])
-            joints.append(distance(miss, spreads[1]))
-        noise, unit = 0.0, 1 / square
-        orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
-        if data.noise is not None:
-            ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
-            noise, unit = float(np.log(ratio * np.sqrt(square))) / NOISE_WIDTH, ratio**2
-        backwards = "beam-backwards" in names
-        launch, blur = self._launch(data, passes, found, square, backwards)
+        sections, joints, spreads = _parts(passes, found)
+        launch, each, blur = self._launch(data, passes, found, square, "beam-backwards" in names)
         times = _size(data) / self.scale
         blur += sum(log_uncertainty(own / times**2) for own in spreads)
+        ratio = 1.0
+        if data.noise is not None:
+            ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
+        noise = np.log(ratio * np.sqrt(square)) / NOISE_WIDTH if data.noise is not None else 0.0
+        orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
+        moved = (sections.kicked**2).sum(axis=2)  # none where nothing was read
+        kicks = KICKS / np.median(moved[moved > 0]) if moved.any() else KICKS[:1]
+        parts = [own.cost(square, kicks) for own in (sections, *joints)]
+        if launch is not None:  # in m and rad; the information of launches differs
+            parts.append(np.maximum(launch.cost(1.0, square * kicks), 0.0))
+        costs = np.concatenate(parts, axis=1)
+        best = costs[costs.sum(axis=1).argmin()]
+        unit = 1 / square if data.noise is None else ratio**2
         return Terms(
-            found.misfit.ravel(),
-            np.concatenate(joints),
-            found.freedom.ravel(),
-            launch,
-            np.array([noise, orbit]),
+            np.concatenate([best, [noise**2 / 2, orbit**2 / 2]]),
             blur,
-            found.level,
-            found.share(passes),
-            unit,
+            unit * np.array([found.level, sections.level()]),
+            np.full(2, np.nan) if launch is None else np.array([_worse(each), launch.level(True)]),
         )
 
     def launches(self, square: float, tolerance: float) -> tuple[Array, Array]:
         """Mean squares of fitted less stated launches by plane, [shot, 2], and the misfit of the
         sections that determine them, [shot]."""
-        passes, found = self.found(self.measurement)
+        passes, found = self.found(self.data)
         first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
-        own, _ = self._launch(self.measurement, passes, found, square, False, tolerance)
-        return own.reshape(-1, 2), found.misfit[first, 0]
+        _, each, _ = self._launch(self.data, passes, found, square, False, tolerance)
+        return each, found.misfit[first, 0]
 
     def _launch(
         self,
@@ -302,15 +436,16 @@ class GlobalErrors:
         square: float,
         backwards: bool,
         tolerance: float = LAUNCH_TOLERANCE,
-    ) -> tuple[Array, float]:
-        """Mean squares of fitted less stated launches by plane, [shot * 2], and the log of their
-        uncertainty."""
+    ) -> tuple[Split | None, Array, float]:
+        """Fitted less stated launches by plane; their mean squares [shot, plane]; and the log of
+        their uncertainty. None if no launch is stated."""
         if backwards:  # the end of the last turn, against the stated launches
             last = np.flatnonzero(np.append(np.diff(passes.shot) != 0, True))
             shot, fitted = passes.shot[last], found.end[last, -1] * _TURNED
             covariance = found.carried[last, -1] * np.outer(_TURNED, _TURNED)
-            stated, J = self.measurement.launches[shot], np.tile(np.eye(4), (len(last), 1, 1))
-            sigma = self.measurement.launch_sigma
+            stated, J = self.data.launches[shot], np.tile(np.eye(4), (len(last), 1, 1))
+            sigma = self.data.launch_sigma
+            kicked = found.end_kicked[-1] * _TURNED[:, None]
         else:
             first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
             shot, fitted = passes.shot[first], found.start[first, 0]
@@ -319,10 +454,11 @@ class GlobalErrors:
             covariance = covariance + energy[:, :, None] * energy[:, None]
             stated, sigma = data.launches[shot], data.launch_sigma
             J = np.tile(np.eye(4), (len(first), 1, 1))
+            kicked = found.start_kicked[0]
             if passes.turn[first].any():
                 stated, J = self._carried(data, passes, first)
         if sigma is None or np.isinf(sigma[shot, :4]).all():
-            return np.zeros(0), 0.0
+            return None, np.zeros((0, 2)), 0.0
         own = np.minimum(sigma[shot, :4], 1e3)
         width = tolerance * np.sqrt(np.mean(fitted**2, axis=0))
         spread = square * covariance + (J * own[:, None] ** 2) @ np.swapaxes(J, 1, 2)
@@ -331,8 +467,12 @@ class GlobalErrors:
         open_ = square * covariance / (own**2 + np.maximum(width, 1e-12) ** 2)[:, None] / times**2
         blur = log_uncertainty(np.eye(4) + open_)
         miss = np.clip(np.nan_to_num(fitted - stated[:, :4], nan=1e6), -1e6, 1e6)
-        planes = [distance(miss[:, p], spread[:, p, p]) for p in (slice(0, 2), slice(2, 4))]
-        return np.stack(planes, axis=1).ravel(), blur
+        planes = miss.reshape(-1, 2, 2)
+        spreads = np.stack([spread[:, p, p] for p in (slice(0, 2), slice(2, 4))], axis=1)
+        free = np.full(planes.shape[:2], 2)
+        every = np.ones(planes.shape, dtype=bool)
+        split = Split.of(planes, spreads, kicked.reshape(2, 2, -1), every, free, np.inf)
+        return split, distance(planes, spreads), blur
 
     def _carried(
         self, data: Measurement, passes: Passes, first: NDArray[np.intp]
@@ -350,9 +490,8 @@ class GlobalErrors:
     # --- all of them ----------------------------------------------------------------------------
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""
-        data = self.measurement
-        names = [n for n, a in ASSUMPTIONS.items() if a.trajectory and n not in _LAST]
-        without = []
+        data = self.data
+        without = list(_LAST)
         if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
             without += ["launches", "slopes", "positions", "beam"]
             without += ["readings-in-km"]  # distinguished by curvature alone
@@ -362,7 +501,9 @@ class GlobalErrors:
             without += ["settings"]
         if len(data.monitors) < 4:
             without += ["monitors"]
-        found: list[Names] = [(n,) for n in names if not {n, n.split("-")[0]} & set(without)]
+        found = [
+            own for own in super().candidates() if not {own[0], own[0].split("-")[0]} & set(without)
+        ]
         return [own for own in found if self._possible(own)]
 
     def _possible(self, names: Names) -> bool:
@@ -375,51 +516,42 @@ class GlobalErrors:
     def square(self, several: Iterable[Names]) -> float:
         """Variance of the readings in units of the stated one, from the best of several
         assumptions."""
-        found = [self.found(self.assumed(names))[1].level for names in several]
+        found = []
+        for names in several:
+            passes, own = self.found(self.assumed(names))
+            found += [own.level, _parts(passes, own)[0].level()]
         return max(float(np.nanmin(found)), 1e-12) if np.isfinite(found).any() else 1.0
 
-    def verdict(self) -> Verdict | None:
-        """Return the assumption that improves the data far, if any; two together if that is far
-        better still."""
+    def judged(self) -> list[Verdict]:
+        """Return the assumptions that improve the data far, and the best of them with others."""
         several = self.candidates()
         square = self.square([(), *several])
         stated = self.terms((), square)
-        found = [own for names in several if (own := self._judged(names, stated, square))]
-        found.sort(key=worth, reverse=True)
+
+        def gains(some: Iterable[Names]) -> list[Verdict]:
+            found = []
+            for names in filter(self._possible, some):
+                other = self.terms(names, square)
+                gain = float(stated.cost.sum() - other.cost.sum())
+                gain -= max(other.blur - stated.blur, 0.0)
+                found.append(_verdict(stated, other, names, gain))
+            return found
+
+        found = sorted(gains(several), key=lambda own: own.gain, reverse=True)
         if not found or found[0].gain < GAIN:
-            return None
-        pairs = {
-            tuple(sorted({*first.names, *second}, key=list(ASSUMPTIONS).index))
-            for first in found[:BEAM]
-            for second in several
-            if not _same_part(first.names[0], second[0])
-        } - set(several)
-        found += [
-            own for names in sorted(pairs)
-            if self._possible(names) and (own := self._judged(names, stated, square))
-        ]  # fmt: skip
-        found = [own for own in found if worth(own) > GAIN and believable(own, stated.share)]
-        if not found:
-            return None
-        best = max(map(worth, found))
-        alike = [own for own in found if worth(own) > best - ALIKE]
-        first = min(alike, key=lambda own: [list(ASSUMPTIONS).index(n) for n in own.names])
-        return replace(first, alike=tuple(own.names for own in alike if own is not first))
+            return []
+        order = list(ASSUMPTIONS).index
+        found += gains(sorted({
+            tuple(sorted({*one.names, *two}, key=order))
+            for one in found[:BEAM] for two in several if not _same_part(one.names[0], two[0])
+        } - set(several)))  # fmt: skip
+        return [own for own in found if own.worth > GAIN]
 
-    def _judged(self, names: Names, stated: Terms, square: float) -> Verdict | None:
-        """Return the gain of an assumption that improves nearly all terms that it changes."""
-        other = self.terms(names, square)
-        if not widely(stated, other, square):
-            return None
-        gain = float(stated.cost(square).sum() - other.cost(square).sum())
-        gain -= max(other.blur - stated.blur, 0.0)
-        return Verdict(names, gain, levels(stated), levels(other))
-
-    def corrected(self, names: Names) -> "GlobalErrors":
+    def corrected(self, names: Names) -> Self:
         """Return the search with assumptions corrected in the data."""
         data = self.assumed(names)
         sections = {1.0: self._section(self._times(data))}
-        return GlobalErrors(self.ring, data, self.known, sections)
+        return replace(self, data=data, _sections=sections, _found={}, _made={})
 
 
 def _same_part(one: str, other: str) -> bool:

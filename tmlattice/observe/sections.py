@@ -135,6 +135,10 @@ class SectionFits:
         covariance: of these, [pass, section, 4, 4], at a known energy.
         energy: their change by the standard error of the energy, [pass, section, 4].
         end, carried: trajectories and covariances at the sections' ends.
+        kicked: change of `left` by unit kicks of the ring behind each monitor, of the pass with the
+            most readings, [section, reading, kick].
+        start_kicked, end_kicked: change of `start`, and of `end` less the trajectory's, by these
+            kicks, [section, 4, kick].
     """
 
     left: Array
@@ -149,6 +153,9 @@ class SectionFits:
     energy: Array
     end: Array
     carried: Array
+    kicked: Array
+    start_kicked: Array
+    end_kicked: Array
 
     @property
     def level(self) -> float:
@@ -161,16 +168,42 @@ class SectionFits:
 
     def share(self, passes: Passes) -> float:
         """Share of the readings' rms that the typical trajectory leaves: 1 if it explains none."""
-        owner, plane = np.maximum(self.owner, 0), np.arange(self.owner.shape[1]) % 2
-        read = np.where(self.there, passes.readings[:, owner, plane], 0.0)
-        left = np.where(self.there, self.left * passes.sigma[owner, plane], 0.0)
         enough = self.freedom > 3
         if enough.sum() < 3:
             return float("nan")
-        count = self.there.sum(axis=2)[enough]
-        whole = (read**2).sum(axis=2)[enough] / count
-        part = (left**2).sum(axis=2)[enough] / self.freedom[enough]
-        return float(np.median(np.sqrt(part / np.maximum(whole, 1e-60))))
+        part, whole = self._squares(passes)
+        shares = np.sqrt(part / np.maximum(whole, 1e-60))[:, enough]
+        return float(np.median(shares, axis=1).min())
+
+    def shares(self, passes: Passes) -> Array:
+        """The same of each section, from all passes together, [section]; NaN if undetermined."""
+        enough = self.freedom > 3
+        part, whole = (np.where(enough, own, 0.0).sum(axis=1) for own in self._squares(passes))
+        own = np.sqrt(part / np.maximum(whole, 1e-60)).min(axis=0)
+        return np.where(enough.any(axis=0), own, np.nan)
+
+    def _squares(self, passes: Passes) -> tuple[Array, Array]:
+        """Mean squares of the residuals and of the readings [2, pass, section], m^2: as read; and
+        of several passes less what is the same in all, as it is of kicks."""
+        owner, plane = np.maximum(self.owner, 0), np.arange(self.owner.shape[1]) % 2
+        read = np.where(self.there, passes.readings[:, owner, plane], 0.0)
+        left = np.where(self.there, self.left * passes.sigma[owner, plane], 0.0)
+        count, free = np.maximum(self.there.sum(axis=2), 1), np.maximum(self.freedom, 1)
+        found = []
+        for common in (0.0, 1.0)[: len(read)]:
+            whole, part = (
+                (np.where(self.there, own - common * mean_pass(own, self.there), 0.0) ** 2).sum(2)
+                for own in (read, left)
+            )
+            found.append((part / free, whole / count))
+        parts, wholes = zip(*found, strict=True)
+        return np.stack(parts), np.stack(wholes)
+
+
+def mean_pass(values: Array, there: Flags) -> Array:
+    """Mean over the passes that were read, [...], of values [pass, ...]."""
+    total = np.where(there, values, 0.0).sum(axis=0)
+    return np.asarray(total / np.maximum(there.sum(axis=0), 1))
 
 
 def distance(miss: Array, covariance: Array) -> Array:
@@ -240,9 +273,10 @@ class Sections:
         return made
 
     @cached_property
-    def _made(self) -> tuple[Maps, Maps]:
+    def _made(self) -> tuple[Maps, Maps, Array]:
         """Maps from the start of each section to its monitors [group, monitor], and to its end
-        [group, section]; all sections at once, step by step."""
+        [group, section], all sections at once, step by step; and unit kicks at the monitors,
+        carried back to the start, [monitor, 4, plane]."""
         groups, count = len(self._steps.c0), len(self._bounds)
         first = np.array([start for start, _ in self._bounds])
         length = np.array([end - start for start, end in self._bounds])
@@ -255,22 +289,24 @@ class Sections:
         section = np.concatenate([np.full(len(own), w) for w, own in enumerate(self._members)])
         at = self._exits - first[section]  # steps within the section
         seen = Maps(*(np.zeros_like(c) for c in (reads.c0, reads.c1, reads.c2)))
+        before = np.tile(np.eye(4), (len(at), 1, 1))
         for step in range(int(length.max()) + 1):
             here = np.flatnonzero(at == step)
             if len(here):
                 now = reads[:, here].after(way[:, section[here]])
                 for name in ("c0", "c1", "c2"):
                     getattr(seen, name)[:, here] = getattr(now, name)
+                before[here] = way.c1[0, section[here], :4, :4]
             go = np.flatnonzero(step < length)
             if len(go):
                 moved = steps[:, first[go] + step].after(way[:, go])
                 for name in ("c0", "c1", "c2"):
                     getattr(way, name)[:, go] = getattr(moved, name)
-        return seen, way
+        return seen, way, np.asarray(np.linalg.inv(before)[..., 1::2], dtype=float)
 
     def fit(self, passes: Passes) -> SectionFits:
         """Fit the trajectory of each section to its own readings."""
-        seen, way = self._made
+        seen, way, kicks = self._made
         group = self.group[passes.shot]
         width = max(len(own) for own in self._members)
         owner = np.full((len(self._members), width), -1, dtype=np.int64)
@@ -319,6 +355,13 @@ class Sections:
         covariance = _inverse(curvature)
         end, slope = way[group[:, None], np.arange(W)](x)
         J = slope[..., :4, :4]
+        most = there.sum(axis=(2, 3)).argmax(axis=0), np.arange(W)  # the pass of each section
+        own = np.where(padded[:, :, None, None], kicks[np.where(padded, owner, 0)], 0.0)
+        behind = np.tril(np.ones((width, width)), -1)[:, None, :, None]  # reading, kick
+        kicked = np.einsum("wkpi,wmiq->wkpmq", maps.c1[most][..., :4], own) * behind
+        kicked = kicked.reshape(W, 2 * width, -1) / sigma[most].reshape(W, -1, 1)
+        moved_start = covariance[most] @ np.swapaxes(A[most], -1, -2) @ kicked
+        carried_back = np.moveaxis(own, 1, 2).reshape(W, 4, -1)
         return SectionFits(
             left=left,
             owner=np.repeat(owner, 2, axis=1),
@@ -332,11 +375,14 @@ class Sections:
             energy=np.nan_to_num(by_energy),
             end=end[..., :4],
             carried=J @ covariance @ np.swapaxes(J, -1, -2),
+            kicked=kicked - A[most] @ moved_start,
+            start_kicked=moved_start,
+            end_kicked=J[most] @ (moved_start - carried_back),
         )
 
     def carried(self, launches: Array, shot: Places, turns: int) -> tuple[Array, Array]:
         """Launches [pass, 5] of shots after whole turns, and the slopes [pass, 4, 4]."""
-        _, way = self._made
+        _, way, _ = self._made
         x, J = launches.copy(), np.tile(np.eye(4), (len(launches), 1, 1))
         for _ in range(turns):
             for w in range(len(self._bounds)):

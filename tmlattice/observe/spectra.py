@@ -25,6 +25,7 @@ from tmlattice.errors import TooFewTurnsError, first_of
 from tmlattice.harmonics import MIN_TURNS
 from tmlattice.inference import chi2
 from tmlattice.measurement import TurnByTurn
+from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.line_fit import (
     NARROW,
     WIDEST,
@@ -106,6 +107,7 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
     Source: J. Laskar, Physica D 67 (1993) 257, for NAFF; C. Wang et al., Phys. Rev. ST Accel.
     Beams 6 (2003) 104001, for modes common to all monitors.
     """
+    turns = beam_lost(turns).without
     shots, _, monitors, _ = turns.readings.shape
     place = np.arange(monitors) / monitors if at is None else np.asarray(at, dtype=float)
     signals = np.moveaxis(turns.readings, 1, 3).reshape(shots, 2 * monitors, -1)

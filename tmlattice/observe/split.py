@@ -54,6 +54,9 @@ def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) 
     held, chooses = np.zeros((2, columns), dtype=bool)
     drawn = rng.permutation(columns - 1)
     drawn = drawn[np.argsort(~read[drawn], kind="stable")]  # others validate nothing
+    plane = data.plane[drawn]
+    alone = [np.flatnonzero(read[drawn] & (plane == p))[-1] for p in set(plane[read[drawn]])]
+    drawn = np.append(np.delete(drawn, alone), drawn[alone])  # each plane has one in the fit
     held[drawn[:count]] = True
     chooses[drawn[count : count + inner]] = True
     half = np.zeros((columns, monitors), dtype=bool)

@@ -1,6 +1,7 @@
 """The beta beating, or the first turns, of a ring now and after a correction."""
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
 
 from tmlattice.correction.result import Correction
@@ -29,7 +30,7 @@ def plot_correction(correction: Correction, figure: Figure | None = None) -> Fig
         shown.append((correction.profile[1], AFTER, "expected"))
     for plane, ax in enumerate(axes):
         for values, colour, label in shown:
-            middle, low, high = scale * values[:, plane].T
+            middle, low, high = scale * np.array(values)[:, plane].T
             ax.plot(correction.s, middle, ".-", color=colour, lw=0.9, ms=4, label=label)
             ax.fill_between(correction.s, low, high, color=colour, alpha=0.25, lw=0)
         ax.axhline(0.0, color="k", lw=0.7)

@@ -23,7 +23,7 @@ def plot_weights(
     """Raw change, normalised score and shares of the parts of every layer, and the lattice.
 
     Args:
-        reading: of `read_network` or `read_gradient`.
+        reading: of `read_network`.
         figure: an empty one; else a new one.
         mark: an element to show, such as the true cause.
     """
@@ -35,9 +35,8 @@ def plot_weights(
     )
     ring, split = reading.ring, reading.split
     s = np.array([magnet.s for magnet in ring.magnets])
-    gradient = reading.kind == "gradient"
     raw.vlines(s, 0, reading.raw, color="k", linewidth=0.6)
-    raw.set_ylabel("raw gradient\n[1/m, 1/rad, ...]" if gradient else "raw change\n[m, rad, ...]")
+    raw.set_ylabel("raw change\n[m, rad, ...]")
     score.vlines(s, 0, reading.best, color="tab:red", linewidth=0.6)
     score.set_ylabel("normalised\nscore [sigma]")
     for ax, values in ((raw, reading.raw), (score, reading.best)):
@@ -62,7 +61,7 @@ def plot_weights(
     if largest > 0:
         size.set_yscale("log")
         size.set_ylim(1e-3 * largest, 20 * largest)  # space for the text
-    size.set_ylabel("parts of the\nsteepest step" if gradient else "parts [sigma]")
+    size.set_ylabel("parts [sigma]")
     size.legend(loc="upper right", ncols=3, fontsize="small", markerscale=5, framealpha=0.9)
     share.set_ylim(0, 1)
     share.set_ylabel("share of the\nsquare")
@@ -70,8 +69,7 @@ def plot_weights(
         if mark is not None:
             ax.axvline(ring[mark].s, color="0.4", linestyle=":", linewidth=1, zorder=0)
         ax.grid(alpha=0.25)
-    what = "Gradient of the loss at the design" if gradient else "Weights after fine-tuning"
     dotted = "" if mark is None else f" (dotted: {mark}, s = {ring[mark].s:.1f} m)"
-    raw.set_title(f"{what}, layer by layer{dotted}")
+    raw.set_title(f"Weights after fine-tuning, layer by layer{dotted}")
     lattice_strip(ring, strip)
     return figure

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tmlattice.diagnosis.consequences import Beam, Consequences
+from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, leading, pieces_of
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
@@ -171,7 +172,7 @@ def next_text(diagnosis: Diagnosis) -> str:
     launch = shot.launch
     if launch is None:
         return (
-            f"{KIND_WORDS[shot.kind]} ({shot.minutes:.2g} minutes) would separate '{first}' from "
+            f"{KINDS[shot.kind].words} ({shot.minutes:.2g} minutes) would separate '{first}' from "
             f"'{second}' by {shot.separation:.1f} standard deviations"
             + _enough(shot.separation, "of them")
         )
@@ -186,16 +187,6 @@ def next_text(diagnosis: Diagnosis) -> str:
         f"One more shot, {how}launched at {where}, would separate '{first}' from '{second}' by "
         f"{shot.separation:.1f} standard deviations" + _enough(shot.separation)
     )
-
-
-KIND_WORDS = {
-    "closed_orbit": "A closed orbit",
-    "tunes": "Tunes and chromaticities",
-    "turn_by_turn": "Turns of the stored beam after a kick",
-    "dispersion": "The dispersion",
-    "orbit_response": "An orbit response",
-}
-"""What to measure, as a sentence begins with it."""
 
 
 def _enough(separation: float, what: str = "such shots") -> str:

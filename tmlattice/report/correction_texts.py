@@ -1,5 +1,7 @@
 """Sentences and tables of a correction, for the terminal and the page."""
 
+from math import isfinite
+
 from tmlattice.correction.result import Correction
 from tmlattice.correction.targets import TARGETS
 from tmlattice.report.text import columns, wrapped
@@ -15,7 +17,7 @@ def setting_rows(correction: Correction) -> list[list[str]]:
     rows = [["device", "present", "new", "change", "unit", "limits", "gain"]]
     for setting in correction.settings[:MOST]:
         knob = setting.knob
-        ends = ["" if abs(end) == float("inf") else f"{end:.6g}" for end in (knob.low, knob.high)]
+        ends = [f"{end:.6g}" if isfinite(end) else "" for end in (knob.low, knob.high)]
         limits = " to ".join(ends) if any(ends) else "-"
         rows.append([
             knob.name, f"{knob.present:.6g}", f"{setting.new:.6g}",
@@ -36,7 +38,7 @@ def expected_rows(correction: Correction) -> list[list[str]]:
             then, low, high = correction.after[name][plane]
             reach, data = (values[plane] for values in correction.stays[name])
             shown = [amount(name, value) for value in (now, then, low, high, reach, data)]
-            words = target.words + ("" if name in correction.counted else " (no target)")
+            words = target.words + ("" if name in correction.targets else " (no target)")
             rows.append([words, target.planes[plane], shown[0], shown[1],
                          f"{shown[2]} to {shown[3]}", *shown[4:]])  # fmt: skip
     return rows
@@ -56,9 +58,9 @@ def amount(name: str, value: float) -> str:
 def gain_rows(correction: Correction) -> list[list[str]]:
     """Head and rows of gains: number of devices, expected rms of each target in the worse plane."""
     return [
-        ["devices", *(TARGETS[name].words for name in correction.counted)],
+        ["devices", *(TARGETS[name].words for name in correction.targets)],
         *(
-            [str(n), *(amount(name, max(rms[name])) for name in correction.counted)]
+            [str(n), *(amount(name, max(rms[name])) for name in correction.targets)]
             for n, rms in correction.gains
         ),
     ]

@@ -159,7 +159,7 @@ def correction_page(correction: Correction, folder: Path) -> str:
     from tmlattice import __version__
 
     (picture,) = draw_correction(correction, folder)
-    stated = {"lattice": correction.ring.name, "package": __version__, **correction.provenance}
+    stated = {"package": __version__, **correction.provenance}
     return render(
         "correction.html",
         stated,

@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from tmlattice.correction import Correction
+from tmlattice.correction.result import CODES, FILES, read_correction
+from tmlattice.correction.result import DOCUMENT as CORRECTION
+from tmlattice.correction.result import LATTICE as CORRECTION_LATTICE
 from tmlattice.diagnosis.load import DOCUMENT, LATTICE, load
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.errors import LatticeError
 from tmlattice.files import output_folder, write_json
-from tmlattice.lattice import save_ring
+from tmlattice.lattice import load_ring, save_ring
 from tmlattice.report.correction_texts import correction_text
 from tmlattice.report.page import correction_page, draw, page, pictures_in
 from tmlattice.report.plain import WIDTH, report_text
@@ -26,7 +29,8 @@ def save(diagnosis: Diagnosis, folder: str | PathLike[str]) -> Path:
 
     Args:
         diagnosis: of `diagnose`.
-        folder: made where it is not there; files of these names are replaced, all or none.
+        folder: made where it is not there; files of these names are replaced, all or none, and
+            those of a correction are removed.
 
     Returns:
         The report's path, `report.html`.
@@ -35,7 +39,7 @@ def save(diagnosis: Diagnosis, folder: str | PathLike[str]) -> Path:
         OutputError: it cannot be written.
     """
     place = Path(folder)
-    with output_folder(place) as temporary:
+    with output_folder(place, FILES) as temporary:
         write_files(diagnosis, temporary, diagnosis.as_json())
     return place / "report.html"
 
@@ -58,33 +62,49 @@ def write_files(
         save_ring(diagnosis.ring, folder / LATTICE)
 
 
-def render(path: str | PathLike[str], out: str | PathLike[str] | None = None) -> Diagnosis:
-    """Write report.html and report.txt of a diagnosis.json anew.
+def render(
+    path: str | PathLike[str], out: str | PathLike[str] | None = None
+) -> Diagnosis | Correction:
+    """Write report.html and report.txt of a diagnosis.json anew, with its correction.json; or
+    report.html of a correction.json alone.
 
     Figures of the readings and of the scan are those that the folder holds: diagnosis.json does
     not hold what they show.
 
     Args:
-        path: a folder of `save`, or its diagnosis.json.
+        path: a folder of `save` or `save_correction`, or the JSON file.
         out: the folder to write to; None: the same.
 
     Returns:
-        The diagnosis, see `Diagnosis.load`.
+        The diagnosis, see `Diagnosis.load`; or the correction.
 
     Raises:
         MeasurementError, LatticeError: see `Diagnosis.load`.
         OutputError: it cannot be written.
     """
-    diagnosis = load(Diagnosis, path)
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    alone = (folder / CORRECTION_LATTICE).is_file() and not (folder / DOCUMENT).is_file()
+    diagnosis = None if alone else load(Diagnosis, path)
+    correction = None
+    if (folder / CORRECTION).is_file():
+        ring = diagnosis.ring if diagnosis else load_ring(folder / CORRECTION_LATTICE)
+        correction = read_correction(folder / CORRECTION, ring)
     with output_folder(folder if out is None else Path(out)) as temporary:
-        pictures = draw(diagnosis, temporary)
-        drawn = {picture.name for picture in pictures}
-        pictures += [kept for kept in pictures_in(folder, diagnosis) if kept.name not in drawn]
-        html = page(diagnosis, pictures)
+        if diagnosis is None:
+            assert correction is not None
+            html = correction_page(correction, temporary)
+        else:
+            pictures = draw(diagnosis, temporary, correction)
+            drawn = {picture.name for picture in pictures}
+            pictures += [kept for kept in pictures_in(folder, diagnosis) if kept.name not in drawn]
+            html = page(diagnosis, pictures, correction=correction)
+            text = report_text(diagnosis) + "\n"
+            (temporary / "report.txt").write_text(text, encoding="utf-8")
         (temporary / "report.html").write_text(html, encoding="utf-8")
-        (temporary / "report.txt").write_text(report_text(diagnosis) + "\n", encoding="utf-8")
-    return diagnosis
+    if diagnosis is not None:
+        return diagnosis
+    assert correction is not None
+    return correction
 
 
 def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path:
@@ -110,6 +130,8 @@ def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path
 def write_correction(correction: Correction, folder: Path) -> None:
     """Write the files of `save_correction` into an existing folder."""
     write_settings(correction, folder)
+    with suppress(LatticeError):  # an element that no file holds
+        save_ring(correction.ring, folder / CORRECTION_LATTICE)
     (folder / "report.html").write_text(correction_page(correction, folder), encoding="utf-8")
 
 
@@ -117,6 +139,6 @@ def write_settings(correction: Correction, folder: Path) -> None:
     """Write the settings and the expected result."""
     (folder / "settings.csv").write_text(correction.table(), encoding="utf-8")
     (folder / "correction.txt").write_text(correction_text(correction) + "\n", encoding="utf-8")
-    for name, suffix in (("madx", "madx"), ("at", "at.py"), ("elegant", "ele")):
-        (folder / f"settings.{suffix}").write_text(correction.snippet(name), encoding="utf-8")
-    write_json(folder / "correction.json", correction.as_json())
+    for code, name in CODES.items():
+        (folder / name).write_text(correction.snippet(code), encoding="utf-8")
+    write_json(folder / CORRECTION, correction.as_json())

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from tmlattice.diagnosis.data_checks import check_data
-from tmlattice.diagnosis.families.steps import STEPS, CorrectorCalibration, Trial
-from tmlattice.diagnosis.response import first_guess, stepwise
+from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response import first_guess
 from tmlattice.diagnosis.response.state import begin, bend
-from tmlattice.diagnosis.response.stepwise import fit_steps, one_by_one
-from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine.response import simulate_response
+from tmlattice.observe.compared import ANOTHER, OfResponse
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_errors import ANOTHER, ResponseGlobalErrors
 from tmlattice.observe.split import split_columns
 
 NOISE = 2e-8
@@ -57,7 +56,7 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
 def test_a_far_lattice_is_no_wrong_sign_and_no_other_ring(small_ring):
     """ALS with 3 % on its largest family: y was said to be reversed, or the ring to be another."""
     data = measured(small_ring, 0.02, 0.06)
-    assert ResponseGlobalErrors(small_ring, data).misfit(()).max() > ANOTHER
+    assert OfResponse(small_ring, data).misfit().max() > ANOTHER
     (check,) = check_data(small_ring, data).reported
     assert check.status == "note"
     assert "is far from the ring that was measured" in check.sentence
@@ -89,39 +88,8 @@ def test_units_are_asked_of_a_far_lattice_too(small_ring, change, said):
     assert said in error.sentence
 
 
-def test_magnets_of_no_family_begin_there_too(small_ring):
-    """Families alone had led single magnets back to nothing, and every round astray."""
-    design = begun(small_ring, measured(small_ring, -0.03))
-    alone = Trial((CorrectorCalibration(),), 3, 0)
-    assert first_guess.begun(design, [alone]) is design
-    near = first_guess.begun(design, [alone, STEPS[2]])
-    (_, state), *_ = one_by_one(near, [alone])
-    assert state.values["gradient"].any()
-    assert score(state, state.split.held).in_plane < 2 * NOISE
-
-
 def test_a_near_design_is_where_the_fit_begins(small_ring):
     assert first_guess.first_guess(begun(small_ring, measured(small_ring, 0.005))) is None
-
-
-def test_a_result_further_off_than_the_design_is_none(small_ring, monkeypatch):
-    """SPEAR3 with 3 % on its main quadrupoles: 404 um, and 572 after the fit."""
-    design = begun(small_ring, measured(small_ring, 0.0))
-    astray = [Cause("quadrupole_gradient", e.name, 0.02) for e in small_ring.elements
-              if e.kind == "quadrupole"]  # fmt: skip
-    settled = stepwise.robust
-
-    def spoilt(state):
-        state = settled(state)
-        at = state.at.with_causes(astray)
-        return stepwise.replace(state, at=at, values={k: 0 * v for k, v in state.values.items()})
-
-    monkeypatch.setattr(stepwise, "robust", spoilt)
-    monkeypatch.setattr(stepwise, "settle", lambda state, *args, **options: state)
-    fit = fit_steps(design.data, design.split, STEPS[:1])
-    assert len(fit.steps) == 1
-    assert "the fit diverged: the residual of its own readings" in fit.messages[-1]
-    assert fit.heldout[0] == fit.heldout[1]
 
 
 def test_a_design_that_stores_no_beam_with_a_step_keeps_what_it_has(small_ring):

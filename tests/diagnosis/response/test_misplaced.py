@@ -14,7 +14,7 @@ from tmlattice.diagnosis.response.misplaced import misplaced, moved_text
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.effects import Cause
-from tmlattice.lattice.json_file import save_ring
+from tmlattice.lattice import save_ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns

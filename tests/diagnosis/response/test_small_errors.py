@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.strategy import outlier
+from tmlattice.diagnosis.selection import outlier
 from tmlattice.effects import CATALOGUE, Cause
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine import simulate
 
 ALL = {"all": None}
@@ -70,10 +71,10 @@ def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_rin
 def test_no_outlier_where_all_of_a_family_or_all_families_are_large():
     sizes = {"corrector_calibration": 0.04, "corrector_roll": 0.01}
     far = [Cause("corrector_calibration", name, a) for name, a in (("h1", 0.3), ("h2", -0.02))]
-    assert outlier(far, sizes) == far[0]
+    assert outlier(far, sizes, DEFAULT) == far[0]
     more = [Cause("corrector_calibration", name, a) for name, a in (("h3", 0.32), ("h4", -0.35))]
-    assert outlier([far[0], *more], sizes) is None
-    assert outlier(far, {name: 5 * size for name, size in sizes.items()}) is None
+    assert outlier([far[0], *more], sizes, DEFAULT) is None
+    assert outlier(far, {name: 5 * size for name, size in sizes.items()}, DEFAULT) is None
 
 
 def test_small_errors_alone_are_no_fault_and_have_their_sizes(small_ring):

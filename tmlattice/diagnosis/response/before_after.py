@@ -150,6 +150,7 @@ def diagnose_change(
             verdict=least_certain(found, fit.verdict),
             findings=with_consequences(there, found, causes),
             warnings=(*messages, *fit.messages),
+            covariance=fit.covariance,
             noise_estimated=False,
             provenance=provenance(ring, options, seed, started),
         )  # fmt: skip

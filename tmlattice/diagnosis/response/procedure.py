@@ -140,7 +140,7 @@ def diagnose_response(
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
         fit, found, supports, degenerate, correlated = sparse.fit, sparse.fitted_causes, (), (), ()
-        covariance = None
+        covariance = sparse.covariance
         verdict, findings = sparse.verdict, sparse.findings
     rows = tuple(weigh(fit.state, progress=progress)) if missing else None
     options = {

@@ -33,6 +33,7 @@ from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.split import Split
 
+Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 MOST = 3
@@ -74,6 +75,7 @@ class SparseFit:
         findings: by falling statistic.
         verdict: the least certain of theirs.
         fitted_causes: the causes with their errors.
+        covariance: of these errors, [cause, cause].
         messages: about the findings.
         noise: whether the residual is noise of the stated size, neither more nor less, in each of
             its blocks.
@@ -83,6 +85,7 @@ class SparseFit:
     findings: tuple[Finding, ...]
     verdict: str
     fitted_causes: list[StatedCause]
+    covariance: Array
     messages: tuple[str, ...]
     noise: bool
 
@@ -316,9 +319,10 @@ def _result(
         name = f"{cause.effect} {cause.element or ''}".rstrip()
         steps.append(Step.scored(name, 1, score(state, split.held)))
     heldout = (score(design, split.held), score(state, split.held))
-    errors = np.sqrt(np.maximum(np.diag(found.fit.covariance), 0.0)).tolist()
+    covariance = found.fit.covariance
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     stepwise = StepwiseFit(design, state, tuple(steps), (), heldout)
     fitted_causes = list(zip(causes, errors, strict=True))
     expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
     noise = expected and stepwise.p_value >= judgement.noise[0]
-    return SparseFit(stepwise, findings[:most], verdict, fitted_causes, messages, noise)
+    return SparseFit(stepwise, findings[:most], verdict, fitted_causes, covariance, messages, noise)

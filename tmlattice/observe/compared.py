@@ -1,0 +1,380 @@
+"""Global errors of data that are compared with the design's, column by column.
+
+>>> search = compared(ring, measured)
+>>> search.verdict()
+
+An orbit response, orbit changes, dispersion and betatron lines are the design's to a tenth or so,
+tunes to a few hundredths. A wrong sign, unit or order of all readings makes nearly all columns
+unrelated to the design. A single bad corrector is one column, a single bad BPM a small part of all.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.effects import modelled
+from tmlattice.errors import MeasurementError
+from tmlattice.lattice import Ring
+from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, TuneReading, TurnByTurn
+from tmlattice.measurement.assume import assume, read_of
+from tmlattice.measurement.shots import FEWEST
+from tmlattice.observe.global_errors import Names, Search, Verdict
+from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.response_data import read as read_rf
+from tmlattice.observe.sections import mean_pass
+from tmlattice.observe.steady import NOTHING
+from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
+from tmlattice.optics import ring_tunes
+
+Array = NDArray[np.float64]
+
+USUAL = 0.01
+"""Mean square misfit of a column by usual errors, relative to the column: a tenth squared."""
+GAIN = 2.5
+"""Mean fall of the log misfit that the changed columns need."""
+OF_RF = 1.4
+"""The same for the RF's one orbit, whose size follows from the ring's length."""
+UNRELATED, RESEMBLING = 1.5, 0.5
+"""Or: typical misfits before and after, of columns that were unrelated and now resemble the
+design."""
+SCALES, NEAR, SIMILAR = {"kicks-doubled": 2.0, "kicks-halved": 0.5}, 0.15, 0.8
+"""Or: ratio of the typical column to the design's, tolerance of its logarithm, and smallest
+correlation with the design."""
+SEEN = 1e-3
+"""Smallest share of the design's square at the monitors that read a column."""
+SHARE = 0.8
+"""Share of the changed columns that an assumption must improve."""
+ANOTHER = 1.0
+"""Misfit of the typical column above which the data are of another ring."""
+TUNE = 0.1
+"""Distance of a tune from the design's that counts as a misfit of 1; usual errors leave a third."""
+TINY = 1e-6
+"""Relative RF step used in place of a step of 1."""
+
+
+@dataclass(frozen=True)
+class Compared(Search):
+    """Search for global errors of one measurement.
+
+    Attributes:
+        what: a column.
+        least: columns that an assumption must change, at least.
+    """
+
+    what: ClassVar[str]
+    least: ClassVar[int] = 1
+
+    @property
+    def of(self) -> str:
+        """What `shown` shows."""
+        return f"the typical {self.what} differs from the design's by"
+
+    def shown(self, misfit: float) -> str:
+        """A misfit for a sentence."""
+        return f"{100 * np.sqrt(misfit):.0f} % of its size"
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Data that could not be used; a sentence each."""
+        return ()
+
+    @property
+    def tunes(self) -> Sequence[str]:
+        """The measured tunes, if there are any; a sentence."""
+        return ()
+
+    def misfit(self, names: Names = ()) -> Array:
+        """Misfit of each column: |measured - design|^2 over the mean of both squares, beyond the
+        noise. 0: equal, 2: unrelated, 4: wrong sign, NaN: no reading of what the design does."""
+        read, made, noise = (np.asarray(own) for own in self.pairs(self.assumed(names)))
+        there, flat = np.isfinite(read), (len(read), -1)
+        a, b = (np.where(there, own, 0.0).reshape(flat) for own in (read, made))
+        square, own = ((np.abs(values) ** 2).sum(axis=1) for values in (a, b))
+        left = (np.abs(a - b) ** 2).sum(axis=1) - np.where(there, noise, 0.0).reshape(flat).sum(1)
+        size = (square + own) / 2
+        whole = (np.abs(made.reshape(flat)) ** 2).sum(axis=1)
+        seen = (size > 0) & (own > SEEN * whole)
+        return np.where(seen, np.maximum(left, 0.0) / np.where(seen, size, 1.0), np.nan)
+
+    @abstractmethod
+    def pairs(self, data: Any) -> tuple[Any, Any, Any]:
+        """Columns as read, and as the design makes them, [column, monitor, 2], and the squares of
+        the noise of their difference."""
+
+    def judged(self) -> list[Verdict]:
+        """Return the assumptions that improve the data far."""
+        stated = self.misfit()
+        found = []
+        for names in self.candidates():
+            other, of_rf = self.misfit(names), names[0].startswith("rf")
+            change = np.log((other + USUAL) / (stated + USUAL))
+            moved = np.abs(np.nan_to_num(change)) > np.log(2.0)
+            few = moved.sum() < (1 if of_rf else self.least)
+            if few or (change[moved] < 0).mean() < SHARE:
+                continue
+            gain = -float(change[moved].sum())
+            before, after = (float(np.median(own[moved])) for own in (stated, other))
+            corrected = before > UNRELATED and after < RESEMBLING
+            if names[0] in SCALES:  # common to all correctors, whatever other errors
+                corrected |= abs(np.log(self.scale() / SCALES[names[0]])) < NEAR
+            if corrected or gain > (OF_RF if of_rf else GAIN) * moved.sum():
+                found.append(Verdict(names, gain, before, after, self.of))
+        return found
+
+    def corrected(self, names: Names) -> Self:
+        """Return the search with assumptions corrected in the data."""
+        return replace(self, data=self.assumed(names))
+
+    def scale(self) -> float:
+        """Ratio of the typical column to the design's; NaN if they are unrelated."""
+        return ratio(*self.pairs(self.data)[:2])
+
+
+def ratio(read: Array, made: Array) -> float:
+    """Ratio of the typical column [column, monitor, 2] to the design's; NaN if unrelated."""
+    there = np.isfinite(read)
+    a, b = (np.where(there, own, 0.0) for own in (read, made))
+    both, own, design = ((u * v).sum(axis=(1, 2)) for u, v in ((a, b), (a, a), (b, b)))
+    seen = (own > 0) & (design > 0)
+    if not seen.any():
+        return float("nan")
+    alike = float(np.median(both[seen] / np.sqrt(own[seen] * design[seen])))
+    return float(np.median(both[seen] / design[seen])) if abs(alike) > SIMILAR else float("nan")
+
+
+@dataclass(frozen=True)
+class OfResponse(Compared):
+    """Orbit changes by correctors, the RF's last; a single bad corrector is no global error."""
+
+    what: ClassVar[str] = "column"
+    least: ClassVar[int] = 2
+
+    @property
+    def stepped(self) -> bool:
+        """Whether there is an orbit of the RF's step."""
+        rf = self.data.rf
+        return rf is not None and rf.orbit is not None
+
+    @cached_property
+    def design(self) -> tuple[Array, Array]:
+        """Response to steps of one [corrector, monitor, 2], and to a relative RF step of one."""
+        data, model = self.data, ResponseModel(self.ring, 6 if self.stepped else 4)
+        columns = model.columns(data.correctors)
+        for name, plane, own in zip(data.correctors, data.planes, columns.planes, strict=True):
+            if plane != own:
+                raise MeasurementError(
+                    f"corrector '{name}' is stated to kick in {plane}; the ring's kicks in {own}"
+                )
+        order = {name: i for i, name in enumerate(model.monitors)}
+        at = [order[self.ring[name].name] for name in data.monitors]
+        of_rf = model.rf_change(TINY)[at] / TINY if self.stepped else np.zeros((len(at), 2))
+        return np.asarray(model.response(data.correctors))[:, at], of_rf
+
+    def pairs(self, data: OrbitResponse) -> tuple[Any, Any, Any]:
+        """See `Compared`."""
+        unit, of_rf = self.design
+        read, made = [*data.response], [*(data.kicks[:, None, None] * unit)]
+        if data.rf is not None and data.rf.orbit is not None:
+            read.append(data.rf.orbit)
+            made.append(of_rf * (data.rf.step / data.rf.frequency))
+        return np.array(read), np.array(made), 0.0
+
+    def scale(self) -> float:
+        """Ratio of the typical corrector's column to the design's; NaN if they are unrelated."""
+        read, made, _ = self.pairs(replace(self.data, rf=None))
+        return ratio(read, made)
+
+    def rf_scale(self) -> float:
+        """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
+        if not self.stepped or not read_rf(self.data):
+            return float("nan")
+        read, made, _ = self.pairs(self.data)
+        return ratio(read[-1:], made[-1:])
+
+    def candidates(self) -> list[Names]:
+        """Return the assumptions that these data allow."""
+        return [own for own in super().candidates() if self.stepped or own[0][:3] != "rf-"]
+
+
+@dataclass(frozen=True)
+class OfOrbits(Compared):
+    """Changes of closed orbits between settings, or with the RF frequency."""
+
+    what: ClassVar[str] = "orbit change"
+    data: ClosedOrbit | Dispersion
+
+    @cached_property
+    def _designs(self) -> dict[str, Array]:
+        return {}
+
+    def design(self, data: ClosedOrbit | Dispersion) -> Array:
+        """Orbits [state, monitor, 2] of the design in the states of the data."""
+        own: Any = self.data
+        make: Any = closed_orbits
+        if isinstance(data, Dispersion):
+            make, pairs = dispersion, zip(own.steps, data.steps, strict=True)
+            own = replace(own, steps=tuple(replace(a, step=b.step) for a, b in pairs))
+        else:
+            own = replace(own, settings=data.settings)
+        key = repr([step.step for step in own.steps] if make is dispersion else own.settings)
+        if key not in self._designs:
+            problem = make(self.ring, own, dict.fromkeys(modelled(), 1.0))
+            order = {name: i for i, name in enumerate(self.monitors)}
+            at = [order[self.ring[name].name] for name in data.monitors]
+            self._designs[key] = problem.read(problem.view(()), NOTHING)[:, at]
+        return self._designs[key]
+
+    def pairs(self, data: ClosedOrbit | Dispersion) -> tuple[Any, Any, Any]:
+        """See `Compared`. One orbit is the sum of all errors, and has no change."""
+        read, made = read_of(data), self.design(data)
+        if isinstance(data, ClosedOrbit):
+            if not any(data.settings):
+                return np.full_like(read, np.nan), made, 0.0
+            there = np.isfinite(read)
+            read, made = (own - mean_pass(own, there) for own in (read, made))
+        noise = np.zeros(2) if data.noise is None else np.nan_to_num(data.noise)
+        return read, made, 2 * np.broadcast_to(noise, read.shape) ** 2
+
+    def candidates(self) -> list[Names]:
+        """Return the assumptions that these data allow."""
+        kicked = any("kick" in own for shot in getattr(self.data, "settings", ())
+                     for own in shot.values())  # fmt: skip
+        return [own for own in super().candidates() if kicked or own[0][:8] != "settings"]
+
+
+@dataclass(frozen=True)
+class OfLines(Compared):
+    """Betatron lines of turns; each is known up to one complex factor."""
+
+    what: ClassVar[str] = "line"
+    first: ManyTurns | None = None
+
+    @cached_property
+    def problem(self) -> ManyTurns:
+        """The lines of the turns.
+
+        Raises:
+            MeasurementError: no line can be used.
+        """
+        return self.first or self._lines(self.data)
+
+    def _lines(self, data: TurnByTurn) -> ManyTurns:
+        return many_turns(self.ring, data, dict.fromkeys(modelled(turns=True), 1.0))
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Data that could not be used; a sentence each."""
+        return self.problem.warnings
+
+    @property
+    def tunes(self) -> Sequence[str]:
+        """The measured tunes; a sentence."""
+        values, used = self.problem.values[:, -2:], self.problem.used[:, -2:]
+        measured = ", ".join(
+            f"Q{'xy'[mode]} = {np.mean(values[used[:, mode], mode]) % 1:.4f}"
+            for mode in (0, 1) if used[:, mode].any()
+        )  # fmt: skip
+        return [f"{measured}, near to those of '{self.ring.name}'"]
+
+    def corrected(self, names: Names) -> Self:
+        """Return the search with assumptions corrected in the data."""
+        return replace(self, data=self.assumed(names), first=None)
+
+    def misfit(self, names: Names = ()) -> Array:
+        """See `Compared`; [shot * mode]. The lines are found once, but with planes exchanged, as
+        each is sought in its own plane."""
+        problem, change = self.problem, self._changed(names)
+        if "planes-exchanged" in names:
+            try:
+                problem, change = self._lines(self.assumed(names)), self._changed(())
+            except MeasurementError:
+                return np.full(1, np.nan)
+        both = np.where(problem.used[:, :LINES], problem.values[:, :LINES], np.nan)
+        own = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
+        read = np.moveaxis(own[..., 0] + 1j * own[..., 1], -1, 1)[:, :, change]
+        if "turns-backwards" in names:
+            read = read.conj()
+        made = np.stack([np.moveaxis(b.shown.modes, -1, 0) for b in problem.view(()).beams])
+        a, b = (np.where(np.isfinite(read), values, 0.0) for values in (read, made))
+        inner, size = np.abs((b.conj() * a).sum(axis=(2, 3))) ** 2, self._size(a) * self._size(b)
+        left = 1 - inner / np.where(size > 0, size, 1.0)
+        return np.where(size > 0, 2 * left, np.nan).ravel()
+
+    @staticmethod
+    def _size(lines: NDArray[np.complex128]) -> Array:
+        return np.asarray((np.abs(lines) ** 2).sum(axis=(2, 3)))
+
+    def _changed(self, names: Names) -> NDArray[np.intp]:
+        """Which of the ring's monitors each of them reads with assumptions corrected."""
+        count = len(self.data.monitors)
+        each = np.broadcast_to(np.arange(count)[:, None], (1, FEWEST, count, 2)).astype(float)
+        places = replace(self.data, readings=each, noise=None, settings=(), shots=(0,))
+        order = {name: i for i, name in enumerate(self.monitors)}
+        at = np.array([order[self.ring[name].name] for name in self.data.monitors])
+        found = np.arange(len(self.monitors))
+        found[at] = at[assume(places, names, self.monitors).readings[0, 0, :, 0].astype(int)]
+        return found
+
+    def pairs(self, data: TurnByTurn) -> tuple[Any, Any, Any]:
+        """See `Compared`."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class OfTunes(Compared):
+    """Tunes of all shots, against the design's."""
+
+    what: ClassVar[str] = "tune"
+
+    @cached_property
+    def design(self) -> Array:
+        """Tunes of the ring.
+
+        Raises:
+            MeasurementError: it has none.
+        """
+        own = ring_tunes(self.ring)
+        if own is None:
+            raise MeasurementError(f"'{self.ring.name}' has no tune: its design is unstable")
+        return np.array(own)
+
+    def shown(self, misfit: float) -> str:
+        """A misfit for a sentence."""
+        return f"{TUNE * np.sqrt(misfit):.4f}"
+
+    @property
+    def tunes(self) -> Sequence[str]:
+        """The measured tunes; a sentence."""
+        (x, y), (qx, qy) = np.nanmedian(self.data.tune % 1, axis=0), self.design
+        return [f"Qx = {x:.4f}, Qy = {y:.4f}; '{self.ring.name}' has {qx:.4f} and {qy:.4f}"]
+
+    def misfit(self, names: Names = ()) -> Array:
+        """Square of the larger distance from the design's, in units of `TUNE`, [1]."""
+        read = np.nanmedian(self.assumed(names).tune % 1, axis=0)
+        apart = np.abs((read - self.design + 0.5) % 1 - 0.5)
+        return np.array([np.nanmax(apart) ** 2 / TUNE**2])
+
+    def pairs(self, data: TuneReading) -> tuple[Any, Any, Any]:
+        """See `Compared`."""
+        raise NotImplementedError
+
+
+def compared(ring: Ring, data: Any, lines: ManyTurns | None = None) -> Compared:
+    """Return the search for global errors of a measurement.
+
+    Args:
+        ring: the design.
+        data: any but first turns; its monitors those of the ring.
+        lines: of turns, if they are known.
+    """
+    if isinstance(data, TurnByTurn):
+        return OfLines(ring, data, lines)
+    if isinstance(data, TuneReading):
+        return OfTunes(ring, data)
+    return OfResponse(ring, data) if isinstance(data, OrbitResponse) else OfOrbits(ring, data)
