@@ -159,6 +159,9 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
             left.append(point.chi2)
             continue
         point = problem.at(there, others.nuisances, others.kicks)
+        if point.lost:
+            left.append(np.inf)
+            continue
         clean = others.projection.out(np.nan_to_num(point.residual, nan=1e3))
         left.append(float(clean @ clean))
     return causes[int(np.argmin(left))]
