@@ -278,7 +278,7 @@ _LEAVES_MORE = tuple(f"remainder_{name}" for name in _UNEXPLAINED)
 STATEMENTS = (
     Statement(
         "verdict", "no_change",
-        "verdict nothing; the findings are changes since a reference; the remainder is noise or "
+        "verdict none; the findings are changes since a reference; the remainder is noise or "
         "cannot be tested",
         lambda own: own.verdict == "none" and own.change
         and own.remainder not in _UNEXPLAINED,
@@ -288,7 +288,7 @@ STATEMENTS = (
     ),
     Statement(
         "verdict", "change_not_located",
-        "verdict nothing; the findings are changes since a reference; the remainder is larger than "
+        "verdict none; the findings are changes since a reference; the remainder is larger than "
         "the noise",
         lambda own: own.verdict == "none" and own.change and own.remainder in _UNEXPLAINED,
         lambda own: "No change since the reference is localised, but drifts do not explain all "
@@ -297,7 +297,7 @@ STATEMENTS = (
     ),
     Statement(
         "verdict", "no_error",
-        "verdict nothing, no reference; the remainder is noise or cannot be tested",
+        "verdict none, no reference; the remainder is noise or cannot be tested",
         lambda own: own.verdict == "none" and not own.change
         and own.remainder not in _UNEXPLAINED,
         lambda own: f"No error is detected: the {own.model} explains the readings within "
@@ -306,7 +306,7 @@ STATEMENTS = (
     ),
     Statement(
         "verdict", "not_located",
-        "verdict nothing, no reference; the remainder is larger than the noise",
+        "verdict none, no reference; the remainder is larger than the noise",
         lambda own: own.verdict == "none" and not own.change and own.remainder in _UNEXPLAINED,
         lambda own: f"No error is localised, but the {own.model} does not explain all readings "
         "within their noise.",
