@@ -45,7 +45,7 @@ ERRORS = 4.0
 """Stated errors that an amount may be from the truth."""
 PULLS = 2.0
 """Largest rms of the misses of fitted small errors over their stated errors."""
-FALLS = 0.5
+FALLS = 0.6
 """Share of the residual of held-out correctors that small errors which are fitted may leave."""
 NOISE = 3.0
 """Chi-square of a reading below which that residual is noise."""

@@ -611,14 +611,14 @@ def posterior(
     names, belongs = families_of(known)
     amounts = stored = known.amounts if linearised_at is None else linearised_at
     nuisances, errors, usual = problem.first, dict[str, float](), known.rms
-    for _ in range(LINEARISATIONS):
+    for left in reversed(range(LINEARISATIONS)):
         inner, point, amounts = linearise(problem, known, amounts, stored, (), nuisances)
         assert point.projection is not None
         stored, nuisances = amounts, point.nuisances
         keep = sampled_rows(len(point.residual))
         sums = sums_at(inner, point, known, amounts, keep)
         beyond = amounts - known.amounts
-        if learn:
+        if learn and not left:
             found = components_of_rows(
                 point.residual[keep] + beyond @ sums.some, point.projection.matrix()[keep],
                 known.correlated(known.rms[:, None] * sums.some), belongs,
