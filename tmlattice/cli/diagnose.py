@@ -131,9 +131,9 @@ def diagnose(
     MEASUREMENT is a folder, as `tmlattice simulate` writes it: first turns, turns of a stored beam,
     a closed orbit, dispersion, tunes, an orbit response; or a control room's file of first turns
     (.csv, .txt, .h5, .sdds), whose columns are recognised; the assumptions are printed. Several
-    measurements of one machine are diagnosed together. The verdict is one of identified,
-    ambiguous (several explanations fit alike), localised (an error that the catalogue does not
-    explain), distributed (no single place) and none; the exit code is 0 for each of them. The diagnosis of
+    measurements of one machine are diagnosed together. The verdict is one of identified, ambiguous
+    (several explanations fit alike), localised (an error that the catalogue does not explain),
+    distributed (no single place) and none; the exit code is 0 for each of them. The diagnosis of
     an orbit response alone has a step for each family of errors; options about launches do not
     apply to it.
     """
