@@ -138,7 +138,7 @@ def test_what_the_network_does_not_have_is_refused(tiny):
     ):
         with pytest.raises(TmlatticeError, match=message):
             simulate_turns(tiny, **options, engine="network", turns=20)
-    with pytest.raises(TmlatticeError, match="no engine 'ocelot' here; there are at and network"):
+    with pytest.raises(TmlatticeError, match="no engine 'ocelot'; there are at and network"):
         simulate_turns(tiny, engine="ocelot", turns=20)
 
 

@@ -140,7 +140,7 @@ def check_engine(name: str, known: Sequence[str] = ENGINES) -> None:
         TmlatticeError: it is unknown.
     """
     if name not in known:
-        raise TmlatticeError(f"no engine '{name}' here; there are {' and '.join(known)}")
+        raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(known)}")
 
 
 def _engine(name: str, ring: Ring, causes: Sequence[Cause], radiation: bool) -> Engine:
