@@ -156,8 +156,8 @@ def test_a_scale_that_fell_is_found_again(rng):
     assert_allclose(found, found[1], rtol=0.15)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_gains_come_in_with_any_seed(small_ring, seed):
+@pytest.mark.parametrize("seed", [0, 1])
+def test_gains_of_little_information_come_in(small_ring, seed):
     """Gains of 10 % and gradients of 1 % in readings that tell little of each: nothing was kept
     with most seeds, for the gains' size had fallen to nothing before the gradients came in."""
     rng = np.random.default_rng(5)
