@@ -23,7 +23,7 @@ from tmlattice.effects import (
 from tmlattice.effects.build import Build
 from tmlattice.errors import EffectError, LatticeError, UnknownNameError
 from tmlattice.machine.at_elements import Builder
-from tmlattice.machine.at_engine import AtEngine, to_at
+from tmlattice.machine.at_engine import AtEngine, from_at, to_at
 
 LAUNCH = np.array([1.1e-3, 2e-4, -0.7e-3, 1e-4, 0.0, 0.0])
 TOUCHED = set()
@@ -544,6 +544,7 @@ def test_momentum_of_at_and_ocelot():
     momentum = np.sqrt(gamma**2 - 1)
     p = (gamma[1] - gamma[0]) / momentum[0]
     state = to_at([1e-3, 2e-3, 3e-3, 4e-3, 5e-3, p], 5e-3)
+    np.testing.assert_allclose(from_at(state, 5e-3), [1e-3, 2e-3, 3e-3, 4e-3, 5e-3, p], rtol=1e-12)
     expected = [
         1e-3,
         2e-3,

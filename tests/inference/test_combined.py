@@ -9,15 +9,18 @@ from numpy.testing import assert_allclose
 from tmlattice import Cause, simulate
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.prepare import prepare
-from tmlattice.effects import apply, background_rms, find, monitors_with
+from tmlattice.effects import apply, background_rms, find, modelled, monitors_with
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import distributed
+from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
+from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.measurement import ClosedOrbit
 from tmlattice.observe.orbits import closed_orbits
+from tmlattice.observe.turn_by_turn import many_turns
 
 WEAK = Cause("quadrupole_gradient", "QD::3", -0.02)
 NOISE = 1e-6
@@ -155,3 +158,16 @@ def test_small_errors_that_need_a_cause_to_store_a_beam_are_a_sentence(small_rin
     monkeypatch.setattr(distributed, "fit", lost)
     with pytest.raises(UnstableRingError, match="no orbit with distributed errors"):
         fit_distributed_errors(problem, DistributedErrors.usual(everywhere, usual), problem.first)
+
+
+def test_a_start_at_which_no_beam_is_stored_is_none(small_ring):
+    fault = Cause("family_gradient", "QF", 0.01)
+    measured = simulate_turns(small_ring, [fault], turns=64, noise=1e-6, seed=1).measured
+    turns = many_turns(small_ring, measured, dict.fromkeys(modelled(turns=True), 1.0))
+    problem = CombinedProblem.of([turns])
+    nuisances = fit(problem, (), problem.first)
+    largest = find("family_gradient").largest
+    unstable = replace(fault, amount=-0.5 * largest)
+    assert problem.at((unstable,), nuisances.nuisances).lost
+    found = best_start(problem, nuisances, ("family_gradient", "QF"))
+    assert found.amount == pytest.approx(fault.amount)  # of shares of the largest

@@ -13,11 +13,16 @@ APERTURE = 1.0
 """m and rad: far outside any beam pipe, where second-order maps are meaningless."""
 
 
+def bounded(n: int) -> list[int]:
+    """Coordinates of n that the aperture bounds: not tau, the fifth of six, as the delay of a
+    particle grows turn by turn without RF."""
+    return [i for i in range(n) if i != 4]
+
+
 def lost(states: Array) -> NDArray[np.bool_]:
-    """Whether states [..., n] are outside the aperture, or NaN, [...]. It does not bound tau, the
-    fifth of six coordinates: without RF the delay of a particle grows turn by turn."""
-    bounded = [i for i in range(states.shape[-1]) if i != 4]
-    return np.asarray(~np.all(np.abs(states[..., bounded]) < APERTURE, axis=-1))
+    """Whether states [..., n] are outside the aperture, or NaN, [...]."""
+    inside = np.abs(states[..., bounded(states.shape[-1])]) < APERTURE
+    return np.asarray(~np.all(inside, axis=-1))
 
 
 def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) -> None:

@@ -261,9 +261,7 @@ class AtEngine:
         """Return readings of the first state of [6, shot]; all are moved to the line's end."""
         return np.asarray(self.run(line, beam.T, 1, beam)[0, 0])
 
-    def centroids(
-        self, line: list[Any], beam: Array, turns: int, first: int = 0
-    ) -> Iterator[tuple[Array, Array]]:
+    def centroids(self, line: list[Any], beam: Array, turns: int) -> Iterator[tuple[Array, Array]]:
         """Yield of each turn the mean of the particles, [monitor, 2], and their part that is not
         lost, [monitor].
 
@@ -271,11 +269,10 @@ class AtEngine:
             line: of `stored_line`.
             beam: the particles, [6, particle]; they are moved.
             turns: number of turns.
-            first: number of the first one.
         """
         block = max(TURNS_AT_ONCE // (beam.shape[1] * len(self._monitors)), 1)
         for turn in range(0, turns, block):
-            seen = self.run(line, beam.T, min(block, turns - turn), beam, first + turn)
+            seen = self.run(line, beam.T, min(block, turns - turn), beam, turn)
             alive = np.isfinite(seen[..., 0]).mean(axis=0)
             mean = np.nansum(seen, axis=0) / np.maximum(alive * len(seen), 1)[..., None]
             yield from zip(mean, alive, strict=True)
@@ -384,6 +381,19 @@ def to_at(launches: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> 
     converted = launches[..., SWAPPED].copy()
     converted[..., 4] = np.sqrt(total**2 - rest**2) / reference - 1
     converted[..., 5] *= reference / (energy * 1e9)
+    return converted
+
+
+def from_at(states: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> Array:
+    """Return OCELOT's coordinates of AT's: the inverse of `to_at`."""
+    states = np.asarray(states, dtype=float)
+    rest = 1e9 * mass
+    reference = np.sqrt((energy * 1e9) ** 2 - rest**2)
+    converted = states[..., SWAPPED].copy()
+    converted[..., 4] *= energy * 1e9 / reference
+    converted[..., 5] = (
+        np.hypot(reference * (1 + states[..., 4]), rest) - energy * 1e9
+    ) / reference
     return converted
 
 

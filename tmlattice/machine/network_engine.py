@@ -14,7 +14,7 @@ from tmlattice.beam.rf import cavities, rf_of
 from tmlattice.effects import Cause, Settings, apply
 from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.lattice import Ring
-from tmlattice.machine.at_elements import SWAPPED
+from tmlattice.machine.at_engine import from_at, to_at
 
 Array = NDArray[np.float64]
 
@@ -59,12 +59,10 @@ class NetworkEngine:
     def one_pass(self, rf: Any, beam: Array) -> Array:
         """Return readings of the first state of [6, shot]; all are moved to the turn's end."""
         state, readings = self._moved(self._state(beam), rf)
-        beam[:] = self._beam(state)
+        beam[:] = to_at(state.cpu().numpy(), self.ring.energy, self.ring.mass).T
         return np.asarray(readings[0].cpu().numpy())
 
-    def centroids(
-        self, rf: Any, beam: Array, turns: int, first: int = 0
-    ) -> Iterator[tuple[Array, Array]]:
+    def centroids(self, rf: Any, beam: Array, turns: int) -> Iterator[tuple[Array, Array]]:
         """See `AtEngine.centroids`; on the card nothing but the centroid leaves it."""
         state = self._state(beam)
         for _ in range(turns):
@@ -74,7 +72,7 @@ class NetworkEngine:
             yield mean.cpu().numpy(), seen.double().mean(dim=0).cpu().numpy()
 
     def _moved(self, state: Any, rf: bool) -> tuple[Any, Any]:
-        """States and readings after a turn, and the RF at its end; infinite where lost."""
+        """States and readings after a turn, and the RF at its end; NaN where lost."""
         readings, state = self._network.one_turn(state)
         if rf:
             crest, phase, wave, _ = self._rf
@@ -82,25 +80,5 @@ class NetworkEngine:
         return state, readings
 
     def _state(self, beam: Array) -> Any:
-        """OCELOT's (x, px, y, py, tau, p) of AT's coordinates, [shot, 6]."""
-        energy, momentum = self._energy
-        state = beam.T[:, SWAPPED].copy()
-        total = np.hypot(momentum * (1 + beam[4]), 1e9 * self.ring.mass)
-        state[:, 4] *= energy / momentum
-        state[:, 5] = (total - energy) / momentum
-        return self._network.W0.new_tensor(state)
-
-    def _beam(self, state: Any) -> Array:
-        """AT's coordinates of OCELOT's, [6, shot]: the inverse of `_state`."""
-        beam: Array = state.cpu().numpy()[:, SWAPPED].T.copy()
-        energy, momentum = self._energy
-        total = energy + momentum * beam[4]
-        beam[4] = np.sqrt(total**2 - (1e9 * self.ring.mass) ** 2) / momentum - 1
-        beam[5] *= momentum / energy
-        return beam
-
-    @property
-    def _energy(self) -> tuple[float, float]:
-        """Energy and momentum of the reference particle, eV."""
-        energy = 1e9 * self.ring.energy
-        return energy, energy * self.ring.beta
+        own = from_at(beam.T, self.ring.energy, self.ring.mass)
+        return self._network.W0.new_tensor(own)

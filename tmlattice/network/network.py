@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tmlattice.beam import sweeps
-from tmlattice.beam.aperture import APERTURE, lost_beam
+from tmlattice.beam.aperture import APERTURE, bounded, lost_beam
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.sweeps import curved
 from tmlattice.errors import missing_package, unknown_choice
@@ -211,8 +211,7 @@ class TaylorNetwork(NetworkChain, Chain):
     @staticmethod
     def _inside(states: Tensor) -> Tensor:
         """See `aperture.lost`."""
-        bounded = [i for i in range(states.shape[1]) if i != 4]
-        return (states[:, bounded].abs() < APERTURE).all(dim=1)  # false for NaN
+        return (states[:, bounded(states.shape[1])].abs() < APERTURE).all(dim=1)  # false for NaN
 
     def _pass(self, launch: Tensor) -> tuple[Tensor, Tensor]:
         """Readings, and states behind the last layer."""

@@ -89,23 +89,14 @@ class Compared(Search):
         """The measured tunes, if there are any; a sentence."""
         return ()
 
-    def misfit(self, names: Names = ()) -> Array:
-        """Misfit of each column: |measured - design|^2 over the mean of both squares, beyond the
-        noise. 0: equal, 2: unrelated, 4: wrong sign, NaN: no reading of what the design does."""
-        read, made, noise = (np.asarray(own) for own in self.pairs(self.assumed(names)))
-        there, flat = np.isfinite(read), (len(read), -1)
-        a, b = (np.where(there, own, 0.0).reshape(flat) for own in (read, made))
-        square, own = ((np.abs(values) ** 2).sum(axis=1) for values in (a, b))
-        left = (np.abs(a - b) ** 2).sum(axis=1) - np.where(there, noise, 0.0).reshape(flat).sum(1)
-        size = (square + own) / 2
-        whole = (np.abs(made.reshape(flat)) ** 2).sum(axis=1)
-        seen = (size > 0) & (own > SEEN * whole)
-        return np.where(seen, np.maximum(left, 0.0) / np.where(seen, size, 1.0), np.nan)
-
     @abstractmethod
-    def pairs(self, data: Any) -> tuple[Any, Any, Any]:
-        """Columns as read, and as the design makes them, [column, monitor, 2], and the squares of
-        the noise of their difference."""
+    def misfit(self, names: Names = ()) -> Array:
+        """Misfit of each column with assumptions corrected. 0: equal, 2: unrelated to the design,
+        4: wrong sign, NaN: no reading of what the design does."""
+
+    def is_scale(self, name: str) -> bool:
+        """Whether the typical column's size shows this factor, whatever other errors there are."""
+        return False
 
     def improving(self) -> list[Verdict]:
         """Return the assumptions that improve the data far."""
@@ -121,8 +112,7 @@ class Compared(Search):
             gain = -float(change[moved].sum())
             before, after = (float(np.median(own[moved])) for own in (stated, other))
             corrected = before > UNRELATED and after < RESEMBLING
-            if names[0] in SCALES:  # common to all correctors, whatever other errors
-                corrected |= abs(np.log(self.scale() / SCALES[names[0]])) < NEAR
+            corrected |= self.is_scale(names[0])
             if corrected or gain > (OF_RF if of_rf else GAIN) * moved.sum():
                 found.append(Verdict(names, gain, before, after, self.of))
         return found
@@ -131,9 +121,27 @@ class Compared(Search):
         """Return the search with assumptions corrected in the data."""
         return replace(self, data=self.assumed(names))
 
-    def scale(self) -> float:
-        """Ratio of the typical column to the design's; NaN if they are unrelated."""
-        return ratio(*self.pairs(self.data)[:2])
+
+@dataclass(frozen=True)
+class OfColumns(Compared):
+    """Columns of readings [column, monitor, 2], of the design's size too."""
+
+    @abstractmethod
+    def pairs(self, data: Any) -> tuple[Any, Any, Any]:
+        """Columns as read, and as the design makes them, [column, monitor, 2], and the squares of
+        the noise of their difference."""
+
+    def misfit(self, names: Names = ()) -> Array:
+        """See `Compared`: |measured - design|^2 over the mean of both squares, beyond the noise."""
+        read, made, noise = (np.asarray(own) for own in self.pairs(self.assumed(names)))
+        there, flat = np.isfinite(read), (len(read), -1)
+        a, b = (np.where(there, own, 0.0).reshape(flat) for own in (read, made))
+        square, own = ((values**2).sum(axis=1) for values in (a, b))
+        left = ((a - b) ** 2).sum(axis=1) - np.where(there, noise, 0.0).reshape(flat).sum(1)
+        size = (square + own) / 2
+        whole = (made.reshape(flat) ** 2).sum(axis=1)
+        seen = (size > 0) & (own > SEEN * whole)
+        return np.where(seen, np.maximum(left, 0.0) / np.where(seen, size, 1.0), np.nan)
 
 
 def ratio(read: Array, made: Array) -> float:
@@ -149,7 +157,7 @@ def ratio(read: Array, made: Array) -> float:
 
 
 @dataclass(frozen=True)
-class OfResponse(Compared):
+class OfResponse(OfColumns):
     """Orbit changes by correctors, the RF's last; a single bad corrector is no global error."""
 
     what: ClassVar[str] = "column"
@@ -177,7 +185,7 @@ class OfResponse(Compared):
         return np.asarray(model.response(data.correctors))[:, at], of_rf
 
     def pairs(self, data: OrbitResponse) -> tuple[Any, Any, Any]:
-        """See `Compared`."""
+        """See `OfColumns`."""
         unit, of_rf = self.design
         read, made = [*data.response], [*(data.kicks[:, None, None] * unit)]
         if data.rf is not None and data.rf.orbit is not None:
@@ -189,6 +197,10 @@ class OfResponse(Compared):
         """Ratio of the typical corrector's column to the design's; NaN if they are unrelated."""
         read, made, _ = self.pairs(replace(self.data, rf=None))
         return ratio(read, made)
+
+    def is_scale(self, name: str) -> bool:
+        """See `Compared`."""
+        return name in SCALES and abs(np.log(self.scale() / SCALES[name])) < NEAR
 
     def rf_scale(self) -> float:
         """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
@@ -203,7 +215,7 @@ class OfResponse(Compared):
 
 
 @dataclass(frozen=True)
-class OfOrbits(Compared):
+class OfOrbits(OfColumns):
     """Changes of closed orbits between settings, or with the RF frequency."""
 
     what: ClassVar[str] = "orbit change"
@@ -231,7 +243,7 @@ class OfOrbits(Compared):
         return self._designs[key]
 
     def pairs(self, data: ClosedOrbit | Dispersion) -> tuple[Any, Any, Any]:
-        """See `Compared`. One orbit is the sum of all errors, and has no change."""
+        """See `OfColumns`. One orbit is the sum of all errors, and has no change."""
         read, made = read_of(data), self.design(data)
         if isinstance(data, ClosedOrbit):
             if not any(data.settings):
@@ -321,10 +333,6 @@ class OfLines(Compared):
         found[at] = at[assume(places, names, self.monitors).readings[0, 0, :, 0].astype(int)]
         return found
 
-    def pairs(self, data: TurnByTurn) -> tuple[Any, Any, Any]:
-        """See `Compared`."""
-        raise NotImplementedError
-
 
 @dataclass(frozen=True)
 class OfTunes(Compared):
@@ -359,10 +367,6 @@ class OfTunes(Compared):
         read = np.nanmedian(self.assumed(names).tune % 1, axis=0)
         apart = np.abs((read - self.design + 0.5) % 1 - 0.5)
         return np.array([np.nanmax(apart) ** 2 / TUNE**2])
-
-    def pairs(self, data: TuneReading) -> tuple[Any, Any, Any]:
-        """See `Compared`."""
-        raise NotImplementedError
 
 
 def compared(ring: Ring, data: Any, lines: ManyTurns | None = None) -> Compared:
