@@ -122,6 +122,8 @@ def _layout(height: int, **axes: Any) -> Figure:
         "height": height, "margin": {"l": 10, "r": 10, "t": 30, "b": 10}, "hovermode": "closest",
         "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom",
                    "itemsizing": "constant"},
+        "modebar": {"orientation": "v", "bgcolor": "rgba(0, 0, 0, 0)", "color": "#8c8c8c",
+                    "activecolor": "#5c5c5c"},  # upright: beside the legend
         **axes,
     }  # fmt: skip
 
