@@ -94,7 +94,7 @@ def test_chi_square_of_a_healthy_ring_is_right_at_every_amplitude(small_ring, am
     found = fit(problem, (), problem.first)
     assert found.chi2 < problem.freedom + 4 * np.sqrt(2 * problem.freedom)
     assert found.chi2 > 0.6 * problem.freedom
-    pulls = found.point.nuisances[0, :, 2:] / problem.shift.error[0].T
+    pulls = found.point.nuisances[0, :, 2:4] / problem.shift.error[0].T
     assert np.abs(pulls).max() < 1  # the shift is AT's to less than a tenth
     linear = replace(problem, shift=replace(problem.shift, modes=0 * problem.shift.modes,
                                             tunes=0 * problem.shift.tunes))  # fmt: skip
@@ -114,9 +114,31 @@ def test_shifts_are_of_the_measured_actions_where_a_kick_makes_others():
     problem = many_turns(ring, turns, {})
     found = fit(problem, (), problem.first)
     assert found.chi2 < problem.freedom
-    pulls = found.point.nuisances[0, :, 2:] / problem.shift.error[0].T
+    pulls = found.point.nuisances[0, :, 2:4] / problem.shift.error[0].T
     assert np.abs(pulls).max() < 1.5
     assert diagnose(ring, turns).verdict == "none"
+
+
+@pytest.mark.parametrize("amplitude", [2e-4, 1e-3])
+def test_a_healthy_beam_that_decoheres_is_no_fault(small_ring, amplitude):
+    """Gone in ten turns: what oscillates last has another energy, and sees other optics."""
+    turns = simulate_turns(small_ring, particles=300, turns=100, amplitude=amplitude).measured
+    assert diagnose(small_ring, turns).verdict == "none"
+
+
+def test_what_decoheres_has_an_imaginary_energy(small_ring):
+    """Phases 2 pi xi delta n of a Gaussian beam: by the mean turn of its power, sigma / sqrt(pi)."""
+    beam = {"particles": 20_000, "turns": 100, "engine": "network", "amplitude": 5e-4}
+    weak = Cause("quadrupole_gradient", "QD::3", 0.01)
+    turns = simulate_turns(small_ring, **beam, noise=2e-6).measured
+    problem = many_turns(small_ring, turns, {})
+    energy = fit(problem, (), problem.first).point.nuisances[0, :, 4:6]
+    assert_allclose(energy[:, 1], np.pi**-0.5, rtol=0.4)  # the kick favours some energies
+    assert np.abs(energy[:, 0]).max() < 0.1
+    found = diagnose(small_ring, simulate_turns(small_ring, [weak], **beam, noise=2e-6).measured)
+    (only,) = found.findings
+    assert only.element == "QD::3"
+    assert abs(only.amount - 0.01) < 4 * only.amount_sigma < 8e-3
 
 
 def test_a_quadrupole_is_found_at_a_large_amplitude(small_ring):

@@ -121,21 +121,29 @@ def _matched(
     beam: Beam,
     random: np.random.Generator,
 ) -> Array:
-    """Deviations of particles from the centroid, Gaussian and of zero mean, [particle, 6].
+    """Deviations of particles from the closed orbit, [particle, 6]: Gaussian and of zero mean, but
+    for the curvature of the orbits.
 
-    With the RF they fill its bucket. Without it each keeps its energy, on the orbit of that energy.
+    With the RF they fill its bucket. Without it each keeps its energy, on the closed orbit of that
+    energy to second order: beside it, it would oscillate before the kick.
     """
-    matrix = at_orbit.one_turn(functools.partial(engine.one_pass, line), state)
+    turn = functools.partial(engine.one_pass, line)
+    matrix = at_orbit.one_turn(turn, state)
     drawn = random.standard_normal((beam.particles, 6))
     drawn -= drawn.mean(axis=0)
     sizes = np.sqrt(np.repeat([*beam.emittance, 0.0], 2))
+    curvature = np.zeros(6)
     if rf:
         directions, _ = _modes(matrix)
         sizes[4:] = beam.spread / np.hypot(directions[4, 4], directions[4, 5])
     else:
         directions = np.zeros((6, 6))
         directions[:4, :4] = _modes(matrix[:4, :4])[0]
-        directions[:4, 4] = np.linalg.solve(np.eye(4) - matrix[:4, :4], matrix[:4, 4])
+        other = np.eye(6)[4] * ENERGY
+        up, down = (at_orbit.closed(turn, state + s * other, TRANSVERSE) - state for s in (1, -1))
+        directions[:4, 4] = (up - down)[:4] / (2 * ENERGY)
+        curvature[:4] = (up + down)[:4] / (2 * ENERGY**2)
         directions[4, 4] = 1.0
         sizes[4:] = beam.spread, 0.0
-    return np.asarray((drawn * sizes) @ directions.T)
+    own = drawn * sizes
+    return np.asarray(own @ directions.T + own[:, 4:5] ** 2 * curvature)

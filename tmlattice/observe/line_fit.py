@@ -9,7 +9,7 @@ frequency.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,12 +101,15 @@ def fit_lines(
         least = max(QUIETEST * float(np.median(own_noise)), TINY)
         noise = np.asarray(np.maximum(own_noise, least))
     quadrature = 0.5 * (cover[:, 0::2] + cover[:, 1::2]).mean(axis=0)
+    shifts, errors = np.array(
+        [_shift(*own) for own in zip(envelopes, quadrature, strict=True)]
+    ).T  # fmt: skip
     return LineFit(
-        frequency=lines,
-        frequency_error=_frequency_errors(envelopes, quadrature),
+        frequency=lines + shifts,
+        frequency_error=errors,
         amplitude=amplitude,
         variance=0.5 * (spread[:, 1::2] + spread[:, 2::2]),
-        envelope=envelopes,
+        envelope=envelopes * np.exp(-2j * np.pi * np.outer(shifts, turn)),
         noise=noise,
         residual=residual,
     )
@@ -177,9 +180,8 @@ def _cosines(width: Array | float, turns: int) -> NDArray[np.int64]:
 def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[float, ComplexArray]:
     """Frequency and envelope of a line from its values by turn.
 
-    The envelope is smooth: its slowest cosines, up to the width. The frequency is the peak of the
-    spectrum with the envelope's modulus as window; with a span, it is sought near NAFF's in so many
-    turns.
+    The envelope is smooth: its slowest cosines, up to the width. The frequency is the mean one of
+    its power; with a span, it is sought near NAFF's in so many turns.
     """
     turns = len(values)
     turn = np.arange(turns)
@@ -190,7 +192,7 @@ def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[f
         found = (float(strongest(envelope[:span])[0]) + 0.5) % 1.0 - 0.5
         if abs(found) < width:
             near, envelope = near + found, envelope * np.exp(-2j * np.pi * found * turn)
-    shift = _peak(np.abs(envelope) * envelope)
+    shift = _mean(envelope)
     if abs(shift) < width:
         near, envelope = near + shift, envelope * np.exp(-2j * np.pi * shift * turn)
     size = np.sqrt(np.mean(np.abs(envelope) ** 2))
@@ -214,31 +216,42 @@ def _peak(signal: ComplexArray) -> float:
     return at
 
 
-def _frequency_errors(envelopes: ComplexArray, quadrature: Array) -> Array:
-    """Errors of the frequencies, from noise and from the drift between two halves.
+def _mean(envelope: ComplexArray) -> float:
+    """Mean frequency of an envelope's power: that of the mean energy of what oscillates."""
+    power = (np.abs(envelope) ** 2).sum()
+    return float(np.vdot(envelope, np.gradient(envelope)).imag / (2 * np.pi * max(power, 1e-300)))
+
+
+def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
+    """Frequency of an envelope, and its error from noise and from the drift between two halves.
+
+    It is the peak of the spectrum with the modulus as window, which the noise moves least; or the
+    mean one, if the noise does not explain the difference.
 
     Args:
-        envelopes: [line, turn].
-        quadrature: variance of a line's real and imaginary part on one turn, [line].
+        envelope: [turn].
+        variance: of the line's real and imaginary part on one turn.
     """
-    turns = envelopes.shape[1]
-    turn = np.arange(turns)
+    power = np.abs(envelope) ** 2
+    turn = np.arange(len(power))
 
-    def statistical(power: Array, variance: float) -> float:
-        middle = (power * turn[: len(power)]).sum() / max(power.sum(), 1e-300)
-        lever = (power * (turn[: len(power)] - middle) ** 2).sum()
-        return float(np.sqrt(variance / max(lever, 1e-300)) / (2 * np.pi))
+    def statistical(power: Array) -> float:
+        own = turn[: len(power)]
+        middle = (power * own).sum() / max(power.sum(), 1e-300)
+        lever = (power * (own - middle) ** 2).sum()
+        return float(variance / max(lever, 1e-300) / (2 * np.pi) ** 2)
 
-    errors = np.empty(len(envelopes))
-    for i, (envelope, variance) in enumerate(zip(envelopes, quadrature, strict=True)):
-        power = np.abs(envelope) ** 2
-        middle = int(np.searchsorted(np.cumsum(power), power.sum() / 2))
-        halves = [slice(0, middle), slice(middle, turns)]  # of the power
-        peaks = [_peak(np.abs(envelope[half]) * envelope[half]) for half in halves]
-        expected = sum(statistical(power[half], variance) ** 2 for half in halves)
-        drift = max((peaks[0] - peaks[1]) ** 2 - 9 * expected, 0.0) / 4
-        errors[i] = np.sqrt(statistical(power, variance) ** 2 + drift)
-    return errors
+    middle = int(np.searchsorted(np.cumsum(power), power.sum() / 2))
+    halves = [slice(0, middle), slice(middle, len(power))]  # of the power
+    peaks = [_peak(np.abs(envelope[half]) * envelope[half]) for half in halves]
+    expected = sum(statistical(power[half]) for half in halves)
+    drift = max((peaks[0] - peaks[1]) ** 2 - 9 * expected, 0.0) / 4
+    peak, mean = _peak(np.abs(envelope) * envelope), _mean(envelope)
+    noise = (np.abs(np.gradient(envelope)) ** 2).sum() + power[0] + power[-1]
+    noise *= variance / max(2 * np.pi * power.sum(), 1e-300) ** 2
+    if (peak - mean) ** 2 > 9 * noise:
+        return mean, float(np.sqrt(noise + drift))
+    return peak, float(np.sqrt(statistical(power) + drift))
 
 
 MIN_TURNS = 64
@@ -285,6 +298,28 @@ def noise_at(fit: LineFit, line: int, quiet: Array, planes: NDArray[np.int64]) -
     return found
 
 
+def without(fit: LineFit, changes: ComplexArray) -> LineFit:
+    """Subtract known changes of the ratios between signals from the residual, with any envelope.
+
+    Args:
+        fit: the lines.
+        changes: of the amplitudes of the first lines, [signal, line].
+    """
+    there = fit.residual != 0
+    turn = np.arange(fit.residual.shape[1])
+    lines = fit.frequency[: changes.shape[1]]
+    values, _ = least_squares(
+        _quadratures(changes), fit.residual.T, there.T, 1 / fit.noise**2, prior=1.0
+    )
+    residual = fit.residual.copy()
+    for i, width in enumerate(_widths(lines, len(lines))):
+        moving = np.exp(2j * np.pi * lines[i] * turn)
+        slow = dct((values[:, 2 * i] + 1j * values[:, 2 * i + 1]) / moving, norm="ortho")
+        slow[_cosines(width, len(turn)) :] = 0
+        residual -= np.real(np.outer(changes[:, i], idct(slow, norm="ortho") * moving)) * there
+    return replace(fit, residual=residual)
+
+
 def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
     """Change of amplitudes between the first and the last half of a line's power, [signal].
 
@@ -323,7 +358,8 @@ def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
     return found
 
 
-def growth(envelope: ComplexArray) -> complex:
-    """Growth of an envelope per turn, averaged over the line's power."""
-    power = (np.abs(envelope) ** 2).sum()
-    return complex((envelope.conj() * np.gradient(envelope)).sum() / power)
+def later(envelope: ComplexArray, share: Array) -> ComplexArray:
+    """Return an envelope some share of a turn later over itself, averaged over the line's power."""
+    growth = np.gradient(envelope)
+    first, second = (np.vdot(envelope, own) for own in (growth, np.gradient(growth)))
+    return np.asarray(1 + (share * first + share**2 / 2 * second) / (np.abs(envelope) ** 2).sum())

@@ -33,8 +33,9 @@ from tmlattice.observe.line_fit import (
     change,
     fit_lines,
     floor,
-    growth,
+    later,
     noise_at,
+    without,
 )
 
 Array = NDArray[np.float64]
@@ -91,7 +92,10 @@ class Lines:
     warnings: tuple[str, ...]
 
 
-def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Lines:
+def lines(
+    turns: TurnByTurn, near: Near = None, at: Array | None = None,
+    chromatic: ComplexArray | None = None,
+) -> Lines:  # fmt: skip
     """Return the betatron lines of every shot.
 
     Args:
@@ -100,6 +104,9 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
             and they distinguish Q from 1 - Q, which positions cannot.
         at: position of each monitor in the turn, s / C, [monitor]: the envelope of a later one is
             later. None: monitors are equidistant, in their order.
+        chromatic: change of the modes by the relative energy in the model that `near` is from, as
+            a share of them, [monitor, plane, mode], 0 where it is not known. What oscillates
+            changes its energy while the beam decoheres, which is not an error of the amplitudes.
 
     Raises:
         TooFewTurnsError: no shot has 16 turns with a beam.
@@ -112,6 +119,9 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
     place = np.arange(monitors) / monitors if at is None else np.asarray(at, dtype=float)
     signals = np.moveaxis(turns.readings, 1, 3).reshape(shots, 2 * monitors, -1)
     found = _empty(turns)
+    if chromatic is not None:
+        above = np.asarray(near) % 1 > 0.5
+        chromatic = np.where(above, chromatic.conj(), chromatic).reshape(-1, 2)
     warnings: Warnings = {}
     noise: list[Array] = []
     for i, shot in enumerate(turns.shots):
@@ -125,6 +135,12 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
         quiet = fit.noise * floor(fit)
         noise.append(np.full(2 * monitors, np.nan))
         noise[-1][usable] = fit.noise
+        if chromatic is not None:
+            changes = np.zeros_like(fit.amplitude[:, :2])
+            for mode, line in enumerate(modes):
+                if line is not None:
+                    changes[:, line] = fit.amplitude[:, line] * chromatic[usable, mode]
+            fit = without(fit, changes)
         for mode, line in enumerate(modes):
             if line is None:
                 continue
@@ -136,7 +152,7 @@ def lines(turns: TurnByTurn, near: Near = None, at: Array | None = None) -> Line
             found.tune[i, mode] = abs(mirrored - fit.frequency[line])
             found.tune_error[i, mode] = fit.frequency_error[line]
             found.envelope[i, mode, :used] = turned(fit.envelope[line])
-            late = 1 + np.repeat(place, 2)[usable] * growth(fit.envelope[line])
+            late = later(fit.envelope[line], np.repeat(place, 2)[usable])
             values = found.amplitude[i].reshape(-1, 2)
             values[usable, mode] = turned(fit.amplitude[:, line] / late)
             errors = found.error[i].reshape(-1, 2)

@@ -53,8 +53,14 @@ FLOOR = 1e-4
 monitors."""
 
 
-LINES = -6
-"""End of the lines among the data of a shot: see `ManyTurns`."""
+OTHERS = 6
+"""Nuisances of a shot and mode beside its amplitude: see `ManyTurns`."""
+LINES = -2 * OTHERS - 2
+"""End of the lines among the data of a shot."""
+ENERGY = 1e-3
+"""rms relative energy of the particles of a stored beam: as much may differ what oscillates."""
+STEP = 0.1
+"""Energy on both sides of the beam's, as a share of it, for the change of its modes."""
 AT_ONCE = 256
 """Changes of modes in memory: 4 MB for 246 monitors."""
 
@@ -335,19 +341,26 @@ class TurnsMetric(StoredMetric):
 
 @dataclass(frozen=True, kw_only=True)
 class ManyTurns(Stored):
-    """Lines [shot, (monitor, plane, mode, re and im), then errors of shifts (mode, action), two
-    tunes]; m, 1.
+    """Lines [shot, (monitor, plane, mode, re and im), then (mode, errors of both shifts, re and im
+    of the energy and of its square), two tunes]; m, 1.
 
-    Nuisances are re and im of the complex amplitude of each shot and mode, and the relative errors
-    of its shifts by both actions, [shot, mode, 4]. The errors of shifts are read as 0.
+    Nuisances are re and im of the complex amplitude of each shot and mode, the relative errors of
+    its shifts by both actions, re and im of the energy of what oscillates in units of the beam's
+    spread, and of its square, [shot, mode, 2 + OTHERS]. All but the amplitudes are read as 0.
+
+    With chromaticity a particle's phase keeps account of its energy. Those ahead of the mean phase
+    have another energy than those behind it, which is an imaginary energy of the line. It grows
+    with the turns until the beam has decohered. A few simulated particles have a mean energy too.
 
     Attributes:
         shift: by the amplitude of each shot.
+        chromatic: change of the beam by its energy and by the square, of each shot.
         warnings: a sentence for all data that could not be used.
     """
 
     counts: ClassVar[bool] = True
     shift: Shift = field(repr=False)
+    chromatic: tuple[Moved, ...] = field(repr=False)
     warnings: tuple[str, ...] = ()
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -383,7 +396,7 @@ class ManyTurns(Stored):
         """Amplitudes that fit the known ring."""
         shots = len(self.values)
         view = self.view(self.fixed)
-        nothing = np.zeros((shots, 2, 4))
+        nothing = np.zeros((shots, 2, 2 + OTHERS))
         slopes = self.as_rows(self.directions(view, nothing)).T
         left = self.as_rows(self.values - self.read(view, nothing))
         solved = np.linalg.lstsq(slopes, left, rcond=None)[0]
@@ -398,24 +411,28 @@ class ManyTurns(Stored):
         return np.zeros(self.used.shape), np.ones(self.used.shape)
 
     def without(self, dropped: NDArray[np.bool_]) -> Self:
-        """Return the problem without some readings; priors of the shifts stay."""
+        """Return the problem without some readings; priors of the nuisances stay."""
         dropped = dropped.copy()
         dropped[:, LINES:-2] = False
         return super().without(dropped)
 
     def shown(self, view: Beams, nuisances: Array) -> list[Moved]:
-        """Return the states, shifted by the amplitude."""
-        by_action = zip(self.shift.modes, self.shift.tunes, 1 + nuisances[..., 2:], strict=True)
+        """Return the states, shifted by the amplitude and by the energy of what oscillates."""
+        by = 1 + nuisances[..., 2:4]
+        energy = nuisances[..., 4::2] + 1j * nuisances[..., 5::2]
+        modes = np.einsum("ska,sampk->smpk", by, self.shift.modes)
+        tunes = np.einsum("ska,sak->sk", by, self.shift.tunes)
         return [
             replace(
-                beam.shown, modes=beam.modes + np.einsum("ka,ampk->mpk", by, modes),
-                tunes=beam.tunes + np.einsum("ka,ak->k", by, tunes),
+                beam.shown,
+                modes=beam.modes + modes[i] + np.einsum("ko,ompk->mpk", energy[i], own.modes),
+                tunes=beam.tunes + tunes[i] + np.einsum("ko,ok->k", energy[i].real, own.tunes),
             )
-            for beam, (modes, tunes, by) in zip(view.beams, by_action, strict=True)
+            for i, (beam, own) in enumerate(zip(view.beams, self.chromatic, strict=True))
         ]  # fmt: skip
 
     def read(self, view: Beams, nuisances: Array) -> Array:
-        """Predicted readings with the errors of the shifts."""
+        """Predicted readings with all nuisances but the amplitudes."""
         readings = super().read(view, nuisances)
         readings[:, LINES:-2] = nuisances[..., 2:].reshape(len(readings), -1)
         return readings
@@ -426,30 +443,30 @@ class ManyTurns(Stored):
         seen = np.ascontiguousarray(stacked(states, "modes") * size[:, None, None, :])
         flat = seen.view(float).reshape(*seen.shape[:-3], -1)
         tunes = stacked(states, "tunes")
-        return np.concatenate([flat, np.zeros_like(tunes), np.zeros_like(tunes), tunes], axis=-1)
+        return np.concatenate([flat, *[np.zeros_like(tunes)] * OTHERS, tunes], axis=-1)
 
     def directions(self, view: Beams, nuisances: Array) -> Array:
-        """Directions of the amplitudes in the lines, and of the shifts in lines and tunes."""
+        """Directions of the amplitudes in the lines, and of the others in lines and tunes."""
         ones = nuisances.copy()
         ones[..., :2] = 1.0, 0.0
         shots = len(ones)
         at_one = self.read(view, ones)
         lines = at_one[:, :LINES].reshape(shots, -1, 2, 2)  # [shot, , mode, re and im]
         size = nuisances[..., 0] + 1j * nuisances[..., 1]
-        out = np.zeros((shots, 2, 4, shots, lines.shape[1], 2, 2))
-        rest = np.zeros((shots, 2, 4, shots, -LINES))
-        for action in range(2):
+        out = np.zeros((shots, 2, 2 + OTHERS, shots, lines.shape[1], 2, 2))
+        rest = np.zeros((shots, 2, 2 + OTHERS, shots, -LINES))
+        for other in range(OTHERS):
             more = ones.copy()
-            more[..., 2 + action] += 1.0
-            of_shift = self.read(view, more) - at_one
-            by = of_shift[:, :LINES].reshape(lines.shape)
+            more[..., 2 + other] += 1.0
+            change = self.read(view, more) - at_one
+            by = change[:, :LINES].reshape(lines.shape)
             moved = (by[..., 0] + 1j * by[..., 1]) * size[:, None]
             for shot in range(shots):
                 for mode in range(2):
                     own = moved[shot, :, mode]
-                    out[shot, mode, 2 + action, shot, :, mode] = np.stack([own.real, own.imag], 1)
-                    here = [2 * mode + action, 4 + mode]
-                    rest[shot, mode, 2 + action, shot, here] = of_shift[shot, LINES:][here]
+                    out[shot, mode, 2 + other, shot, :, mode] = np.stack([own.real, own.imag], 1)
+                    here = [OTHERS * mode + other, 2 * OTHERS + mode]
+                    rest[shot, mode, 2 + other, shot, here] = change[shot, LINES:][here]
         for shot in range(shots):
             for mode in range(2):
                 own = lines[shot, :, mode]
@@ -457,6 +474,20 @@ class ManyTurns(Stored):
                 out[shot, mode, 1, shot, :, mode] = np.stack([-own[:, 1], own[:, 0]], axis=1)
         flat = out.reshape(nuisances.size, shots, -1)
         return np.concatenate([flat, rest.reshape(nuisances.size, shots, -1)], axis=2)
+
+
+def _chromatic(beam: StoredBeam, at: Array) -> Moved:
+    """Change of a beam by its energy in units of ENERGY, and by the square of it, [order, ...], at
+    the same phase of each monitor: `lines` delays the envelope by its part of the turn."""
+    ends = [beam, *(StoredBeam(beam.model.at_energy(h * ENERGY)) for h in (STEP, -STEP))]
+
+    def orders(zero: Any, up: Any, down: Any) -> Any:
+        return np.stack([(up - down) / (2 * STEP), (up - 2 * zero + down) / (2 * STEP**2)])
+
+    tunes = [(end.tunes - beam.tunes + 0.5) % 1.0 - 0.5 for end in ends]
+    delays = [np.exp(-2j * np.pi * at[:, None, None] * own) for own in tunes]
+    modes = [end.modes * own for end, own in zip(ends, delays, strict=True)]
+    return Moved(orders(*(end.model.readings for end in ends)), orders(*tunes), orders(*modes))
 
 
 def many_turns(
@@ -489,22 +520,31 @@ def many_turns(
         used=np.zeros(shape, dtype=bool),
         places=places,
         shift=Shift.none(shots, count),
+        chromatic=(),
     )
     beams = blank.view(()).beams
     design = np.array([beam.tunes for beam in beams])
     found, shift = spectrum, blank.shift
+    at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
+    each = {id(beam): _chromatic(beam, at) for beam in beams}
+    chromatic = tuple(each[id(beam)] for beam in beams)
     if found is None:
-        at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
-        found = lines(measured.in_order_of(names), near=design[0], at=at)
+        share = np.zeros_like(beams[0].modes)
+        for mode in (0, 1):  # the other plane shows a mode by coupling alone
+            own = chromatic[0].modes[0, :, mode, mode] / beams[0].modes[:, mode, mode]
+            share[:, mode, mode] = own + 2j * np.pi * at * chromatic[0].tunes[0, mode]
+        found = lines(measured.in_order_of(names), near=design[0], at=at, chromatic=share)
         shift = shift_of(ring, beams, found, at)
     # the model's error is proportional to the line of the mode in its own plane
     size = np.nan_to_num(np.abs(found.amplitude)).max(axis=2, keepdims=True)
     error = np.sqrt(found.error**2 + (FLOOR * size) ** 2 + shift.mode_error**2).reshape(shots, -1)
     both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
-    # shift errors are common to all shots: their mean is known no better than one
-    known = shift.error.swapaxes(1, 2).reshape(shots, -1) * np.sqrt(shots)
+    # of shifts and energies, common to all shots: their mean is known no better than one
+    known = np.ones((shots, 2, OTHERS))
+    known[..., :2] = shift.error.swapaxes(1, 2)
+    known = known.reshape(shots, -1) * np.sqrt(shots)
     tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
-    data = np.concatenate([both.reshape(shots, -1), np.zeros((shots, 4)), tunes], axis=1)
+    data = np.concatenate([both.reshape(shots, -1), np.zeros_like(known), tunes], axis=1)
     tune_error = np.sqrt(found.tune_error**2 + TUNE**2 + shift.tune_error**2)
     errors = np.concatenate([np.repeat(error, 2, axis=1), known, tune_error], axis=1)
     there = np.isfinite(data) & np.isfinite(errors)
@@ -523,5 +563,6 @@ def many_turns(
         sigma=np.where(there, errors, 1.0),
         used=there,
         shift=shift,
+        chromatic=chromatic,
         warnings=(*found.warnings, *large),
     )
