@@ -127,7 +127,7 @@ def test_a_healthy_beam_that_decoheres_is_no_fault(small_ring, amplitude):
 
 
 def test_what_decoheres_has_an_imaginary_energy(small_ring):
-    """Phases 2 pi xi delta n of a Gaussian beam: by the mean turn of its power, sigma / sqrt(pi)."""
+    """Of Gaussian phases 2 pi xi delta n: by the mean turn of its power, sigma / sqrt(pi)."""
     beam = {"particles": 20_000, "turns": 100, "engine": "network", "amplitude": 5e-4}
     weak = Cause("quadrupole_gradient", "QD::3", 0.01)
     turns = simulate_turns(small_ring, **beam, noise=2e-6).measured
