@@ -111,14 +111,18 @@ def of_healthy(rows):
 
 
 def of_turns(rows):
-    """Counts of `turns_amplitude.py` by ring, fault and amplitude, of what was not refused."""
+    """Counts of `turns_amplitude.py` by ring, beam, fault, amplitude, of what was not refused."""
+    rows = [{"particles": 1} | row for row in rows]
     amplitudes = sorted({row["amplitude"] for row in rows})
-    yield ["ring", "quadrupole", *(f"{1e3 * own:g} mm" for own in amplitudes)]
-    for name, fault in dict.fromkeys((row["ring"], row["fault"]) for row in rows):
-        line = [name, f"{100 * fault:g} %: named" if fault else "right: false alarms"]
+    yield ["ring", "particles", "quadrupole", *(f"{1e3 * own:g} mm" for own in amplitudes)]
+    kinds = ("ring", "particles", "fault")
+    for case in dict.fromkeys(tuple(row[key] for key in kinds) for row in rows):
+        name, particles, fault = case
+        named = f"{100 * fault:g} %: named" if fault else "right: false alarms"
+        line = [name, f"{particles:,}", named]
         for amplitude in amplitudes:
-            case = name, fault, amplitude
-            own = [r for r in rows if (r["ring"], r["fault"], r["amplitude"]) == case]
+            own = [r for r in rows if tuple(r[key] for key in kinds) == case]
+            own = [r for r in own if r["amplitude"] == amplitude]
             done = [r for r in own if r["verdict"] not in ("refused", "error")]
             count = sum(r["right"] if fault else r["verdict"] != "none" for r in done)
             cells = [f"{count} of {len(done)}"] if done else []

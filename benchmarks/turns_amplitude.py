@@ -3,7 +3,8 @@
 A ring without errors is kicked, read turn by turn and diagnosed; whatever is found is a false
 alarm, `distributed` too. The rings are the built-in PETRA III and those that accelerator-toolbox
 ships. With --fault each ring has one quadrupole that is 0.5 % too strong, and the share whose first
-finding is that quadrupole is counted. Rows are appended to FILE (one JSON object a line), and rows
+finding is that quadrupole is counted. With --particles the beam has an energy spread of 1e-3 and
+decoheres; the network tracks it. Rows are appended to FILE (one JSON object a line), and rows
 that FILE holds already are not measured again.
 
     python benchmarks/turns_amplitude.py --rings petra3 dba --amplitudes 0.001 --seeds 25
@@ -30,7 +31,7 @@ FAULT = 0.005
 """Of a quadrupole's strength."""
 
 
-def one(ring, amplitude: float, seed: int, fault: float) -> dict:
+def one(ring, fault: float, particles: int, amplitude: float, seed: int) -> dict:
     """What is found in one measurement."""
     quadrupoles = [e.name for e in ring.elements if e.kind == "quadrupole" and e.k1 and e.length]
     place = quadrupoles[(97 * seed + 31) % len(quadrupoles)]
@@ -38,7 +39,8 @@ def one(ring, amplitude: float, seed: int, fault: float) -> dict:
     row = {"place": place} if fault else {}
     begun = time.process_time()
     try:
-        data = simulate_turns(ring, causes, amplitude=amplitude, seed=seed).measured
+        beam = {"particles": particles, "engine": "network"} if particles > 1 else {}
+        data = simulate_turns(ring, causes, amplitude=amplitude, seed=seed, **beam).measured
         result = diagnose(ring, data, seed=seed)
         row |= {
             "verdict": result.verdict,
@@ -63,23 +65,24 @@ def main() -> None:
     parser.add_argument("--amplitudes", nargs="*", type=float, default=list(AMPLITUDES))
     parser.add_argument("--seeds", type=int, default=25)
     parser.add_argument("--fault", action="store_true")
+    parser.add_argument("--particles", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     chosen = parser.parse_args()
     logging.getLogger("tmlattice").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
     there = chosen.out.read_text(encoding="utf-8").splitlines() if chosen.out.is_file() else []
     rows = [json.loads(line) for line in there]
-    keys = ("ring", "fault", "amplitude", "seed")
-    done = {tuple(row[key] for key in keys) for row in rows}
+    keys = ("ring", "fault", "particles", "amplitude", "seed")
+    done = {tuple(({"particles": 1} | row)[key] for key in keys) for row in rows}
     fault = FAULT if chosen.fault else 0.0
     for name in chosen.rings:
         ring = ring_of(name)
         for amplitude in chosen.amplitudes:
             for seed in range(chosen.seeds):
-                case = (name, fault, amplitude, seed)
+                case = (name, fault, chosen.particles, amplitude, seed)
                 if case in done:
                     continue
-                row = dict(zip(keys, case, strict=True)) | one(ring, amplitude, seed, fault)
+                row = dict(zip(keys, case, strict=True)) | one(ring, *case[1:])
                 rows.append(row)
                 with chosen.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
