@@ -417,6 +417,9 @@ QUADRUPOLE = {"PassMethod": "StrMPoleSymplectic4Pass", "PolynomA": [0.0, 0.0],
         {"m": at.Corrector("m", 0.2, [1e-5, 2e-5], **QUADRUPOLE)},
         {"m": at.Corrector("m", 0.2, [1e-4, 2e-4], PassMethod="DriftPass")},
         {"m": at.Quadrupole("m", 0.2, 0.3, PassMethod="SolenoidLinearPass")},
+        {"m": at.Drift("m", 0.2, PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)},
+        {"m": at.Monitor("m", Length=0.2, PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)},
+        {"m": at.M66("m", np.diag([2, 0.5, 2, 0.5, 1, 1]), Length=0.2, PassMethod="DriftPass")},
     ],
 )
 def test_pass_method_and_not_the_class_says_what_at_tracks(changed):

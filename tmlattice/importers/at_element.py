@@ -75,6 +75,8 @@ def _is_data(value: Any) -> bool:
 
 def _method_of(fields: Mapping[str, Any]) -> str:
     """AT's own pass method of such fields."""
+    if np.shape(fields.get("M66")) == (6, 6):
+        return "Matrix66Pass"
     multipole = any(np.size(fields.get(name, ())) for name in ("PolynomA", "PolynomB"))
     if is_number(fields.get("BendingAngle")):
         return "BndMPoleSymplectic4Pass" if multipole else "BendLinearPass"
@@ -117,22 +119,9 @@ def _complete(fields: dict[str, Any], energy: float) -> None:
 
 
 def _made(fields: Mapping[str, Any], place: int) -> Any:
-    """By AT, whose class of an element goes by the name of its family before its pass method: a
-    drift called `WIG` is none the less a drift."""
-    import at
+    """By AT, from which the name of the family is kept: AT would take it for the class."""
     from at.load.utils import element_from_dict
 
-    def made(**more: Any) -> Any:
-        return element_from_dict({**fields, **more}, index=place, check=False, quiet=True)
-
-    empty = "Class" not in fields and fields["PassMethod"] in EMPTY
-    try:
-        element = made()
-        if not (empty and isinstance(element, at.M66)):
-            return element
-    except Exception:  # AT's constructors fail in their own ways
-        if not empty:
-            raise
-    element = made(FamName="_")
+    element = element_from_dict({**fields, "FamName": "_"}, index=place, check=False, quiet=True)
     element.FamName = fields["FamName"]
     return element
