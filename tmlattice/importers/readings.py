@@ -435,7 +435,7 @@ class _Finder:
             raise MeasurementError(
                 f"{path}: {error}; assign the names in [channels] of "
                 "tmlattice.toml (`tmlattice import --example` writes one)"
-            )
+            ) from error
         loose = [d for d, at in found.items() if at is not None and not self._same(d, at)]
         if loose and not self._in_order:
             at = found[loose[0]]

@@ -211,7 +211,8 @@ class OfResponse(OfColumns):
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""
-        return [own for own in super().candidates() if self.stepped or own[0][:3] != "rf-"]
+        read = self.stepped and read_rf(self.data)
+        return [own for own in super().candidates() if read or own[0][:3] != "rf-"]
 
 
 @dataclass(frozen=True)
