@@ -75,7 +75,7 @@ def _is_data(value: Any) -> bool:
 
 def _method_of(fields: Mapping[str, Any]) -> str:
     """AT's own pass method of such fields."""
-    if np.shape(fields.get("M66")) == (6, 6):
+    if np.shape(fields.get("M66", 0)) == (6, 6):
         return "Matrix66Pass"
     multipole = any(np.size(fields.get(name, ())) for name in ("PolynomA", "PolynomB"))
     if is_number(fields.get("BendingAngle")):
