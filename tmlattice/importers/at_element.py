@@ -13,7 +13,7 @@ import numpy as np
 from tmlattice.errors import LatticeError
 from tmlattice.importers.imported import is_number
 from tmlattice.lattice.at_child import shipped_methods
-from tmlattice.lattice.expressions import check_order
+from tmlattice.lattice.expressions import check_order, of_fields
 
 LONGEST = 1e5
 """m; no element of a ring is longer."""
@@ -59,7 +59,7 @@ def at_element(fields: Mapping[str, Any], place: int, energy: float, messages: C
     _one_gradient(kept)
     _complete(kept, energy)
     try:
-        return _made(kept, place)
+        return of_fields(kept, index=place, check=False, quiet=True)
     except Exception as error:  # AT's constructors fail in their own ways
         said_so = " ".join(str(error).split()) or type(error).__name__
         raise LatticeError(
@@ -116,12 +116,3 @@ def _complete(fields: dict[str, Any], energy: float) -> None:
         for plane in "xy":
             if f"{plane}kick" in fields:
                 fields.setdefault(f"{plane}kick1", np.zeros_like(fields[f"{plane}kick"]))
-
-
-def _made(fields: Mapping[str, Any], place: int) -> Any:
-    """By AT, from which the name of the family is kept: AT would take it for the class."""
-    from at.load.utils import element_from_dict
-
-    element = element_from_dict({**fields, "FamName": "_"}, index=place, check=False, quiet=True)
-    element.FamName = fields["FamName"]
-    return element

@@ -292,9 +292,8 @@ def _convert(
     if passes_freely(element):
         if isinstance(element, at.Monitor) or mad in ("MONITOR", "HMONITOR", "VMONITOR"):
             return "monitor", ocelot.Monitor(l=length, eid=family)
-        named = str(element.FamName).casefold() in ("bpm", "monitor")  # from before the class
-        if named and not mad and isinstance(element, at.Marker):
-            return "monitor", ocelot.Monitor(l=length, eid=family)
+        if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
+            return "monitor", ocelot.Monitor(l=length, eid=family)  # from before the class
         if _fields(element):
             left_out[f"fields of magnets whose pass method is {method}"] += 1
         if mad in ACTS:
