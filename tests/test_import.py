@@ -224,7 +224,6 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
         (lambda d: {"LocoMeasData_M": d["M"] / 2}, "--assume kicks-halved"),
         (lambda d: {"LocoMeasData_M": d["M"] / 0.1}, "not the response per mrad"),
         (lambda d: {"LocoMeasData_M": d["M"] / 1e-4}, "not the response per rad"),
-        (lambda d: {"LocoMeasData_Eta": d["Eta"] / 1e3}, "--assume rf-in-km"),
         (lambda d: {"LocoMeasData_Eta": -d["Eta"], "LocoMeasData_M": np.concatenate(
             [-d["M"][:16], d["M"][16:]])}, "--assume x-reversed"),
         (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-exchanged"),

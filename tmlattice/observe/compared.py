@@ -211,8 +211,8 @@ class OfResponse(OfColumns):
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""
-        read = self.stepped and read_rf(self.data)
-        return [own for own in super().candidates() if read or own[0][:3] != "rf-"]
+        left_out = "rf-" if not self.stepped else "rf-in" if not read_rf(self.data) else "-"
+        return [own for own in super().candidates() if not own[0].startswith(left_out)]
 
 
 @dataclass(frozen=True)
