@@ -5,6 +5,7 @@ the second-order maps it does not change. ThomX, which AT ships, has bends of 0.
 which the vertical chromaticities differ by 0.65.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import machine_data
@@ -13,6 +14,7 @@ from numpy.testing import assert_allclose
 
 from tmlattice import Cause, diagnose, load_ring
 from tmlattice.beam.chain import Chain
+from tmlattice.errors import MeasurementError
 from tmlattice.machine.stored_beam import simulate_tunes
 from tmlattice.observe.tune_readings import fringe_uncertainty
 from tmlattice.optics import off_momentum
@@ -45,6 +47,19 @@ def test_a_reversed_sextupole_is_still_seen(thomx):
     assert found.findings
     effects = [m.effect for m in found.findings[0].credible_set]
     assert "sextupole_strength" in effects
+
+
+def test_a_chromaticity_that_no_error_explains_is_refused(thomx):
+    read = simulate_tunes(thomx, shots=2, seed=1).measured
+    values = read.chromaticity.copy()
+    for value, words in ((-20.0, None), (-500.0, "a chromaticity of -500 in y")):
+        values[1, 1] = value
+        wrong = replace(read, chromaticity=values)
+        if words is None:  # a ring without its sextupoles has as much
+            assert diagnose(thomx, wrong).verdict != "none"
+            continue
+        with pytest.raises(MeasurementError, match=words):
+            diagnose(thomx, wrong)
 
 
 def test_chromaticity_of_slow_particles_is_per_momentum(tmp_path):

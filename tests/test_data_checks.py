@@ -296,13 +296,23 @@ def test_a_scale_is_named_of_a_ring_far_from_its_design(small_ring, steps, name,
     assert any(name in check.sentence for check in checks), checks
 
 
-def test_an_rf_orbit_in_millimetres_is_told(small_ring):
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1e3, "--assume rf-in-mm"),
+        (1e-3, "--assume rf-in-km"),
+        (30.0, "the RF's orbit is 30 times the design's for its step"),
+    ],
+)
+def test_an_rf_orbit_in_another_unit_is_told(small_ring, factor, words):
     """`no closed orbit` had been all that was said."""
     steps = simulate_response(small_ring, rf_step=-3000.0, engine="ocelot", seed=1).measured
     assert told(check_data(small_ring, steps)) == []
-    scaled = replace(steps, rf=replace(steps.rf, orbit=1e3 * steps.rf.orbit))
+    scaled = replace(steps, rf=replace(steps.rf, orbit=factor * steps.rf.orbit))
     (check,) = told(check_data(small_ring, scaled))
-    assert check.sentence.startswith("the RF's orbit is 1e+03 times the design's for its step")
+    assert words in check.sentence
+    if check.assume:
+        assert check_data(small_ring, scaled, assumed=check.assume).reported == ()
     repeated = np.tile(scaled.rf.orbit[:5], (len(steps.monitors) // 5, 1))  # no monitor read that
     copied = replace(scaled, rf=replace(scaled.rf, orbit=repeated))
     assert told(check_data(small_ring, copied)) == []

@@ -222,6 +222,8 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
         (lambda d: {"LocoMeasData_M": d["M"] * 1e3 / 2e2, "LocoMeasData_Eta": d["Eta"]},
          "the data are not those of"),
         (lambda d: {"LocoMeasData_M": d["M"] / 2}, "--assume kicks-halved"),
+        (lambda d: {"LocoMeasData_M": d["M"] / 0.1}, "not the response per mrad"),
+        (lambda d: {"LocoMeasData_M": d["M"] / 1e-4}, "not the response per rad"),
         (lambda d: {"LocoMeasData_Eta": -d["Eta"], "LocoMeasData_M": np.concatenate(
             [-d["M"][:16], d["M"][16:]])}, "--assume x-reversed"),
         (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-exchanged"),
@@ -342,6 +344,12 @@ WRONG = {
         lambda v: {"CMData_HCMGoodDataIndex": np.array([1.0, 2.5])}, "list of places"),
     "a step without bounds": (
         lambda v: {"CMData_HCMKicks": one(v["CMData"]["HCMKicks"], 1e300)}, "has a step of"),
+    "no orbit change": (
+        lambda v: {"LocoMeasData_M": np.nan * v["LocoMeasData"]["M"]}, "no corrector's orbit"),
+    "a magnet of negative length": (
+        lambda v: {"RINGData_Lattice": np.array(
+            [{**e, "Length": -e["Length"]} if e["FamName"] == "QF" else e
+             for e in v["RINGData"]["Lattice"]], dtype=object)}, "has the negative length -0.4 m"),
     "an RF without bounds": (lambda v: {"LocoMeasData_RF": 9e299}, "cannot be"),
     "a harmonic without bounds": (lambda v: {"RINGData_CavityHarmNumber": 1e299}, "cannot be"),
     "an order of a field that would fill the memory": (
@@ -716,6 +724,7 @@ def test_wide_table(lattice, tmp_path):
         ("corrector,monitor,x,y\ncor_h::0,bpm::0,1e-4,0", "no column 'kick'"),
         ("corrector,monitor,x [furlong],y,kick\ncor_h::0,bpm::0,1e-4,0,1e-4", "furlong"),
         ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,much,0,1e-4", "row 2: 'much' is no number"),
+        ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,1_0,0,1e-4", "row 2: '1_0' is no number"),
         ("corrector,monitor,x,y,kick\ncor_h::0,bpm::0,1e-4,0", "line 2: 4 fields"),
         ("corrector,monitor,x,y,kick\nqf::0,bpm::0,1e-4,0,1e-4", "no corrector"),
         ("corrector,monitor,x,y,kick\ncor_h::0,bpm::77,1e-4,0,1e-4", "bpm::77"),

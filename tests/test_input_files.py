@@ -17,7 +17,7 @@ from tmlattice.importers.hdf5 import read_hdf5, read_mapping
 from tmlattice.input_files import json_of, yaml_of
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import read_turn_by_turn
-from tmlattice.observe.calibration import read_calibration
+from tmlattice.observe.calibration import read_calibration, read_rejected
 
 NAMES = [f"bpm{i}" for i in range(6)]
 
@@ -78,7 +78,29 @@ def in_itself(file, folder):
     group["b"] = group
 
 
+def partly(fill):
+    """Two of four rows are written."""
+
+    def change(file, folder):
+        values = file["x"][()]
+        del file["x"]
+        x = file.create_dataset("x", (4, 6), "f8", chunks=(1, 6), fillvalue=fill)
+        x[1:3] = values[1:3]
+
+    return change
+
+
+def many_groups(file, folder):
+    for number in range(10_001):
+        file.create_group(f"g{number}")
+
+
 HALF = {
+    "never written": (replaced(shape=(4, 6), dtype="f8"), "all of 'x' was never written"),
+    "half written": (partly(0.0), "2 of 4 parts of 'x' was never written"),
+    "an enumeration": (replaced(shape=(4, 6), dtype=h5py.enum_dtype({"OK": 0, "BAD": 1})),
+                       "'x' holds names of an enumeration"),
+    "more groups than any file": (many_groups, "more than 10,000 groups"),
     "complex": (replaced(data=np.ones((4, 6), complex)), "'x' holds complex numbers"),
     "without elements": (replaced(shape=(0, 6), dtype="f8"), "'x' is empty"),
     "null": (replaced(data=h5py.Empty("f8")), "'x' is empty"),
@@ -112,6 +134,14 @@ def test_hdf5_that_is_not_whole_numbers_of_its_own_is_refused_by_name(tmp_path, 
         change(file, tmp_path)
     with pytest.raises(MeasurementError, match=words):
         read_columns(path)
+
+
+def test_what_was_not_written_and_is_filled_with_nan_was_not_read(tmp_path):
+    path = readings(tmp_path / "t.h5")
+    with h5py.File(path, "r+") as file:
+        partly(np.nan)(file, tmp_path)
+    column = read_columns(path)[0]
+    assert [text == "nan" for text in column.values] == [True, False, False, True]
 
 
 def test_a_unit_that_is_no_text_is_refused(tmp_path):
@@ -281,6 +311,20 @@ def test_turns_that_are_cut_off_are_refused(tmp_path, write):
         path.write_text(text[: int(share * len(text))])
         with pytest.raises(MeasurementError, match=r"cut off|cannot be read"):
             read_turn_by_turn(path, write.__name__)
+
+
+@pytest.mark.parametrize(
+    ("family", "plane", "words"),
+    [("quadrupole", "x", "is rejected as a BPM"), ("monitor", None, "is rejected as a corrector")],
+)
+def test_only_bpms_and_correctors_are_rejected_channels(tmp_path, small_ring, family, plane, words):
+    element = next(e.name for e in small_ring.elements if e.kind == family)
+    document = {"format": "tmlattice-calibration", "version": 1, "effects": [],
+                "rejected": [{"element": element, "plane": plane}]}  # fmt: skip
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(MeasurementError, match=words):
+        read_rejected(path, small_ring)
 
 
 def test_orbits_up_and_down_of_two_sizes_are_refused(tmp_path):

@@ -18,6 +18,7 @@ from tmlattice.errors import LatticeError
 from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.maps import ring_matrix
+from tmlattice.optics import ring_tunes
 
 ENERGY = 3.0
 
@@ -417,6 +418,9 @@ QUADRUPOLE = {"PassMethod": "StrMPoleSymplectic4Pass", "PolynomA": [0.0, 0.0],
         {"m": at.Corrector("m", 0.2, [1e-5, 2e-5], **QUADRUPOLE)},
         {"m": at.Corrector("m", 0.2, [1e-4, 2e-4], PassMethod="DriftPass")},
         {"m": at.Quadrupole("m", 0.2, 0.3, PassMethod="SolenoidLinearPass")},
+        {"m": at.Drift("m", 0.2, PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)},
+        {"m": at.Monitor("m", Length=0.2, PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)},
+        {"m": at.M66("m", np.diag([2, 0.5, 2, 0.5, 1, 1]), Length=0.2, PassMethod="DriftPass")},
     ],
 )
 def test_pass_method_and_not_the_class_says_what_at_tracks(changed):
@@ -454,6 +458,23 @@ def test_energy_of_a_lattice_of_at_without_one_is_given(tmp_path):
     with pytest.raises(LatticeError, match="states no beam energy; give energy="):
         load_ring(tmp_path / "old.mat")
     assert load_ring(tmp_path / "old.mat", energy=2.5).energy == 2.5
+
+
+def test_a_family_of_matlab_may_have_a_word_of_ats(tmp_path):
+    """AT would make a cavity of the quadrupole and a wiggler of the drift."""
+    from scipy.io import savemat
+
+    tunes = []
+    for names in (("qf", "d"), ("RF", "Wig")):
+        lattice = fodo()
+        cells = np.empty((len(lattice), 1), object)
+        for place, element in enumerate(lattice):
+            fields = {k: v for k, v in vars(element).items() if v is not None}
+            family = {"q": names[0], "d": names[1]}.get(element.FamName, element.FamName)
+            cells[place, 0] = {**fields, "FamName": family, "PassMethod": element.PassMethod}
+        savemat(tmp_path / "ring.mat", {"RING": cells})
+        tunes.append(ring_tunes(load_ring(tmp_path / "ring.mat", energy=3.0)))
+    assert tunes[0] == tunes[1]
 
 
 def test_change_of_the_reference_momentum_is_refused():

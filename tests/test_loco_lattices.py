@@ -10,6 +10,7 @@ from at.load.utils import element_from_dict
 from numpy.testing import assert_allclose
 from test_import import ENERGY, design, elements, simulated  # noqa: F401  (a fixture)
 
+from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in, matlab_ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
@@ -82,6 +83,14 @@ def table_of_kicks(v):
     first.update(fields, FamName="EPU", PassMethod="IdTablePass")
 
 
+def matrix_of_a_laboratory(v):
+    """In place of a drift; its pass method is no one's."""
+    matrix = np.eye(6)
+    matrix[[0, 2], [1, 3]] = 0.5
+    first = next(e for e in lattice(v) if e["FamName"] == "DR")
+    first.update(FamName="ID", PassMethod="MyMatrixPass", M66=matrix)
+
+
 NONE = "is no pass method of AT: "
 LATTICES = {
     "a laboratory's own quadrupoles": (families("QF", "QD", PassMethod="StrMPoleNew4Pass"),
@@ -96,11 +105,15 @@ LATTICES = {
     "monitors at magnets": (monitors_at_magnets, ""),
     "a field that is a word of AT's": (families("QF", tilt=0.0, dx=0.0), ""),
     "one kick of a corrector": (families("COR", KickAngle=0.0), ""),
+    "a laboratory's own matrix": (matrix_of_a_laboratory, f"{NONE}Matrix66Pass, by its fields"),
     "noise of the radiation": (noise_of_radiation, ""),
     "a table of kicks": (table_of_kicks, "InsertionDeviceKickMap"),
 } | {
     f"a drift called {name}": (families("DR", FamName=name), "")
     for name in ("WIG", "Wiggler", "RF", "Aperture", "Collimator", "Corrector", "Matrix66")
+} | {
+    f"a {family} called {name}": (families(family, FamName=name), "")
+    for family, name in (("QF", "RF"), ("BEND", "Quad"), ("SF", "M66"), ("CAV", "Drift"))
 }  # fmt: skip
 
 
@@ -154,24 +167,51 @@ def test_a_magnet_that_at_passes_as_a_drift_is_one(fields):
     assert_allclose(np.array(ring_tunes(ring)) % 1, at.get_tune(there), atol=1e-3)
 
 
-def test_a_linear_wiggler_focuses(bring):
-    """AT's class of it goes by its length: a drift."""
+def linear_wiggler(v):
+    first = next(e for e in lattice(v) if e["FamName"] == "DR")
+    first.update(FamName="ID", PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)
+
+
+@pytest.mark.parametrize("read", [False, True])
+def test_a_linear_wiggler_focuses(bring, read):
+    """AT's class of it goes by its length: a drift. Also where a monitor's place is its own."""
 
     def change(v):
-        first = next(e for e in lattice(v) if e["FamName"] == "DR")
-        first.update(FamName="ID", PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)
+        linear_wiggler(v)
+        if read:
+            names = [e["FamName"] for e in lattice(v)]
+            v["BPMData"]["BPMIndex"][0] = names.index("ID") + 1.0
 
     plain, found = bring(lambda v: None).ring, bring(change)
     own = next(e for e in found.ring.elements if e.family == "id")
     assert own.kind == "wiggler"
     made = elements()
-    first = next(e for e in made if e["FamName"] == "DR")
-    first.update(FamName="ID", PassMethod="WiggLinearPass", InvRho=0.5, KxKz=0.0)
+    linear_wiggler({"RINGData": {"Lattice": made}})
     there = at.Lattice([element_from_dict(dict(e), quiet=True) for e in made],
                        energy=ENERGY * 1e9, periodicity=1)  # fmt: skip
     tunes = at.get_tune(there.disable_6d(copy=True))
     assert_allclose(np.array(ring_tunes(found.ring)) % 1, tunes, atol=1e-4)
     assert abs(ring_tunes(found.ring)[1] - ring_tunes(plain)[1]) > 1e-3
+
+
+@pytest.mark.parametrize("energy", [None, ENERGY])
+def test_a_lattice_in_a_file_of_its_own(tmp_path, simulated, energy):  # noqa: F811
+    """It states its energy, or the user does."""
+    variables = copy.deepcopy(simulated)
+    own = variables.pop("RINGData")["Lattice"]
+    if energy:
+        del own[-2]["Energy"]
+    scipy.io.savemat(tmp_path / "loco.mat", variables)
+    scipy.io.savemat(tmp_path / "ring.mat", {"THERING": own.reshape(-1, 1)})
+    both = [tmp_path / "loco.mat", tmp_path / "ring.mat"]
+    found = bring_in(both, Options(energy=energy))
+    assert found.ring.energy == ENERGY
+    assert_allclose(found.measurement.response, design(found)[0], atol=2e-7)
+    with pytest.raises(MeasurementError, match=r"a lattice of its own \(.mat\) with it"):
+        bring_in(both[:1], Options())
+    scipy.io.savemat(tmp_path / "loco.mat", {**variables, "RINGData": {"Lattice": own}})
+    with pytest.raises(MeasurementError, match="holds a lattice, and"):
+        bring_in(both, Options())
 
 
 def test_tunes_that_are_not_ats_are_a_doubt(bring, monkeypatch):

@@ -231,6 +231,7 @@ def test_a_channel_of_a_bpm_that_is_not_there(small_ring, data, tmp_path):
     [
         ("a b\n1 2\n", "no column holds readings"),
         ("shot,end_1 x [mm]\n0,wet\n", "'wet' of 'end_1 x' is no number"),
+        ("shot,end_1 x [mm]\n0,1_000\n", "'1_000' of 'end_1 x' is no number"),
         ("shot,end_1 x [inch]\n0,1\n", "no unit 'inch'"),
         ("monitor,x,y\nend_1,0.1,0.1\nend_1,0.2,0.2\n", "stands twice in one shot"),
         ("shot,end_1 x\n0,1,2\n", "line 2: 3 fields where the header has 2"),

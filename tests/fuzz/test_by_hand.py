@@ -5,8 +5,10 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 import zlib
 from pathlib import Path
+from unittest import mock
 
 import at
 import numpy as np
@@ -15,12 +17,14 @@ from at_ring import at_lattice
 from command import tmlattice
 
 sys.path.insert(0, str(Path(__file__).parent))
+from contract import called
 from inputs import ring, write_all
 
 from tmlattice import batch, diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.families.fields import VerticalFocusing
 from tmlattice.diagnosis.families.steps import MonitorGain, Trial
 from tmlattice.diagnosis.response.stepwise import fit_steps
+from tmlattice.importers import Options, bring_in
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -291,3 +295,22 @@ def test_deep_json_ends_in_its_own_sentence(folder):
         (folder / "own.json").write_text(text.replace('"extra": 0', f'"extra": {deep}'))
         done = tmlattice("info", "own.json", cwd=folder, check=2)
         assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_name_of_thousands_of_words_is_searched_once(folder):
+    """For runs of words that are a monitor's name: no longer ones than such a name has."""
+    name = "m::1 " + "a " * 20_000
+    (folder / "a.csv").write_text(WIDE.format("0.2").replace("m::1", name))
+    begun = time.process_time()
+    found = bring_in([folder / "a.csv"], Options(ring=load_ring(folder / "ring.json")))
+    assert time.process_time() - begun < 2.0
+    assert "m::1" in found.measurement.monitors
+
+
+def test_init_reads_a_file_that_is_damaged_once(folder):
+    """Only names that the lattice does not have are a reason to read it again."""
+    (folder / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(2000))
+    with mock.patch("tmlattice.lattice.mat_file.subprocess.run", wraps=subprocess.run) as read:
+        code, _, errors, _ = called(["init", "ring.json", "a.h5"], folder)
+    assert (code, read.call_count) == (2, 1)
+    assert "a.h5' cannot be read as HDF5" in errors

@@ -86,7 +86,7 @@ def _of_data(
     channel that is none of the lattice's is None."""
     import numpy as np
 
-    from tmlattice.errors import MeasurementError
+    from tmlattice.errors import MeasurementError, UnknownNameError
     from tmlattice.importers import Options, bring_in, described
     from tmlattice.measurement import read_measurement
 
@@ -97,8 +97,10 @@ def _of_data(
     else:
         try:
             brought = bring_in([path], Options(ring=ring))
-        except MeasurementError:
-            brought = bring_in([path])  # raises the error again where names are not the cause
+        except MeasurementError as error:
+            if not isinstance(error.__cause__, UnknownNameError):
+                raise
+            brought = bring_in([path])
             names = getattr(brought.measurement, "monitors", ())
             sentence = (
                 f"none of its {len(names)} channels is a BPM of the lattice: fill in [channels]"

@@ -13,7 +13,7 @@ import numpy as np
 from tmlattice.errors import LatticeError
 from tmlattice.importers.imported import is_number
 from tmlattice.lattice.at_child import shipped_methods
-from tmlattice.lattice.expressions import check_order
+from tmlattice.lattice.expressions import check_order, of_fields
 
 LONGEST = 1e5
 """m; no element of a ring is longer."""
@@ -59,7 +59,7 @@ def at_element(fields: Mapping[str, Any], place: int, energy: float, messages: C
     _one_gradient(kept)
     _complete(kept, energy)
     try:
-        return _made(kept, place)
+        return of_fields(kept, index=place, check=False, quiet=True)
     except Exception as error:  # AT's constructors fail in their own ways
         said_so = " ".join(str(error).split()) or type(error).__name__
         raise LatticeError(
@@ -75,6 +75,8 @@ def _is_data(value: Any) -> bool:
 
 def _method_of(fields: Mapping[str, Any]) -> str:
     """AT's own pass method of such fields."""
+    if np.shape(fields.get("M66", 0)) == (6, 6):
+        return "Matrix66Pass"
     multipole = any(np.size(fields.get(name, ())) for name in ("PolynomA", "PolynomB"))
     if is_number(fields.get("BendingAngle")):
         return "BndMPoleSymplectic4Pass" if multipole else "BendLinearPass"
@@ -114,25 +116,3 @@ def _complete(fields: dict[str, Any], energy: float) -> None:
         for plane in "xy":
             if f"{plane}kick" in fields:
                 fields.setdefault(f"{plane}kick1", np.zeros_like(fields[f"{plane}kick"]))
-
-
-def _made(fields: Mapping[str, Any], place: int) -> Any:
-    """By AT, whose class of an element goes by the name of its family before its pass method: a
-    drift called `WIG` is none the less a drift."""
-    import at
-    from at.load.utils import element_from_dict
-
-    def made(**more: Any) -> Any:
-        return element_from_dict({**fields, **more}, index=place, check=False, quiet=True)
-
-    empty = "Class" not in fields and fields["PassMethod"] in EMPTY
-    try:
-        element = made()
-        if not (empty and isinstance(element, at.M66)):
-            return element
-    except Exception:  # AT's constructors fail in their own ways
-        if not empty:
-            raise
-    element = made(FamName="_")
-    element.FamName = fields["FamName"]
-    return element

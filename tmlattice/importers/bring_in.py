@@ -110,6 +110,7 @@ def bring_in(
             text_of(path)  # its error states what to do
     if options.turns and len(files) != 1:
         raise MeasurementError("turns are in one file; name one")
+    shown = ", ".join(f"'{path}'" for path in files) or label(frames[0])
     known = [] if options.turns else files
     matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
     hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
@@ -120,7 +121,6 @@ def bring_in(
         if isinstance(error, TmlatticeError):
             raise
         log.info("not imported", exc_info=True)
-        shown = ", ".join(f"'{path}'" for path in files) or label(frames[0])
         said = plain(f"{type(error).__name__}: {error}", 200)
         raise MeasurementError(
             f"{shown}: fields have other types or sizes than a reader knows ({said}); save it again"
@@ -133,6 +133,8 @@ def bring_in(
         brought = replace(brought, measurement=replace(data, noise=noise))
         brought = brought.saying(f"the noise is taken as {1e6 * options.noise:g} µm, as stated")
     if isinstance(brought.measurement, OrbitResponse):
+        if not np.isfinite(brought.measurement.response).any():
+            raise MeasurementError(f"{shown}: no corrector's orbit change was read; save it again")
         brought = _with_all_noise(brought, brought.measurement)
     if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
         return brought
@@ -254,6 +256,14 @@ def _bring(
         )
     if len(loco) == 1 and len(loco) + len(rest) == len(files):
         ((path, content),) = loco
+        if len(rest) == 1 and not responses:
+            if not content.keys().isdisjoint(("RINGData", "THERING")):
+                raise MeasurementError(
+                    f"'{path}' holds a lattice, and '{rest[0][0]}' is given as well; give one"
+                )
+            own = _lattice(rest, options)
+            content = {**content, "RINGData": {"Lattice": own.fields, "Energy": own.energy}}
+            rest = []
         if not rest:
             return bring_loco(content, path, options.iteration, options.keep_bad, options.energy)
         if len(responses) == 1:
@@ -336,7 +346,7 @@ def _lattice(matlab: Sequence[tuple[Path, Content]], options: Options) -> Elemen
     if len(matlab) > 1:
         raise MeasurementError(f"two lattices, '{matlab[0][0]}' and '{matlab[1][0]}'; give one")
     ((path, content),) = matlab
-    return elements_of(content, path, options.sequence)
+    return elements_of(content, path, options.sequence, options.energy)
 
 
 # --- a measurement by its path --------------------------------------------------------------------

@@ -196,9 +196,18 @@ def _csv(path: Path) -> list[Column]:
     return [Column(*named(name), [row[i] for _, row in rows]) for i, name in enumerate(header)]
 
 
+def number(text: str) -> float:
+    """A number of a table.
+
+    Raises:
+        ValueError: it is none; `1_000`, which Python takes for one, is none either.
+    """
+    return float(text.replace("_", "?"))
+
+
 def _is_number(text: str) -> bool:
     try:
-        float(text.replace(",", "."))
+        number(text.replace(",", "."))
     except ValueError:
         return False
     return True

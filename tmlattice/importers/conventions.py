@@ -5,16 +5,17 @@ corrector and each BPM is compared with the design's, and the data decide whethe
 or the momentum was constant. Nothing is corrected.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.data_checks import check_data
-from tmlattice.errors import UnstableRingError
+from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.importers.imported import Array, counted
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
+from tmlattice.observe.compared import NEAR, OfResponse, ratio
 
 MOST = 0.7
 """Correlation with the design's, of the typical corrector, from which single ones can be found: on
@@ -68,6 +69,7 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
     """
     try:
         told = [check.sentence for check in check_data(ring, measured).reported]
+        told += _per_kick(OfResponse(ring, replace(measured, rf=None)))
         model, flat = ResponseModel(ring), ResponseModel(ring, dimension=4)
     except UnstableRingError as error:
         return [], [f"the lattice has no closed orbit to compare with ({error})"]
@@ -82,6 +84,24 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
             confirmed += agreed
             told += not_so
     return confirmed, told
+
+
+def _per_kick(checked: OfResponse) -> list[str]:
+    """A hint where the orbits are the design's for a kick of one unit, and not for the steps."""
+    try:
+        read, made, _ = checked.pairs(checked.data)
+    except MeasurementError:  # reported already
+        return []
+    stated = ratio(read, made)
+    for unit, kick in (("mrad", 1e-3), ("rad", 1.0)):
+        steps = np.abs(checked.data.kicks[:, None, None]) / kick
+        other = ratio(read * steps, made)
+        if abs(np.log(abs(other))) < NEAR < abs(np.log(abs(stated))):
+            return [
+                f"the orbits are {stated:.3g} times the design's for the steps, and {other:.3g} "
+                f"times for a kick of 1 {unit}: give orbit changes, not the response per {unit}"
+            ]
+    return []
 
 
 def _plane(model: ResponseModel, measured: OrbitResponse, plane: str) -> Plane:

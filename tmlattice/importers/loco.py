@@ -120,7 +120,10 @@ def bring_loco(
 
 def _structure(value: Any, what: str) -> Fields:
     if not isinstance(value, Mapping):
-        raise MeasurementError(f"no structure {what}; give the whole LOCO file")
+        raise MeasurementError(
+            f"no structure {what}; give the whole LOCO file, and a lattice of its own "
+            "(.mat) with it"
+        )
     return value
 
 

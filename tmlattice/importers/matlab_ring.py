@@ -27,7 +27,8 @@ from tmlattice.errors import LatticeError
 from tmlattice.importers.at_element import at_element
 from tmlattice.importers.imported import gev, is_positive
 from tmlattice.lattice import Ring
-from tmlattice.lattice.at_file import ring_from_at
+from tmlattice.lattice.at_file import passes_freely, ring_from_at
+from tmlattice.lattice.checks import check_ring
 from tmlattice.optics import ring_tunes
 
 AS_AT = 2e-3
@@ -55,13 +56,19 @@ class Elements:
     frequency: float | None = None
 
 
-def elements_of(content: Mapping[str, Any], path: Path, sequence: str | None = None) -> Elements:
+def elements_of(
+    content: Mapping[str, Any],
+    path: Path,
+    sequence: str | None = None,
+    energy: float | None = None,
+) -> Elements:
     """The lattice among a MATLAB file's variables.
 
     Args:
         content: of `read_mat`.
         path: of the file.
         sequence: the variable, where several are lattices.
+        energy: GeV; None: what the elements state.
 
     Raises:
         LatticeError: none is one, or more than one are, or no energy is stated.
@@ -82,9 +89,11 @@ def elements_of(content: Mapping[str, Any], path: Path, sequence: str | None = N
         )
     ((name, elements),) = found.items()
     fields = [dict(e) for e in elements if str(e.get("Class", "")).lower() != "ringparam"]
-    energy = next((e["Energy"] for e in elements if is_positive(e.get("Energy"))), None)
-    if energy is None:
-        raise LatticeError(f"the lattice '{name}' of '{path}' states no energy; add Energy")
+    stated = [e["Energy"] for e in elements if is_positive(e.get("Energy"))]
+    if energy is None and not stated:
+        raise LatticeError(
+            f"the lattice '{name}' of '{path}' states no energy; name it: --energy, in GeV"
+        )
     cavities = [
         e for e in fields if is_positive(e.get("Frequency")) and is_positive(e.get("HarmNumber"))
     ]
@@ -92,7 +101,7 @@ def elements_of(content: Mapping[str, Any], path: Path, sequence: str | None = N
     return Elements(
         name=path.name.split(".")[0],
         fields=fields,
-        energy=gev(energy),
+        energy=gev(stated[0]) if energy is None else energy,
         harmonic=None if main is None else round(main["HarmNumber"]),
         frequency=None if main is None else float(main["Frequency"]),
     )
@@ -171,10 +180,7 @@ def ring_of_elements(
     messages: Counter[str] = Counter()
     with warnings.catch_warnings():  # AT's own, of what it finds in old files
         warnings.simplefilter("ignore")
-        made = [
-            _as_it_passes(at_element(fields, i, energy, messages))
-            for i, fields in enumerate(elements)
-        ]
+        made = [at_element(fields, i, energy, messages) for i, fields in enumerate(elements)]
     of_family = _planes_of_families(made, roles.kicks)
     sequence: list[Any] = []
     where: dict[tuple[int, str], int] = {}  # (place, "" or plane) -> in the sequence
@@ -194,6 +200,7 @@ def ring_of_elements(
         warnings.simplefilter("always")
         try:
             ring = ring_from_at(lattice, name, energy)
+            check_ring(ring)
         except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError) as error:
             raise LatticeError(f"the lattice cannot be taken over ({error}); correct it") from error
     names = _names(ring, [_family(element) for element in sequence], where.values())
@@ -259,15 +266,6 @@ def _names(ring: Ring, families: Sequence[str], places: Iterable[int]) -> dict[i
     return names
 
 
-def _as_it_passes(element: Any) -> Any:
-    """No drift, where AT made one of the length alone and its pass method is another's."""
-    import at
-
-    if not isinstance(element, at.Drift) or "Drift" in element.PassMethod:
-        return element
-    return at.Element(element.FamName, **{k: v for k, v in vars(element).items() if k != "FamName"})
-
-
 def _family(element: Any) -> str:
     return str(element.FamName).strip().lower()
 
@@ -320,7 +318,7 @@ def _read(element: Any, parts: list[Any]) -> list[Any]:
     import at
 
     fills = isinstance(element, at.Monitor | at.Marker | at.Drift)
-    if fills and parts == [element]:
+    if fills and passes_freely(element) and parts == [element]:
         return [at.Monitor(_family(element), Length=float(getattr(element, "Length", 0.0)))]
     return [at.Monitor(f"{_family(element)}_bpm"), *parts]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
-from tmlattice.importers.columns import Column
+from tmlattice.importers.columns import Column, number
 from tmlattice.importers.imported import (
     Imported,
     counted,
@@ -315,7 +315,7 @@ def _number(path: str, row: int, name: str, text: str) -> float:
     if text.casefold() in _MISSING:
         return float("nan")
     try:
-        return float(text)
+        return number(text)
     except ValueError:
         raise MeasurementError(
             f"{path}, row {row + 1} below the header: '{text}' of '{name}' is no number"
@@ -324,7 +324,7 @@ def _number(path: str, row: int, name: str, text: str) -> float:
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        number(text)
     except ValueError:
         return not text
     return True
@@ -435,7 +435,7 @@ class _Finder:
             raise MeasurementError(
                 f"{path}: {error}; assign the names in [channels] of "
                 "tmlattice.toml (`tmlattice import --example` writes one)"
-            )
+            ) from error
         loose = [d for d, at in found.items() if at is not None and not self._same(d, at)]
         if loose and not self._in_order:
             at = found[loose[0]]
@@ -457,7 +457,8 @@ class _Finder:
             if key in table:
                 return table[key]
         tokens = [token.casefold() for token in _TOKEN.findall(device)]
-        for count in range(len(tokens), 0, -1):  # the longest run that is a monitor's name
+        longest = max(map(len, (*self._told, *self._plain)), default=0)
+        for count in range(min(len(tokens), longest), 0, -1):  # the longest run that is a name
             runs = ["".join(tokens[i : i + count]) for i in range(len(tokens) - count + 1)]
             hits = {
                 table[run] for run in runs for table in (self._told, self._plain) if run in table

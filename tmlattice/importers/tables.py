@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
-from tmlattice.importers.columns import SDDS, Column
+from tmlattice.importers.columns import SDDS, Column, number
 from tmlattice.importers.imported import (
     LIGHT,
     Imported,
@@ -167,7 +167,7 @@ Header = list[tuple[str, str]]
 
 def _number(path: str, line: int, text: str) -> float:
     try:
-        value = float(text) if text.strip() else np.nan
+        value = number(text) if text.strip() else np.nan
     except ValueError:
         raise MeasurementError(f"{path}, row {line}: '{text}' is no number") from None
     return value

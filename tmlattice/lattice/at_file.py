@@ -289,18 +289,19 @@ def _convert(
     gradient = abs(strengths_of(element)[1]) if acts else 0.0
     if "Symplectic4" in method and gradient * length**2 > COARSE * max(steps, 1.0) ** 4:
         left_out["the error of AT's integration in a few steps"] += 1
-    if not acts and (isinstance(element, at.Monitor) or mad in ("MONITOR", "HMONITOR", "VMONITOR")):
-        return "monitor", ocelot.Monitor(l=length, eid=family)
-    if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
-        return "monitor", ocelot.Monitor(l=length, eid=family)  # lattices from before the class
-    way = isinstance(element, at.Drift | at.Marker | at.Aperture)
-    if (way and not acts) or _passive(element, left_out):
+    if passes_freely(element):
+        if isinstance(element, at.Monitor) or mad in ("MONITOR", "HMONITOR", "VMONITOR"):
+            return "monitor", ocelot.Monitor(l=length, eid=family)
+        if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
+            return "monitor", ocelot.Monitor(l=length, eid=family)  # from before the class
+        if _fields(element):
+            left_out[f"fields of magnets whose pass method is {method}"] += 1
         if mad in ACTS:
             left_out[f"what {mad.lower()} does"] += 1
         if length:
             return "drift", ocelot.Drift(l=length, eid=family)
         return "marker", ocelot.Marker(eid=family)
-    if isinstance(element, at.M66):
+    if isinstance(element, at.M66) and method.startswith("Matrix66"):
         matrix = np.asarray(element.M66, dtype=float)
         if roll:
             matrix = R2 @ matrix @ R1
@@ -321,7 +322,8 @@ def _convert(
     across = kick * [1, 1, 1, 1, 0, 0]
     kind, source = _matrix(matrix, family, length, energy, across if across.any() else None)
     name = type(element).__name__
-    name = element.PassMethod.removesuffix("Pass") if name == "Element" else name
+    if name in ("Element", "Drift", "Marker", "Monitor"):
+        name = method.removesuffix("Pass")
     left_out[f"what {name} has beyond its first-order matrix"] += 1
     if element.PassMethod.startswith(("GWig", "Wigg", "IdTable")):
         kind = "wiggler"
@@ -342,13 +344,11 @@ def _acts(element: Any) -> bool:
     return element.PassMethod.startswith(_FIELDS) and _fields(element)
 
 
-def _passive(element: Any, left_out: Counter[str]) -> bool:
-    """Whether AT passes it as if nothing were there, whatever its fields: a magnet that was
-    switched off by its pass method; and noise of the radiation, which moves no orbit."""
-    method = element.PassMethod
-    if method in ("DriftPass", "IdentityPass") and _fields(element):
-        left_out[f"fields of magnets whose pass method is {method}"] += 1
-    return method == "DriftPass" or "Identity" in method or "QuantDiff" in method
+def passes_freely(element: Any) -> bool:
+    """Whether AT passes an element as if nothing were there, whatever its class and its fields: by
+    a drift, an aperture, a monitor of the beam's moments, or noise of the radiation."""
+    free = ("Drift", "Identity", "QuantDiff", "Aperture", "Moments")
+    return any(word in element.PassMethod for word in free)
 
 
 def _correctors(element: Any, family: str, mad: str) -> list[Place]:

@@ -31,6 +31,8 @@ DEEPEST = 30
 """Structures within structures; a file that loops ends here."""
 MOST_REFERENCES = 300_000
 """Followed in a file of MATLAB 7.3: a ring of 10,000 elements of 30 fields."""
+MOST_OBJECTS = 10_000
+"""Groups and data sets of a file that is no lattice: each is looked at."""
 MOST_ATTRIBUTE = 1 << 16
 """Bytes of an attribute."""
 
@@ -212,6 +214,7 @@ class _Budget:
         import h5py
 
         entered: set[Any] = set()
+        objects = 0
         waiting: list[tuple[str, Any]] = [("", self.file)]
         while waiting:
             path, item = waiting.pop()
@@ -222,6 +225,9 @@ class _Budget:
             if (key := _identity(item)) in entered or path.count("/") > DEEPEST:
                 raise RefusedError(f"the group '{path}' stands in itself, or twice")
             entered.add(key)
+            objects += len(item)
+            if objects > MOST_OBJECTS:
+                raise RefusedError(f"it has more than {MOST_OBJECTS:,} groups and data sets")
             members = [(f"{path}/{n}".lstrip("/"), self.child(item, n)) for n in item]
             waiting += reversed(members)
 
@@ -237,7 +243,8 @@ class _Budget:
         kind = item.dtype
         text = h5py.check_string_dtype(kind) is not None
         reference = references and h5py.check_ref_dtype(kind) is h5py.Reference
-        if not (kind.kind in "fiub" or text or reference):
+        names = kind.kind in "iu" and h5py.check_enum_dtype(kind) is not None
+        if names or not (kind.kind in "fiub" or text or reference):
             raise RefusedError(f"'{name}' holds {_kind(kind)}; numbers or texts are read")
         if item.shape is None or 0 in item.shape:
             raise RefusedError(f"'{name}' is empty")
@@ -259,6 +266,11 @@ class _Budget:
         import h5py
 
         self.checked(item, name, references)
+        if (unwritten := _unwritten(item)) and not _is_nan(item.fillvalue):
+            raise RefusedError(
+                f"{unwritten} of '{name}' was never written: such numbers would be read as "
+                f"{item.fillvalue}; save it whole, or with NaN as the fill value"
+            )
         value = item[()]
         return _texts(value, name) if h5py.check_string_dtype(item.dtype) else value
 
@@ -295,8 +307,23 @@ def _identity(item: Any) -> Any:
     return info.fileno, info.addr
 
 
+def _unwritten(item: Any) -> str:
+    """What of a data set the file does not hold; empty where it holds all of it."""
+    if item.chunks is None:
+        return "" if item.id.get_storage_size() else "all"
+    chunks = math.prod(-(-n // m) for n, m in zip(item.shape, item.chunks, strict=True))
+    there = item.id.get_num_chunks()
+    return "" if there >= chunks else f"{chunks - there:,} of {chunks:,} parts"
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, np.floating) and bool(np.isnan(value))
+
+
 def _kind(kind: Any) -> str:
     """What a type of elements is called."""
+    if kind.kind in "iu":
+        return "names of an enumeration"
     if kind.kind == "c":
         return "complex numbers"
     if kind.names:

@@ -183,6 +183,19 @@ def _checked(make: Callable[..., Any]) -> Callable[..., Any]:
     return made
 
 
+def of_fields(fields: dict[str, Any], **options: Any) -> Any:
+    """AT's element of a structure of MATLAB. Its class is that of its fields: of a family's name,
+    which AT looks at before its pass method, only `BPM` and `Monitor` are one."""
+    from at.load.utils import element_from_dict
+
+    name = fields.get("FamName")
+    if not isinstance(name, str) or name.casefold() in ("bpm", "monitor"):
+        return element_from_dict(fields, **options)
+    element = element_from_dict({**fields, "FamName": "_"}, **options)
+    element.FamName = name
+    return element
+
+
 @contextmanager
 def nothing_run() -> Iterator[None]:
     """AT's readers of `.m` and `.repr` calculate where they would evaluate, and all of them look at
@@ -210,7 +223,7 @@ def nothing_run() -> Iterator[None]:
     with _ONE_AT_A_TIME:
         for module in (matfile, reprfile):
             module.eval = value
-        json.element_from_dict = matfile.element_from_dict = _checked(make)
+        json.element_from_dict, matfile.element_from_dict = _checked(make), _checked(of_fields)
         try:
             yield
         finally:

@@ -265,6 +265,12 @@ def _rf(data: Any, factor: float) -> Any:
     return _with(data, rf=replace(data.rf, step=data.rf.step * factor))
 
 
+def _rf_orbit(data: OrbitResponse, factor: float) -> OrbitResponse:
+    if data.rf is None or data.rf.orbit is None:
+        raise MeasurementError("there is no RF orbit of which anything could be assumed")
+    return _with(data, rf=replace(data.rf, orbit=data.rf.orbit * factor))
+
+
 # --- turns and tunes of a stored beam ------------------------------------------------------------
 def _last_first(data: TurnByTurn) -> TurnByTurn:
     return _with(data, readings=data.readings[:, ::-1])
@@ -552,6 +558,10 @@ ASSUMPTIONS: dict[str, Assumption] = {
         "give the step that the orbit change belongs to",
         _rf,
         0.5,
+    ),
+    "rf-in-mm": _columns("the RF's orbit is in mm", UNIT.format("it", "m"), _rf_orbit, 1e-3),
+    "rf-in-km": _columns(
+        "the RF's orbit is a thousand times too small", UNIT.format("it", "m"), _rf_orbit, 1e3
     ),
     "turns-backwards": _of(
         (TurnByTurn,),

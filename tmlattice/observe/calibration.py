@@ -113,8 +113,18 @@ def read_rejected(path: str | Path, ring: Ring) -> list[Channel]:
     """
     path = Path(path)
     document = read_document(path, "calibration", FORMAT)
-    with located(path):
-        return [(ring[row["element"]].name, row["plane"]) for row in document.get("rejected", [])]
+    found: list[Channel] = []
+    for row in document.get("rejected", []):
+        with located(path):
+            element, plane = ring[row["element"]], row["plane"]
+        if element.kind not in (("monitor",) if plane else CORRECTORS):
+            raise MeasurementError(
+                f"{path}: '{element.name}' is a {element.kind}, and is rejected as a "
+                f"{'BPM' if plane else 'corrector'}; write the calibration anew (diagnose "
+                "--lattice-out)"
+            )
+        found.append((element.name, plane))
+    return found
 
 
 def write_calibration(

@@ -211,7 +211,8 @@ class OfResponse(OfColumns):
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""
-        return [own for own in super().candidates() if self.stepped or own[0][:3] != "rf-"]
+        left_out = "rf-" if not self.stepped else "rf-in" if not read_rf(self.data) else "-"
+        return [own for own in super().candidates() if not own[0].startswith(left_out)]
 
 
 @dataclass(frozen=True)

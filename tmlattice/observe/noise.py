@@ -230,7 +230,9 @@ def stated_and_estimated(ring: Ring, measured: OrbitResponse) -> Array | None:
         shown = estimated_noise(measured, places(ring, measured))
     except MeasurementError:
         return None
-    return np.stack([np.nanmedian(measured.noise, axis=0), shown[0]])
+    there = [own[np.isfinite(own)] for own in measured.noise.T]
+    stated = [np.median(own) if len(own) else np.nan for own in there]
+    return np.stack([stated, shown[0]])
 
 
 def overstated(ring: Ring, measured: OrbitResponse) -> bool:

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import Settings, apply
+from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TuneReading
 from tmlattice.observe.stored import Stored, rf_of, stacked
+from tmlattice.optics import ring_tunes
 
 Array = NDArray[np.float64]
 
@@ -21,6 +23,10 @@ DELTA = 5e-4
 TUNE, CHROMATICITY = 1e-4, 0.1
 """Errors if none is stated: a tune's from drifts of currents in minutes, a chromaticity's from
 these over steps of a per mil."""
+
+LARGEST = 10.0
+"""Times 1, the design's chromaticity and its tune together, by which a chromaticity may differ from
+the design's: without its sextupoles, a ring has one to four times its tune."""
 
 WIDER = 0.01
 """Relative change of all gaps of bends, for the slope of the tunes."""
@@ -44,7 +50,11 @@ class TuneReadings(Stored):
 
 
 def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]) -> TuneReadings:
-    """Return the problem of measured tunes, each of the mode nearer to its plane."""
+    """Return the problem of measured tunes, each of the mode nearer to its plane.
+
+    Raises:
+        MeasurementError: a chromaticity that no error of the ring explains.
+    """
     shots = len(measured.tune)
     settings: tuple[Settings, ...] = measured.settings or ({},) * shots
     model = ResponseModel(ring)
@@ -58,6 +68,14 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     slopes = np.full((shots, 2), np.nan)
     if measured.chromaticity is not None:
         slopes = measured.chromaticity
+        up, down = (StoredBeam(ResponseModel(ring, 6, h)).tunes for h in (step, -step))
+        own = ((up - down + 0.5) % 1.0 - 0.5) / energies
+        most = LARGEST * (1 + np.abs(own) + (ring_tunes(ring) or [0.0, 0.0]))
+        for shot, plane in np.argwhere(np.abs(slopes - own) > most)[:1]:
+            raise MeasurementError(
+                f"a chromaticity of {slopes[shot, plane]:g} in {'xy'[plane]}, where the design has "
+                f"{own[plane]:.3g}: no error of a ring explains it; correct it, or leave it out"
+            )
     data = np.concatenate([near, slopes], axis=1)
     errors = np.concatenate(
         [_filled(measured.tune_error, TUNE, shots),
