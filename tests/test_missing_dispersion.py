@@ -36,6 +36,7 @@ from tmlattice.observe.calibration import (
     write_calibration,
 )
 from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_change import response_change
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
