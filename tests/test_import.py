@@ -32,6 +32,7 @@ real = pytest.mark.skipif(
     not os.environ.get("TMLATTICE_DATA") or not DATA.is_dir(),
     reason="TMLATTICE_DATA names no folder with real_rings in it",
 )
+pytestmark = pytest.mark.usefixtures("forked_readers")
 
 ENERGY, CELLS, HARMONIC = 1.5, 8, 88
 POLE = {"MaxOrder": 2.0, "NumIntSteps": 20.0, "PassMethod": "StrMPoleSymplectic4Pass"}

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from contract import made, report, tried, tried_whole
 from kills import child, filled, killed, litter, prepared, references
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
 SOME = 80
 """Inputs, one or more of each format; `make fuzz` takes 10,000."""
 WRITING = ("simulate", "check", "import")
