@@ -391,8 +391,8 @@ def folders(tmp_path_factory, small_ring):
 @pytest.mark.parametrize(("name", "coordinates"), [("on", 4), ("off", 6)])
 def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
     done = tmlattice(
-        "tune-fit", SMALL, "--measurement", folders / name, "--epochs", 60, "--out",
-        "fit", cwd=tmp_path, check=0,
+        "tune-fit", SMALL, "--measurement", folders / name, "--epochs", 150, "--method", "adam",
+        "--out", "fit", cwd=tmp_path, check=0,
     )  # fmt: skip
     result = json.loads((tmp_path / "fit" / "tune-fit.json").read_text())
     jsonschema.validate(result, schema("tune-fit"))
