@@ -236,19 +236,6 @@ def test_wrong_input_ends_in_one_sentence_and_leaves_nothing(tmp_path, arguments
     assert list(tmp_path.iterdir()) == []
 
 
-def test_full_disk_leaves_nothing(tmp_path):
-    from tmlattice.files import OutputError, output_folder
-
-    def write_on_a_full_disk():
-        with output_folder(tmp_path / "out") as folder:
-            (folder / "a").write_text("x")
-            raise OSError(28, "No space left on device")
-
-    with pytest.raises(OutputError, match="No space left"):
-        write_on_a_full_disk()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_existing_results_are_replaced_whole(tmp_path):
     from tmlattice.files import output_file
 
