@@ -212,7 +212,7 @@ def test_map_states_its_error_where_its_prior_is_true(small_ring, small_network)
     rng = np.random.default_rng(3)
     names = [e.name for e in small_ring.magnets if e.kind == "quadrupole" and e.k1]
     pulls = []
-    for _ in range(25):
+    for _ in range(10):
         drawn = [Cause("quadrupole_gradient", n, 2e-3 * rng.standard_normal()) for n in names]
         network = TaylorNetwork.from_ring(apply(small_ring, drawn))
         readings = network(LAUNCH).detach().numpy()
@@ -229,7 +229,7 @@ def test_map_states_its_error_where_its_prior_is_true(small_ring, small_network)
         )  # of 1 %; fmt: skip
         pulls.append((fit.tunes - one_turn_optics(network).tunes) / fit.tune_sigma)
     width = np.sqrt(np.mean(np.square(pulls)))
-    assert 0.7 < width < 1.35  # 50 pulls, not all independent: 1 +- 0.15
+    assert 0.6 < width < 1.5  # 20 pulls, not all independent: 1 +- 0.2
 
 
 def test_adam_on_a_symplectic_network_moves_generators(small_ring, small_network):
