@@ -1,8 +1,10 @@
 """Rings that many tests share, loaded once."""
 
 import os
+import sys
 import tempfile
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -65,6 +67,19 @@ def petra3_network(petra3):
     from tmlattice import TaylorNetwork
 
     return TaylorNetwork.from_ring(petra3)
+
+
+@pytest.fixture(scope="module")
+def forked_readers():
+    """Binary files are read by copies of this process, which have the libraries already."""
+    import h5py  # noqa: F401
+    import scipy.io  # noqa: F401
+
+    sys.path.append(str(Path(__file__).parent / "fuzz"))
+    from contract import forked
+
+    with mock.patch("tmlattice.lattice.mat_file.subprocess.run", forked):
+        yield
 
 
 @pytest.fixture

@@ -95,20 +95,9 @@ def with_names_of_their_own(ring, folder, form="{}_a{}"):
     return load_ring(folder / "ring.json")
 
 
-def test_a_supply_of_magnets_with_names_of_their_own(small_ring, before, after, change, tmp_path):
-    """What their names begin with stands for it; all else is as with a family's name."""
+def test_a_supply_of_magnets_with_names_of_their_own(small_ring, tmp_path):
+    """What their names begin with stands for it."""
     ring = with_names_of_their_own(small_ring, tmp_path)
-    result = diagnose(ring, after, reference=before)
-    found, same = (
-        {
-            (own.effect, own.element.casefold().replace("_a", "::")): own.amount
-            for own in of.findings
-        }
-        for of in (result, change)
-    )
-    assert found == pytest.approx({(e, name.casefold()): a for (e, name), a in same.items()})
-    assert ("family_gradient", "qf") in found
-    assert [e.name for e in result.as_found.elements] == [e.name for e in ring.elements]
     supply = Cause("family_gradient", "qf", 0.01)
     weaker = apply(ring, [supply])
     assert weaker["QF_a3"].k1 == pytest.approx(1.01 * ring["QF_a3"].k1)
@@ -195,23 +184,10 @@ def test_the_changed_supply_and_the_changed_magnet_are_found_and_no_other(change
         assert own.amount_sigma < 0.1 * abs(true)  # noise, drifts and what magnets scatter by
 
 
-def test_a_machine_that_only_drifts_has_not_changed(small_ring, before):
-    same = diagnose(small_ring, machine(small_ring, seed=5, drift=0.01), reference=before)
-    assert (same.verdict, same.findings) == ("none", ())
-    assert "Nothing changed since the reference" in report_text(same)
-
-
 def test_a_measurement_against_itself_is_nothing(small_ring, before):
     same = diagnose(small_ring, before, reference=before)
     assert (same.verdict, same.findings) == ("none", ())
-
-
-def test_a_corrector_that_was_reversed_since_is_named(small_ring, before):
-    kicks = np.where(np.arange(len(before.kicks)) == 4, -1.0, 1.0)
-    wrong = replace(before, response=before.response * kicks[:, None, None])
-    (found,) = diagnose(small_ring, wrong, reference=before).findings
-    assert (found.effect, found.element) == ("corrector_calibration", before.correctors[4])
-    assert abs(found.amount + 2) < 0.01  # its own calibration is known to a per cent
+    assert "Nothing changed since the reference" in report_text(same)
 
 
 def exchanged(measured, axis, a, b):
@@ -224,58 +200,69 @@ def exchanged(measured, axis, a, b):
     return replace(measured, response=response, rf=rf, noise=measured.noise[order])
 
 
-@pytest.mark.parametrize("day", ["before", "after"])
-@pytest.mark.parametrize(("axis", "a", "b"), [(0, 4, 5), (0, 2, 11), (0, 16, 5), (1, 3, 20)])
-def test_what_was_exchanged_on_one_day_is_located(small_ring, before, axis, a, b, day):
-    """Neighbours, correctors far from one another, one of each plane, and monitors; in a machine
-    that drifts."""
-    days = {"before": before, "after": machine(small_ring, seed=5, drift=0.01)}
-    days[day] = exchanged(days[day], axis, a, b)
-    result = diagnose(small_ring, days["after"], reference=days["before"])
-    names = (before.correctors, before.monitors)[axis]
-    (found,) = result.findings
-    assert (result.verdict, found.effect) == ("localised", None)
-    assert set(found.elements) == {names[a], names[b]}
-    text = " ".join(report_text(result).split())
-    assert "respond each as the other one did. 1." in text  # and no word of small errors, or of
-    assert "--corrected-out" not in text  # gradients to be set
-
-
-def test_a_step_that_went_wrong_in_the_reference_is_no_change(small_ring, before, after):
-    """A supply jumped while v6 was stepped, on the first day alone."""
-    orbits = before.response.copy()
-    orbits[6] += 0.3 * orbits[10]
-    result = diagnose(small_ring, after, reference=replace(before, response=orbits))
-    assert {own.element for own in result.findings} == {"qf", "QD::5"}
-    (text,) = [text for text in result.warnings if text.startswith("of the reference: ")]
-    assert "v6 (+2.8 µrad in y, as behind v10)" in text  # 0.3 of its 10
-
-
-def test_what_changed_is_found_beside_two_exchanged_correctors(small_ring, before, after):
-    result = diagnose(small_ring, exchanged(after, 0, 4, 5), reference=before)
+def test_what_changed_is_found_together_with_what_was_exchanged_on_one_day(
+    small_ring, before, after
+):
+    """Two correctors, one of each plane, in the reference; two BPMs since."""
+    reference = exchanged(before, 0, 16, 5)
+    result = diagnose(small_ring, exchanged(after, 1, 3, 20), reference=reference)
     assert result.verdict == "localised"
     assert {own.element for own in result.findings if own.effect} == {"qf", "QD::5"}
-    (pair,) = (own for own in result.findings if own.effect is None)
-    assert set(pair.elements) == {before.correctors[4], before.correctors[5]}
+    pairs = {frozenset(own.elements) for own in result.findings if own.effect is None}
+    names = before.correctors, before.monitors
+    assert pairs == {frozenset(names[axis][k] for k in pair)
+                     for axis, pair in enumerate([(16, 5), (3, 20)])}  # fmt: skip
+    text = " ".join(report_text(result).split())
+    assert text.count("respond each as the other one did") >= 2
 
 
-@pytest.mark.parametrize(("axis", "a", "b"), [(0, 4, 5), (1, 3, 20)])
+@pytest.mark.parametrize(
+    ("axis", "a", "b"), [(0, 4, 5), pytest.param(1, 3, 20, marks=pytest.mark.slow)]
+)
 def test_what_was_exchanged_on_both_days_is_no_change(small_ring, before, axis, a, b):
+    """Neighbouring correctors, and BPMs; in a machine that drifts."""
     days = before, machine(small_ring, seed=5, drift=0.01)
     first, second = (exchanged(one, axis, a, b) for one in days)
     same = diagnose(small_ring, second, reference=first)
     assert (same.verdict, same.findings) == ("none", ())
-    (said,) = (own for own in same.warnings if own.startswith("on both days"))
+    (message,) = (own for own in same.warnings if own.startswith("on both days"))
     names = (before.correctors, before.monitors)[axis]
-    assert {names[a], names[b]} <= set(said.replace(";", " ").split())
+    assert {names[a], names[b]} <= set(message.replace(";", " ").split())
 
 
-def test_monitors_and_correctors_of_one_measurement_alone_do_no_harm(small_ring, before, after):
-    fewer = before.select(monitors=before.monitors[2:])
-    other = after.select(correctors=after.correctors[:-1], monitors=after.monitors[::-1])
+def test_a_bad_step_and_channels_of_one_measurement_alone_do_no_harm(small_ring):
+    """In the reference a supply jumped while v6 was stepped; since, v9 was reversed. The change is
+    one of the ring at its beam's energy: off by a thousandth the tunes are others by 0.013 and
+    0.016."""
+    energy = Cause("energy_offset", None, 1e-3)
+    before = machine(small_ring, [energy])
+    after = machine(small_ring, [energy, *CHANGED], seed=2, drift=0.01)
+    orbits = before.response.copy()
+    orbits[6] += 0.3 * orbits[10]
+    fewer = replace(before, response=orbits).select(monitors=before.monitors[2:])
+    kicks = np.where(np.array(after.correctors) == "v9", -1.0, 1.0)
+    after = replace(after, response=after.response * kicks[:, None, None])
+    other = after.select(correctors=after.correctors[1:], monitors=after.monitors[::-1])
     result = diagnose(small_ring, other, reference=fewer)
-    assert {own.element for own in result.findings} == {"qf", "QD::5"}
+    found = {own.element: own for own in result.findings}
+    assert set(found) == {"qf", "QD::5", "v9"}
+    assert found["v9"].effect == "corrector_calibration"
+    assert abs(found["v9"].amount + 2) < 0.05  # it drifts by a per cent
     assert any(before.monitors[0].casefold() in said for said in result.warnings)
+    (text,) = [text for text in result.warnings if "v6 (" in text]
+    assert text.startswith("of the reference: ")
+    assert "µrad in y, as behind v10)" in text
+    (told,) = [said for said in result.warnings if "differs from the nominal energy by" in said]
+    assert float(told.split(" by ")[1].split()[0]) == pytest.approx(energy.amount, rel=0.1)
+    rng = np.random.default_rng(7)  # as the machine has them
+    static = [
+        Cause("quadrupole_gradient", f"{name}::{i}", 3e-3 * rng.standard_normal())
+        for name in ("QF", "QD")
+        for i in range(16)
+    ]
+    for day, more in (("before", []), ("after", CHANGED)):
+        true = ring_tunes(apply(small_ring, [*static, *more]), energy.amount)
+        assert result.tunes[day] == pytest.approx(true, abs=1.5e-3)
 
 
 @pytest.mark.slow
@@ -413,31 +400,6 @@ def test_correctors_of_the_machine_before_kick_as_they_were_fitted(small_ring, b
     change = response_change(data, errors, data).measured
     fitted = Predicted(data, errors).kicked[:-1]
     assert np.abs(change.response - fitted).max() < 1e-5 * np.abs(fitted).max()
-
-
-def test_a_change_is_one_of_the_ring_at_its_beams_energy(small_ring):
-    """Off by a thousandth the tunes are others by 0.013 and 0.016: all that is fitted to the first
-    day is in the ring of the change, the energy too."""
-    energy = Cause("energy_offset", None, 1e-3)
-    before = machine(small_ring, [energy])
-    after = machine(small_ring, [energy, *CHANGED], seed=2, drift=0.01)
-    change = diagnose(small_ring, after, reference=before)
-    assert {(own.effect, own.element.casefold()) for own in change.findings} == {
-        (own.effect, own.element.casefold()) for own in CHANGED
-    }
-    (told,) = [said for said in change.warnings if "differs from the nominal energy by" in said]
-    assert float(told.split(" by ")[1].split()[0]) == pytest.approx(
-        energy.amount, rel=0.1
-    )  # gradients take some
-    rng = np.random.default_rng(7)  # as the machine has them
-    static = [
-        Cause("quadrupole_gradient", f"{name}::{i}", 3e-3 * rng.standard_normal())
-        for name in ("QF", "QD")
-        for i in range(16)
-    ]
-    for day, more in (("before", []), ("after", CHANGED)):
-        true = ring_tunes(apply(small_ring, [*static, *more]), energy.amount)
-        assert change.tunes[day] == pytest.approx(true, abs=1.5e-3)
 
 
 def test_an_unchanged_machine_leaves_nothing_of_large_steps(small_ring, before):

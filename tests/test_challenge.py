@@ -332,31 +332,20 @@ def scored(folder, tier, cases, lattice=LATTICE, **options):
 def test_a_fixed_set_of_single_faults_keeps_its_rates(tmp_path):
     """Bounds leave room for one case of chance: a loss of a tenth of the rates breaks them.
     (The same on petra3, fault by fault: test_diagnosis.py.)"""
-    found = scored(tmp_path, "A", 24, signal=(20.0, 100.0))
+    found = scored(tmp_path, "A", 16, signal=(20.0, 100.0))
     tool = {key: value["share"] for key, value in found["bands"]["above 20"]["tool"].items()}
     assert tool["detected"] == 1.0
-    assert tool["place"] >= 23 / 24
-    assert tool["element_in_set"] >= 23 / 24
-    assert tool["effect_in_set"] >= 23 / 24
+    assert tool["place"] >= 15 / 16
+    assert tool["element_in_set"] >= 15 / 16
+    assert tool["effect_in_set"] >= 15 / 16
     assert found["coverage"]["median_elements"] <= 2
-    assert found["false_refusals"]["share"] <= 1 / 24
-    assert abs(found["pulls"]["mean"]) < 0.67  # three standard errors of twenty
+    assert found["false_refusals"]["share"] <= 1 / 16
+    assert abs(found["pulls"]["mean"]) < 0.8  # three standard errors of fourteen
 
 
 def test_a_fixed_set_without_a_fault_stays_silent(tmp_path):
     # 1.8 expected at a rate of 5 %; five or more have 3 % there, and 88 % at a rate of 20 %
     assert scored(tmp_path, "E", 36)["false_alarms"]["share"] <= 4 / 36
-
-
-def test_a_fixed_set_of_several_faults_is_taken_apart(tmp_path):
-    assert scored(tmp_path, "C", 6, signal=(20.0, 100.0))["exact"]["tool"]["share"] >= 2 / 3
-
-
-def test_a_fixed_set_of_unknown_faults_is_refused(tmp_path):
-    """On petra3: on the small ring no launch makes some of the unknown faults that strong."""
-    found = scored(tmp_path, "D", 6, "petra3", signal=(50.0, 100.0))
-    kinds = [row for row in found["rows"] if row["unknown"]["kind"] != "taken_out"]
-    assert sum(row["refused"] for row in kinds) >= len(kinds) - 1
 
 
 def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):

@@ -31,7 +31,7 @@ def several(tmp_path_factory):
     folder = tmp_path_factory.mktemp("challenge") / "M"
     make(
         "M", 2, 3, folder, lattice=LATTICE, effects=EFFECTS, signal=(30, 60), progress=False,
-        kinds=["turn_by_turn", "dispersion"],
+        kinds=["trajectory", "dispersion"],
     )  # fmt: skip
     return folder
 
@@ -41,7 +41,7 @@ def test_the_public_part_of_kinds_holds_no_truth(several):
     text = b"".join(p.read_bytes() for p in files if p.suffix != ".npz").decode()
     for name in ("0000", "0001"):
         truth, case = read_truth(several, name), read_case(several, name)
-        assert set(case.measured) == {"turn_by_turn", "dispersion"}
+        assert set(case.measured) == {"trajectory", "dispersion"}
         assert repr(truth.causes[0].amount) not in text
         assert str(truth.seed) not in text
     assert '"alone"' not in text
@@ -72,13 +72,13 @@ def test_what_no_stored_beam_survives_is_smaller_until_one_does(small_ring, tmp_
 
 def test_each_kind_alone_and_all_together_are_scored(several):
     results = run(several, jobs=1, progress=False, lattice=LATTICE)
-    assert all(set(r["alone"]) == {"turn_by_turn", "dispersion"} for r in results.values())
+    assert all(set(r["alone"]) == {"trajectory", "dispersion"} for r in results.values())
     result = score(several, jobs=1, progress=False, lattice=LATTICE)
     schema = resources.files("tmlattice") / "schemas" / "challenge.schema.json"
     jsonschema.validate(json.loads(json.dumps(result)), json.loads(schema.read_text()))
     assert not result["failed"]
-    assert result["measured_kinds"] == ["turn_by_turn", "dispersion"]
-    names = {"tool", "alone: turn_by_turn", "alone: dispersion", "oracle", "omp", "lasso"}
+    assert result["measured_kinds"] == ["trajectory", "dispersion"]
+    names = {"tool", "alone: trajectory", "alone: dispersion", "oracle", "omp", "lasso"}
     for row in result["rows"]:
         assert names <= set(row["answers"])
         assert row["answers"]["tool"]["in_set"]
@@ -87,7 +87,7 @@ def test_each_kind_alone_and_all_together_are_scored(several):
     assert told["of_found_alone"]["cases"] + told["of_none_alone"]["cases"] == 2
 
 
-def test_scoring_again_reads_no_turns(several, monkeypatch):
+def test_scoring_again_reads_no_table(several, monkeypatch):
     """Tables of turns take longer to be read than all else takes where the oracle was asked."""
     run(several, jobs=1, progress=False, lattice=LATTICE)
     score(several, jobs=1, progress=False, lattice=LATTICE)

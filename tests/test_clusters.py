@@ -2,14 +2,10 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from tmlattice.inference.errors import (
     LinearFit,
     Rows,
-    _mismatches,
-    _of_columns,
-    _of_monitors,
     cluster_robust_errors,
 )
 from tmlattice.inference.normal import normal_equations, solve
@@ -70,24 +66,6 @@ def test_stated_errors_hold_where_readings_share_model_discrepancy(lacking):
     size, without = (np.sqrt(np.mean(np.square(own))) for own in (pulls, plain))
     assert 0.8 < size < 1.3
     assert without > 2 or lacking == "nothing"
-
-
-@pytest.mark.parametrize("by", [0, 1])
-def test_a_cluster_against_all_others_vs_a_fit_without_it(by, rng):
-    rows, noise = made_up(rng, "columns")
-    weight = rng.uniform(0.5, 1.5, noise.shape) / NOISE**2
-    weight[3, 5] = 0.0  # a missing reading
-    found, there = solved(rows, noise, weight)
-    left = noise - readings(rows, found.values)
-    shares, mismatch = _mismatches((_of_columns, _of_monitors)[by](rows, weight, left, None), there)
-    without = weight.copy()
-    without[(7, slice(None)) if by == 0 else (slice(None), 7)] = 0.0
-    other, apart = solved(rows, noise, without)
-    ring = slice(-ERRORS, None)
-    grown = (apart.variance - there.variance)[ring]
-    assert_allclose(shares[7, ring], grown / apart.variance[ring], rtol=1e-6)
-    moved = (found.values - other.values)[ring]
-    assert_allclose(mismatch[7, ring], moved**2 / grown, rtol=1e-6)
 
 
 def test_readings_far_above_their_noise_have_errors_all_the_same(rng):

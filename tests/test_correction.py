@@ -476,7 +476,7 @@ def test_applied_settings_have_a_calibration(small_ring, tmp_path):
     made = [simulate_response(small_ring, [Cause("family_gradient", "QF", amount)] * (amount != 0),
                               engine="ocelot", progress=False, noise=1e-7).measured
             for amount in (0.0, 0.008)]  # fmt: skip
-    found = diagnose(small_ring, made[1], reference=made[0])
+    found = diagnose(small_ring, made[1], reference=made[0], effects=["family_gradient"])
     (own,) = applied(found, read_settings(path, small_ring))
     assert own.asked == pytest.approx(0.01)
     assert own.ratio == pytest.approx(0.8, abs=max(0.01, 3 * own.ratio_error))

@@ -23,16 +23,11 @@ def first(diagnosis):
 FAULTS = [
     Cause("quadrupole_gradient", "qd::12", -0.05),
     Cause("skew_gradient", "qskew_nw_1", 2e-3),
-    Cause("quadrupole_roll", "qa2::13", 0.01),
     Cause("quadrupole_offset_y", "qa3::2", 2e-4),
     Cause("dipole_field", "b::28", 1e-3),
-    Cause("dipole_roll", "b::28", 1e-3),
-    Cause("corrector_kick_x", "hcor_a1_5", 5e-5),
     Cause("sextupole_offset_x", "s1::48", 2e-3),
     Cause("insertion_device_focusing", "wiggler::12", 3e-3),
-    Cause("monitor_gain_y", "bpm_a4_3", -0.2),
     Cause("monitor_roll", "bpm_a4_3", 0.1),
-    Cause("monitor_swap", "bpm_a4_3", 1.0),
     Cause("energy_offset", None, 2e-4),
     Cause("radiation_loss_bends", None, 1.0),
 ]
@@ -71,25 +66,6 @@ def test_no_fault_is_nothing_and_says_what_would_have_been_seen(petra3):
     least = result.sensitivity["quadrupole_gradient"]
     seen = Cause("quadrupole_gradient", "qd::12", 10 * least)
     assert first(diagnose(petra3, measured(petra3, [seen]))).where is not None
-
-
-def test_two_faults_in_different_places_are_both_found(petra3):
-    causes = [Cause("quadrupole_roll", "qd::12", 0.01), Cause("monitor_gain_x", "bpm_a6_2", 0.3)]
-    result = diagnose(petra3, measured(petra3, causes))
-    sets = [{(m.effect, m.element) for m in f.credible_set} for f in result.findings]
-    assert len(sets) == 2
-    for cause in causes:
-        assert any((cause.effect, cause.element) in members for members in sets)
-
-
-def test_dead_and_frozen_monitors_are_findings(petra3):
-    causes = [Cause("monitor_dead", "bpm_a3_3", 1.0), Cause("monitor_dead", "bpm_a4_3", 2.0)]
-    result = diagnose(petra3, measured(petra3, causes))
-    assert {(f.element, f.amount) for f in result.findings} == {
-        ("bpm_a3_3", 1.0),
-        ("bpm_a4_3", 2.0),
-    }
-    assert result.verdict == "identified"
 
 
 def test_an_effect_without_a_name_is_located(petra3):
@@ -164,14 +140,6 @@ def test_energy_offset_is_no_hypothesis_where_every_shot_has_its_own_energy(petr
     assert ("energy_offset", None) not in result.explanation.scan.hypotheses
 
 
-def test_the_same_seed_gives_the_same_diagnosis(petra3):
-    data = measured(petra3, [Cause("quadrupole_gradient", "qd::12", -0.03)])
-    one, two = (diagnose(petra3, data, seed=4).as_json() for _ in range(2))
-    for result in (one, two):
-        del result["provenance"]["seconds"]
-    assert one == two
-
-
 @pytest.mark.slow
 def test_a_reference_shows_an_offset_among_small_errors(petra3):
     """0.2 mm of one quadrupole on a machine whose magnets are all misaligned by 0.1 mm."""
@@ -229,21 +197,11 @@ def test_held_out_gap_vs_noise_free_truth(petra3):
     assert result.gap["heldout"]["after"]["chi2_per_dof"] == pytest.approx(1.0, abs=0.15)
 
 
-def test_explain_stops_at_the_number_of_causes_allowed(petra3):
-    causes = [Cause("quadrupole_gradient", f"qd::{k}", 0.05) for k in (3, 12, 30)]
-    result = diagnose(petra3, measured(petra3, causes), max_effects=1)
-    assert (result.verdict, result.findings) == ("distributed", ())
-    assert any("not explain" in w for w in result.warnings)
-    assert result.gap["fit"]["before"] == result.gap["fit"]["after"]
-
-
 @pytest.mark.parametrize(
     ("cause", "shots"),
     [
         (None, 2),
         (Cause("quadrupole_gradient", "QD::3", -0.05), 1),
-        (Cause("quadrupole_gradient", "QD::3", -0.05), 3),
-        (Cause("monitor_gain_x", "bpm::4", 0.1), 1),
         (Cause("dipole_roll", "bend::4", 5e-3), 2),
     ],
 )
@@ -272,14 +230,6 @@ def test_more_shots_than_find_room_are_used_in_part(small_ring, monkeypatch):
     monkeypatch.setattr(prepare, "MEMORY", 0.5 * each)
     with pytest.raises(MeasurementError, match="give fewer turns"):
         diagnose(small_ring, measured)
-
-
-def test_small_errors_alone_are_no_change(small_ring):
-    machine = {"background": {"all": None}, "machine_seed": 7}
-    before, after = (
-        simulate(small_ring, [], shots=6, seed=seed, **machine).measurement() for seed in (50, 0)
-    )
-    assert diagnose(small_ring, after, reference=before).verdict == "none"
 
 
 def test_a_fault_among_small_errors_that_lose_the_beam(small_ring):

@@ -9,6 +9,8 @@ from test_import import simulated  # noqa: F401  (a fixture)
 
 from tmlattice.importers import Options, bring_in
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 
 @pytest.fixture
 def bring(tmp_path):

@@ -15,6 +15,8 @@ from tmlattice.importers import Options, bring_in, matlab_ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 
 @pytest.fixture
 def bring(tmp_path, simulated):  # noqa: F811

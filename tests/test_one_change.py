@@ -7,26 +7,21 @@ import pytest
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS
-from tmlattice.diagnosis.response import sparse
 from tmlattice.diagnosis.response.before_after import ANY
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
 from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.rounds import settle
-from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.diagnosis.response.undetermined import (
     Blur,
     Undetermined,
     and_orbits,
-    strongest,
     undetermined,
 )
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import Cause, find
-from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_change import response_change
@@ -81,36 +76,6 @@ def crowded_change(small_ring, before, fitted):
     return settle(state)
 
 
-def chi2_per_reading(state):
-    left = state.data.pick(state.at.left)[:-1] / state.data.noise_of(0)[:-1]
-    return np.nanmean(left[state.fitted[:-1]] ** 2)
-
-
-def test_dispersion_that_gradients_make_does_not_draw_the_gains_astray(fitted):
-    """One horizontal corrector and the RF are all that this ring's horizontal gains have."""
-    assert chi2_per_reading(fitted) < 1.5
-    assert fitted.groups["monitor_gain"].rms < 0.05  # 0.025 are there
-
-
-def test_every_number_of_a_fit_is_told_as_what_it_does(fitted):
-    data, rng = fitted.data, np.random.default_rng(4)
-    nothing = Predicted(data, Errors.none(data))
-    for family in {f.variable: f for f in fitted.families}.values():
-        values = 1e-6 * rng.standard_normal(family.size(data))
-        if family.variable == "calibration":
-            values[-1] = 0.0  # the RF has none
-        amounts: dict[Hypothesis, float] = {}
-        for value, moves in zip(values, family.moves(data), strict=True):
-            for hypothesis, share in moves.items():
-                amounts[hypothesis] = amounts.get(hypothesis, 0.0) + share * float(value)
-        put = Predicted(data, family.put(Errors.none(data), values, data)).read - nothing.read
-        if family.variable == "spread":  # by the square of the amount
-            continue
-        told = nothing.with_causes([Cause(*h, a) for h, a in amounts.items()]).read - nothing.read
-        seen = np.isfinite(put) & (np.abs(told) > 1e-3 * np.nanmax(np.abs(told)))
-        assert put[seen] == pytest.approx(told[seen], rel=2e-3), family.name
-
-
 def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
     """Against differences of the full model, with the change and without."""
     whole = and_orbits(fitted.data.ring, undetermined(fitted))
@@ -135,17 +100,6 @@ def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
         slope = (read[True, 1] - read[True, -1] - read[False, 1] + read[False, -1]) / (2 * h)
         size = np.nanmax(np.abs(slope))
         assert np.nanmax(np.abs(of[error] - slope)) < 0.02 * size + 1e-9
-
-
-def test_the_strongest_errors_are_nearly_all_that_a_blur_is(fitted, problem):
-    whole, changes = undetermined(fitted), [Cause("quadrupole_gradient", "QF::3", 0.01)]
-    sparse = strongest(problem, whole, changes)
-    assert len(sparse.hypotheses) < len(whole.hypotheses) / 2
-    of_all, of_few = (
-        np.sum(np.where(problem.used, Blur(problem, one).of(changes), 0.0) ** 2)
-        for one in (whole, sparse)
-    )
-    assert of_few == pytest.approx(of_all, rel=0.02)
 
 
 def test_numbers_that_nobody_asks_for_are_a_covariance_of_the_readings(fitted, rng):
@@ -202,45 +156,3 @@ def test_a_supply_of_sextupoles_shows_by_the_orbit_that_nobody_knows(small_ring,
     (found,) = result.findings
     assert ("family_sextupole", "sd") in [(m.effect, m.element) for m in found.credible_set]
     assert abs(found.amount - 0.1) < 4 * found.amount_sigma
-
-
-def test_a_change_that_readings_do_not_want_is_none(fitted, problem):
-    same = SingleChange(Blur(problem, and_orbits(fitted.data.ring, undetermined(fitted))))
-    same.left = np.zeros_like(same.left)
-    assert same.likeliest(("quadrupole_gradient", "QF::3")) is None
-
-
-def test_a_drift_beside_a_change_is_none_and_hides_none(small_ring):
-    def day(causes, seed):
-        return simulate_response(
-            small_ring, causes, kick=1e-4, noise=2e-7, rf_step=-1000.0, progress=False, seed=seed
-        ).measured
-
-    change = Cause("quadrupole_offset_y", "QF::2", 3e-4)
-    causes = [change, Cause("monitor_gain_y", "bpm::6", 0.004)]
-    (own,) = diagnose(small_ring, day(causes, 2), reference=day([], 1)).findings
-    assert (own.effect, own.element) == (change.effect, change.element)
-    assert abs(own.amount - 3e-4) < 4 * own.amount_sigma
-
-
-def test_one_more_look_that_leads_astray_loses_nothing(small_ring, monkeypatch):
-    cause, looks = Cause("quadrupole_gradient", "QF::3", 0.02), []
-    data = response_data(
-        small_ring, simulate_response(small_ring, [cause], progress=False).measured
-    )
-    explain = sparse.explain
-
-    def once(*given):
-        looks.append(given)
-        if len(looks) > 1:
-            raise UnstableRingError("no beam off energy")
-        return explain(*given)
-
-    monkeypatch.setattr(sparse, "explain", once)
-    split = split_columns(data, 0.2, np.random.default_rng(0))
-    found = sparse.sparse_fit(data, split, ["quadrupole_gradient"], 5, DEFAULT)
-    assert found is not None
-    (own,) = found.findings
-    assert own.element == "QF::3"
-    assert abs(own.amount - 0.02) < 4 * own.amount_sigma
-    assert len(looks) == 2

@@ -8,7 +8,7 @@ from tmlattice.diagnosis.suspects import numbers
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
-from tmlattice.observe.response_problem import Response, single_causes
+from tmlattice.observe.response_problem import Response
 from tmlattice.observe.steady import NOTHING
 from tmlattice.report.amounts import all_of
 
@@ -60,25 +60,6 @@ def test_slope_of_a_cause_is_the_finite_change(small_ring, causes):
         finite = (ends[1] - ends[0]) / (2 * h)  # the residual falls as the reading grows
         slope = problem.slope(point, i)
         np.testing.assert_allclose(slope, finite, atol=1e-5 * np.abs(finite).max())
-
-
-def test_what_was_not_measured_is_no_place(small_ring):
-    whole = measured(small_ring, [], correctors=["v1", "v2", "v3", "v4", "v5", "v6"])
-    hypotheses = single_causes(response_data(small_ring, whole))
-    assert ("corrector_calibration", "v1") in hypotheses
-    assert ("corrector_calibration", "v7") not in hypotheses
-    assert ("corrector_kick_x", "v7") not in hypotheses
-
-
-def test_a_ring_without_a_closed_orbit_is_said(small_ring):
-    data = response_data(small_ring, measured(small_ring, []))
-    problem = Response(
-        base=Predicted(data, Errors.none(data)), used=np.isfinite(data.orbits), places={}
-    )
-    strong = [Cause("quadrupole_gradient", f"QF::{k}", 3.0) for k in range(8)]
-    point = problem.at(strong, NOTHING)
-    assert "closed orbit" in point.lost
-    assert point.chi2 == np.inf
 
 
 def test_one_number_of_several_places_is_told_once():

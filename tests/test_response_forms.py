@@ -64,16 +64,17 @@ def of_plane(plane):
 def test_a_response_of_less_is_fitted_and_says_what_is_not_known(
     small_ring, whole, tmp_path, made, said
 ):
-    effects = ["corrector_calibration", "quadrupole_gradient", "monitor_roll", "skew_gradient"]
+    effects = ["corrector_calibration", "quadrupole_gradient", "monitor_roll"]
     found = diagnose(small_ring, made(whole), effects=effects, seed=1)
     assert any(said in sentence for sentence in found.warnings), found.warnings
     last = found.steps[-1]
     assert last.heldout_rms_in_plane < 3e-8
     assert np.isnan(last.heldout_rms_coupling)
-    found.save(tmp_path / "found")
-    text = (tmp_path / "found" / "report.txt").read_text()
-    assert "nan" not in text, text
-    json.loads((tmp_path / "found" / "diagnosis.json").read_text())
+    assert "nan" not in found.report()
+    if made is y_monitors:  # figures take seconds
+        found.save(tmp_path / "found")
+        assert "nan" not in (tmp_path / "found" / "report.txt").read_text()
+        json.loads((tmp_path / "found" / "diagnosis.json").read_text())
 
 
 def test_reversed_monitors_and_correctors_are_fitted_and_named(small_ring, whole):
@@ -117,28 +118,6 @@ def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, mo
     none, own = weigh(fitted, ["orbit_drift"])
     assert own.judgement == "excluded"
     assert own.evidence < 0
-
-
-def test_fields_that_their_neighbours_shift_are_weighed_by_the_magnets_beside_them(
-    small_ring, whole
-):
-    """All vertical correctors between the same two families by 2 cm."""
-    data = response_data(small_ring, whole)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
-    trials = [replace(STEPS[0], families=STEPS[0].families[:1]), *STEPS[1:3]]
-    name = "corrector_position_neighbours"
-    patterns = HYPOTHESES[name](fit_steps(data, split, trials).state).patterns
-    counts = (np.abs(patterns).max(axis=2) > 0).sum(axis=1)
-    assert (counts > 1).all()
-    response = data.measured.response.copy()
-    own = np.arange(len(response))[:, None], np.arange(response.shape[1]), data.plane[:-1, None]
-    shift = 0.02 * patterns[int(np.argmax(counts))][:-1]
-    response[own] += shift
-    moved = response_data(small_ring, replace(data.measured, response=response))
-    none, row = weigh(fit_steps(moved, split, trials).state, [name])
-    assert row.judgement == "helps"
-    assert row.heldout_rms_in_plane < 0.7 * none.heldout_rms_in_plane
-    assert row.amount * np.sqrt(row.parameters) == pytest.approx(0.02, rel=0.2)
 
 
 def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_ring, whole, rng):

@@ -10,8 +10,6 @@ from tmlattice import Cause, simulate
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import apply, background_rms, find, modelled, monitors_with
-from tmlattice.errors import UnstableRingError
-from tmlattice.inference import distributed
 from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
@@ -143,21 +141,6 @@ def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):
     assert learnt.log_evidence > 1e3
     assert 0.5 < learnt.before.chi2 / problem.valid.sum() < 1.5  # 70 readings: +- 0.17
     assert 0.5 < learnt.sizes["quadrupole_offset_x"] / usual["quadrupole_offset_x"] < 2
-
-
-def test_small_errors_that_need_a_cause_to_store_a_beam_are_a_sentence(small_ring, monkeypatch):
-    """The search went on from a point that is none (AssertionError)."""
-    usual = background_rms({"quadrupole_offset_x": None})
-    everywhere = [(n, place) for n in usual for place in find(n).places(small_ring)]
-    problem = closed_orbits(small_ring, _orbit(small_ring, [], 2), {})
-
-    def lost(problem, causes, nuisances):
-        there = fit(problem, causes, nuisances)
-        return replace(there, point=replace(there.point, projection=None, lost="no orbit"))
-
-    monkeypatch.setattr(distributed, "fit", lost)
-    with pytest.raises(UnstableRingError, match="no orbit with distributed errors"):
-        fit_distributed_errors(problem, DistributedErrors.usual(everywhere, usual), problem.first)
 
 
 def test_a_start_at_which_no_beam_is_stored_is_none(small_ring):

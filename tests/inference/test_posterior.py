@@ -1,10 +1,6 @@
 """What readings leave known of small errors, from sums over rows: the same as with all signatures
 written out."""
 
-import tracemalloc
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -12,18 +8,12 @@ from numpy.testing import assert_allclose
 from tmlattice import Cause, simulate
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import background_rms, find
-from tmlattice.errors import UnstableRingError
-from tmlattice.inference import distributed
 from tmlattice.inference.distributed import (
-    ROWS,
     DistributedErrors,
     fit_distributed_errors,
     posterior,
-    sampled_rows,
 )
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.metric import Metric
-from tmlattice.inference.whitening import Projection
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe import response_problem
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -105,57 +95,3 @@ def test_nuisances_are_projected_out(small_ring, everywhere):
     known = direct.problem.learnt(direct.before)
     assert_allclose(sums_at.errors, known.errors, rtol=0.02)
     assert_allclose((sums_at.amounts - known.amounts) / known.errors, 0, atol=0.1)
-
-
-def test_memory_does_not_grow_with_readings():
-    """Errors times errors, and one piece: never errors times readings, here 160 MB."""
-    count, readings, size = 100, 200_000, 2000
-    rng = np.random.default_rng(1)
-    residual = rng.standard_normal(readings)
-
-    class Many(Metric):
-        def pieces(self, hypotheses):
-            for start in range(0, readings, size):
-                yield np.arange(start, start + size), _drawn(start)
-
-    def _drawn(start):
-        return np.random.default_rng(start).standard_normal((count, size))
-
-    projection = Projection(np.zeros((1, readings, 0)))
-    problem = SimpleNamespace(
-        everywhere=lambda: SimpleNamespace(metric=lambda point: Many(projection))
-    )
-    known = DistributedErrors.usual(
-        [("dipole_field", str(i)) for i in range(count)], {"dipole_field": 1.0}
-    )
-    point = SimpleNamespace(residual=residual, projection=projection)
-    tracemalloc.start()
-    sums = distributed.sums_at(problem, point, known, np.zeros(count), np.array([3, size + 7]))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 20e6
-    starts = range(0, readings, size)
-    inner = sum(_drawn(start) @ residual[start : start + size] for start in starts)
-    assert_allclose(sums.inner, inner, rtol=1e-9, atol=1e-6)
-    assert_allclose(np.diag(sums.gram), sum((_drawn(start) ** 2).sum(axis=1) for start in starts))
-    assert_allclose(sums.some, np.stack([_drawn(0)[:, 3], _drawn(size)[:, 7]], axis=1))
-
-
-def test_too_large_small_errors_are_a_sentence(response, everywhere, monkeypatch):
-    def lost(*_):
-        return replace(response.at((), response.first), projection=None, lost="no orbit")
-
-    monkeypatch.setattr(distributed, "fit_nuisances", lost)
-    with pytest.raises(
-        UnstableRingError, match="no orbit with the most probable distributed errors"
-    ):
-        posterior(response, DistributedErrors.usual(everywhere, USUAL))
-
-
-def test_rows_for_sizes_have_both_planes():
-    """Every second row was one plane of all monitors: the other had no say in any size."""
-    for count in (2 * ROWS, 4 * ROWS - 3, 12 * ROWS):
-        rows = sampled_rows(count)
-        assert len(rows) == ROWS == len(set(rows.tolist()))
-        assert 0.4 < np.mean(rows % 2) < 0.6
-    assert_allclose(sampled_rows(ROWS), np.arange(ROWS))

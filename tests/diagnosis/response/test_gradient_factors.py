@@ -1,7 +1,6 @@
 """The few numbers behind many gradients, on simulated responses whose errors are known."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +8,6 @@ import pytest
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CorrectorCalibration, MonitorGain
 from tmlattice.diagnosis.response.common_factors import (
-    CommonFactors,
-    Instead,
-    Reason,
     explain_gradients,
     weighed,
 )
@@ -24,11 +20,6 @@ from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
-from tmlattice.report.response_text import (
-    common_factor_rows,
-    common_factors_sentence,
-    instead_texts,
-)
 
 SINGLE = QuadrupoleGradient()
 
@@ -67,19 +58,13 @@ def test_what_all_or_one_polarity_share_is_one_reason(small_ring, shared, name, 
     assert found.outliers == ()
 
 
-def test_a_magnet_that_no_magnet_is_like_is_flagged(small_ring, monkeypatch):
+def test_a_magnet_that_no_magnet_is_like_is_flagged(small_ring):
     more = [Cause("quadrupole_gradient", "QD::5", 0.04)]
     found = explained(small_ring, {"QF": 0.0, "QD": 0.0}, more)
     assert [own.name for own in found.common_factors] == ["QD::5"]
     (outlier,) = found.outliers
     assert outlier.element == "QD::5"
     assert abs(outlier.amount - 0.04) < 0.005
-    # ALS: six magnets -3 +- 3 %, whose family's size is unknown
-    monkeypatch.setattr(
-        "tmlattice.diagnosis.response.common_factors.of_sizes",
-        lambda state, block, there: 0.03 * np.eye(len(there.start)),
-    )
-    assert explained(small_ring, {"QF": 0.0, "QD": 0.0}, more).outliers == ()
 
 
 def test_small_scatter_alone_has_no_reason(small_ring):
@@ -165,29 +150,3 @@ def test_families_that_share_all_are_alike():
     between, _, sets = of_families([0, 0, 0, 0.01, 0, 0])
     assert between == 0
     assert sets[0].chosen == (5,)
-
-
-def test_other_sets_are_told_by_what_is_otherwise_in_them():
-    def reason(name, amount, probability, rivals=()):
-        return Reason("family", name, (), amount, 1e-3, probability, 30.0, "", rivals)
-
-    found = CommonFactors(
-        (reason("qa", 0.01, 1.0), reason("qb", 0.02, 0.6), reason("qc", 0.03, 0.5, (("qd", 0.4),))),
-        (
-            Instead(0.3, (("qa", 0.0102, 1e-3), ("qb", 0.05, 1e-3), ("qc", 0.03, 1e-3))),
-            Instead(0.2, (("qa", 0.01, 1e-3), ("qd", -0.01, 2e-3))),
-            Instead(0.1, (("qa", 0.01, 1e-3), ("qb", 0.02, 1e-3), ("qc", 0.03, 1e-3))),
-        ),
-        (), 0.5, 1e-3, 0.005,
-    )  # fmt: skip
-    told = SimpleNamespace(common_factors=found)
-    assert [row[0] for row in common_factor_rows(told)] == [
-        "qa",
-        "qb (probability 60 %)",
-        "qc (or qd, 40 %)",
-    ]
-    assert instead_texts(told) == [
-        "qb +5.00 ± 0.10 % (30 %)",
-        "qd -1.00 ± 0.20 %; without qb, qc (20 %)",
-    ]
-    assert "Families differ by 0.5 % (rms)" in common_factors_sentence(told)

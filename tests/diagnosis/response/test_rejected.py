@@ -49,7 +49,8 @@ def day(ring_kicking_x, tmp_path_factory):
     save_ring(ring, folder / "ring.json")
     write_measurement(folder / "day", measured)
     words = ["diagnose", folder / "ring.json", folder / "day", "--lattice-out",
-             folder / "found.json", "--json", folder / "found.diagnosis.json"]  # fmt: skip
+             folder / "found.json", "--json", folder / "found.diagnosis.json", "--effects",
+             "quadrupole_gradient,monitor_gain_x,monitor_gain_y,monitor_swap"]  # fmt: skip
     done = CliRunner().invoke(tmlattice, [str(word) for word in words])
     assert done.exit_code == 0, done.output
     return ring, measured, folder

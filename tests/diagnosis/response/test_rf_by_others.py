@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tmlattice.diagnosis.families.dispersion import USUAL, HorizontalKicks
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
-from tmlattice.diagnosis.response.validation import inner, score
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -71,57 +68,3 @@ def test_each_reading_vs_a_fit_without_it(settled, rng, moving):
         rest = np.arange(len(read)) != i
         by_noise = covariance[i, rest] @ np.linalg.solve(covariance[np.ix_(rest, rest)], left[rest])
         assert_allclose(by_others[read[i]], left[i] - by_noise, rtol=1e-5, atol=1e-13)
-
-
-def test_without_all_that_is_fitted_it_is_the_designs(settled):
-    """The one family in plane: without it stood for what is left with it, by the fit itself."""
-    _, _, with_it = told(settled)
-    design = begin(settled.data, settled.split)
-    one = dataclasses.replace(settled, jitter=None)
-    left = design.data.pick(Predicted(design.data, Errors.none(design.data), settled.at.bent).left)
-    nothing = dataclasses.replace(one, at=Predicted(one.data, Errors.none(one.data), one.at.bent))
-    read = np.isfinite(with_it)
-    assert_allclose(rf_by_others(nothing, None, None)[read], left[-1, read], rtol=1e-9)
-    linearly = rf_by_others(one, linear(one, 0), None)
-    # second order of gradients of 0.3 %, and gains
-    assert np.std(linearly[read] - left[-1, read]) < 0.25 * np.std(left[-1, read])
-    assert np.std(with_it[read]) < 0.1 * np.std(left[-1, read])
-
-
-def test_they_judge_beside_those_kept_apart(settled):
-    _, _, by_others = told(settled)
-    alone, both = inner(settled), inner(settled, by_others)
-    fitted = np.isfinite(by_others)
-    assert not (alone.rf[:, 1].astype(bool) & fitted).any()
-    assert both.rf[:, 1].sum() == alone.rf[:, 1].sum() + fitted.sum()
-    floor = np.median(settled.data.noise) ** 2  # no judge wants less of the RF
-    assert_allclose(both.rf[fitted, 0], by_others[fitted] ** 2 + floor)
-    assert_allclose(both.columns, alone.columns)
-
-
-def test_what_is_known_of_it_is_what_held_out_monitors_miss(small_ring):
-    """Five measurements of a ring with kicks that no gradient makes up for: the fit misses the RF's
-    orbit by more than the noise, as its posterior predicts."""
-    rng = np.random.default_rng(11)
-    quadrupoles = [e.name for e in small_ring.elements if e.kind == "quadrupole"]
-    missed, blocks = [], []
-    for seed in range(5):
-        causes = [Cause("quadrupole_gradient", name, 3e-3 * rng.standard_normal())
-                  for name in quadrupoles]  # fmt: skip
-        measured = simulate_response(
-            small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
-            progress=False, seed=seed,
-        ).measured  # fmt: skip
-        data = response_data(small_ring, measured)
-        split = split_columns(data, 0.2, np.random.default_rng(seed))
-        drawn = rng.standard_normal(len(HorizontalKicks().patterns(data).rf))
-        kicks = HorizontalKicks().put(Errors.none(data), USUAL * drawn, data)
-        orbits = data.orbits.copy()
-        orbits[-1] += kicks.dispersion
-        data = dataclasses.replace(data, orbits=orbits)
-        *_, (_, state) = one_by_one(begin(data, split), (*STEPS[:3], STEPS[-2]))
-        missed.append(score(state, split.held).dispersion)
-        blocks += [block for block in remainder(state) if block.name == "held-out, RF"]
-    assert min(missed) > 1.5 * 2e-8
-    # 2.4: families that came in one by one have not settled together
-    assert 0.5 < sum(b.chi2 for b in blocks) / sum(b.freedom for b in blocks) < 3

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from tmlattice import diagnose
-from tmlattice.diagnosis.selection import outlier
-from tmlattice.effects import CATALOGUE, Cause
-from tmlattice.inference.judgement import DEFAULT
+from tmlattice.effects import Cause
 from tmlattice.machine import simulate
 
 ALL = {"all": None}
@@ -66,32 +64,6 @@ def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_rin
     assert (finding.effect, finding.element) == (fault.effect, fault.element)
     assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
     assert found.priors["corrector_calibration"] < 0.3
-
-
-def test_no_outlier_where_all_of_a_family_or_all_families_are_large():
-    sizes = {"corrector_calibration": 0.04, "corrector_roll": 0.01}
-    far = [Cause("corrector_calibration", name, a) for name, a in (("h1", 0.3), ("h2", -0.02))]
-    assert outlier(far, sizes, DEFAULT) == far[0]
-    more = [Cause("corrector_calibration", name, a) for name, a in (("h3", 0.32), ("h4", -0.35))]
-    assert outlier([far[0], *more], sizes, DEFAULT) is None
-    assert outlier(far, {name: 5 * size for name, size in sizes.items()}, DEFAULT) is None
-
-
-def test_small_errors_alone_are_no_fault_and_have_their_sizes(small_ring):
-    found = diagnose(small_ring, measured(small_ring, []))
-    assert (found.verdict, found.findings) == ("distributed", ())
-    seen = [name for name, error in found.prior_errors.items() if error < 0.3]
-    assert {"monitor_gain_x", "monitor_gain_y", "monitor_offset_x"} <= set(seen)
-    for name in seen:
-        pull = np.log(found.priors[name] / CATALOGUE[name].background) / found.prior_errors[name]
-        assert abs(pull) < 4
-
-
-def test_no_small_errors_are_learnt_where_there_are_none(small_ring):
-    clean = simulate(small_ring, [Cause("quadrupole_gradient", "QD::5", -0.2)], shots=6, seed=1)
-    found = diagnose(small_ring, clean.measurement())
-    assert found.verdict == "identified"
-    assert not found.priors
 
 
 def test_noise_that_nobody_states_is_not_taken_for_what_neighbours_leave(small_ring):

@@ -32,7 +32,7 @@ def found(causes):
     measured = simulate_response(
         ring, causes, kick=2e-5, rf_step=0.1 * rf_step_of(ring), noise=4e-7, seed=1, progress=False
     ).measured
-    return diagnose(ring, measured, seed=1)
+    return diagnose(ring, measured, seed=1, effects=list(USUAL))
 
 
 def test_a_faulty_quadrupole_that_the_data_do_not_determine_is_covered_by_its_error(found):
