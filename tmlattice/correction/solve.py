@@ -57,6 +57,8 @@ MIN_GAIN = 0.01
 AVERSIONS, BISECTIONS = (1e-5, 1e5), 10
 """Risk aversions between which one is sought, relative to the means of both quadratic forms; and
 halvings of this range: of two per cent."""
+GROWTH = 1.25
+"""Of a risk aversion that is enough to first order alone."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Numbers of knobs with a stated gain."""
 ROUNDING = 1e-10
@@ -402,7 +404,7 @@ def safest(begin: Point, end: Point, knobs: Indices) -> tuple[Point, float]:
             gain = now - point.squares
             if gain.mean() >= max(SIGMAS * gain.std(), MIN_GAIN * now.mean()):
                 return point, aversion
-        aversion = 2 * aversion or end.aversion(knobs)
+        aversion = GROWTH * aversion or end.aversion(knobs)
         if np.isinf(aversion):
             break
         amounts, _ = end.step(knobs, aversion)
