@@ -57,8 +57,8 @@ MIN_GAIN = 0.01
 AVERSIONS, BISECTIONS = (1e-5, 1e5), 10
 """Risk aversions between which one is sought, relative to the means of both quadratic forms; and
 halvings of this range: of two per cent."""
-GROWTH = 1.25
-"""Of a risk aversion that is enough to first order alone."""
+NEAR = 1.03
+"""Standard deviations over `SIGMAS` at which a shortened correction is not lengthened again."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Numbers of knobs with a stated gain."""
 ROUNDING = 1e-10
@@ -271,8 +271,8 @@ class Point:
     def _ridge(self, knobs: Indices, aversion: float) -> Array | float:
         return aversion * self.problem.begin.doubt[np.ix_(knobs, knobs)] if aversion else 0.0
 
-    def aversion(self, knobs: Indices) -> float:
-        """Return the smallest risk aversion whose step gains `SIGMAS` standard deviations, to first
+    def aversion(self, knobs: Indices, sigmas: float) -> float:
+        """Return the smallest risk aversion whose step gains these standard deviations, to first
         order; infinite where none does."""
         doubt = self.problem.begin.doubt[np.ix_(knobs, knobs)]
         ends = np.log(AVERSIONS) + np.log(len(knobs) / max(float(np.trace(doubt)), 1e-300))
@@ -280,7 +280,7 @@ class Point:
         def safe(log: float) -> bool:
             amounts, then = self.step(knobs, float(np.exp(log)))
             own = (amounts * self.problem.sizes)[knobs]
-            return self._normal[2] - then >= 2 * SIGMAS * np.sqrt(own @ doubt @ own)
+            return self._normal[2] - then >= 2 * sigmas * np.sqrt(own @ doubt @ own)
 
         low, high = ends
         if not safe(high):
@@ -394,21 +394,26 @@ def safest(begin: Point, end: Point, knobs: Indices) -> tuple[Point, float]:
         begin, end: before and after the whole correction.
         knobs: indices of free knobs; the others are at zero.
     """
-    problem, now = end.problem, begin.squares
-    amounts, aversion = end.amounts, 0.0
+    problem, now, found = end.problem, begin.squares, (begin, np.inf)
+    amounts, aversion, sigmas = end.amounts, 0.0, SIGMAS
     for _ in range(MAX_HALVINGS):
         pairs = zip(problem.knobs, amounts.tolist(), strict=True)
         new = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
         point = end if np.array_equal(new, end.amounts) else problem.better(new, np.inf)
-        if point is not None:
-            gain = now - point.squares
-            if gain.mean() >= max(SIGMAS * gain.std(), MIN_GAIN * now.mean()):
-                return point, aversion
-        aversion = GROWTH * aversion or end.aversion(knobs)
+        gain = now - (now if point is None else point.squares)
+        mean, deviation = float(gain.mean()), float(gain.std())
+        safe = mean >= SIGMAS * deviation
+        if point is not None and safe and mean >= MIN_GAIN * now.mean():
+            found = point, aversion
+        if safe and (not aversion or mean <= NEAR * SIGMAS * deviation):
+            break
+        if aversion:  # beyond first order
+            sigmas *= float(np.clip(1.01 * SIGMAS * deviation / max(mean, 1e-30), 0.5, 2.0))
+        aversion = end.aversion(knobs, sigmas)
         if np.isinf(aversion):
             break
         amounts, _ = end.step(knobs, aversion)
-    return begin, np.inf
+    return found
 
 
 def drawn(
