@@ -280,7 +280,7 @@ class Point:
         def safe(log: float) -> bool:
             amounts, then = self.step(knobs, float(np.exp(log)))
             own = (amounts * self.problem.sizes)[knobs]
-            return self._normal[2] - then >= 2 * sigmas * np.sqrt(own @ doubt @ own)
+            return self._normal[2] - then >= 2 * sigmas * float(np.sqrt(own @ doubt @ own))
 
         low, high = ends
         if not safe(high):
