@@ -221,7 +221,7 @@ def case(ring, seed, options):
         apply(ring, on_ring),
         goal=ring,
         targets=["closed_orbit"],
-        knobs=[replace(k, error=0.0) for k in default_knobs(ring, ["correctors"])],
+        knobs=[replace(k, error=STEERED) for k in default_knobs(ring, ["correctors"])],
     )
     miss = 1 + STEERED * stream(seed, "steering").standard_normal(len(steered.settings))
     kicks = [replace(c, amount=float(m) * c.amount)
@@ -277,6 +277,7 @@ def case(ring, seed, options):
             for cut in CUTS
         ]  # fmt: skip
         found["loco"] = min((f for f in fits if f), key=lambda one: one["square"], default=None)
+        found["loco_cuts"] = [f and f["square"] for f in fits]
     return found
 
 

@@ -216,6 +216,27 @@ def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupol
     assert not hardly.settings or hardly.gain > 2 * hardly.gain_error
 
 
+def test_what_is_sure_to_gain_is_set(small_ring, quadrupoles):
+    """One supply's error is known, the other's is as large as its uncertainty."""
+    rms = np.array([1e-5 if name.startswith("QF") else 8e-3 for name in quadrupoles])
+    mean = np.full(len(quadrupoles), 2e-3)
+    known = replace(posterior(quadrupoles, 1.0, mean), rms=rms)
+    found = correct(estimate_with(small_ring, small_ring, known), targets=["tunes"])
+    amounts = {s.knob.name: s.amount for s in found.settings}
+    assert amounts["QF"] == pytest.approx(-2e-3, rel=0.15)
+    assert abs(amounts.get("QD", 0.0)) < 1.3e-3
+    assert "measure again" in found.report()
+    goal, rng, worse = optics(small_ring)[2], np.random.default_rng(1), 0
+    for _ in range(40):
+        drawn = zip(quadrupoles, mean + rms * rng.standard_normal(len(mean)), strict=True)
+        machine = apply(small_ring, [Cause("quadrupole_gradient", n, float(a)) for n, a in drawn])
+        before, after = (
+            np.sum((optics(r)[2] - goal) ** 2) for r in (machine, set_to(machine, found))
+        )
+        worse += after > before
+    assert worse <= 1  # of all changes of the whole correction one in six
+
+
 def test_a_mean_that_stores_no_beam_is_shortened(small_ring, quadrupoles):
     """The linear estimate of a ring that stores a beam goes too far."""
     signs = [0.6 if name.startswith("QF") else -0.6 for name in quadrupoles]

@@ -24,7 +24,7 @@ from tmlattice.correction.solve import (
     fewest,
     nearly,
     optimised,
-    shortened,
+    safest,
 )
 from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
@@ -95,8 +95,8 @@ def correct(
     if not begin.slopes.any():
         raise TmlatticeError("no knob changes a target; name others (--knobs, --target)")
     whole, order = _corrected(problem, begin)
-    end, share = shortened(begin, whole)
-    found = _fields(begin, whole, end, share, order)
+    end, aversion = safest(begin, whole, np.array(order, dtype=np.int64))
+    found = _fields(begin, whole, end, aversion, order)
     seconds = time.perf_counter() - begun
     made = {"lattice": estimate.settings.name, "seed": seed, "draws": DRAWS,
             "knobs": len(devices), "seconds": seconds}  # fmt: skip
@@ -129,19 +129,15 @@ def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
 
 
 def _fields(
-    begin: Point, whole: Point, end: Point, share: float, order: Sequence[int]
+    begin: Point, whole: Point, end: Point, aversion: float, order: Sequence[int]
 ) -> dict[str, Any]:
-    """Fields of the result: the whole correction, and a share of it where all ends."""
+    """Fields of the result: the whole correction, and the safe one where all ends."""
     problem, targets = end.problem, end.problem.targets
-    now, then = (
-        np.sum((p.rows + targets.rows(p.open)) ** 2, axis=-1)
-        for p in (begin, end if share else whole)
-    )
-    square = max(float(now.mean()), 1e-30)
-    gain = (now - then) / square
-    refused = "" if share else _refusal(float(gain.mean()), float(gain.std()))
-    order = order if share else []
-    gains = end.gains(np.array(order, dtype=np.int64))
+    gain = begin.squares - (whole if end is begin else end).squares
+    gain /= max(float(begin.squares.mean()), 1e-30)
+    refused = _refusal(float(gain.mean()), float(gain.std())) if end is begin else ""
+    order = [] if refused else order
+    gains = end.gains(np.array(order, dtype=np.int64), aversion)
     gains /= max(float(gains.sum()), 1e-30)
     settings = [
         Setting(knob, amount, knob.setting(amount), own)
@@ -174,7 +170,7 @@ def _fields(
         "after": _intervals(end),
         "stays": stays,
         "gains": tuple(
-            (n, _expected(share * end.step(np.array(order[:n]))[0], end))
+            (n, _expected(end.step(np.array(order[:n]), aversion)[0], end))
             for n in sorted({*COUNTS, len(order)}) if 0 < n <= len(order)
         ),
         "gain": float(gain.mean()),
@@ -184,8 +180,8 @@ def _fields(
         "profile": profile,
         "s": tuple(targets.s.tolist()),
         "targets": targets.tolerance,
-        "iterations": _iterations(end, share),
-        "warnings": tuple(_warnings(end, share, settings)),
+        "iterations": _iterations(end, aversion),
+        "warnings": tuple(_warnings(begin, whole, end, aversion, settings)),
     }  # fmt: skip
 
 
@@ -220,17 +216,20 @@ def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _iterations(end: Point, share: float) -> int:
-    """One, and another one after a share of the changes, or where most of what stays comes from
+def _iterations(end: Point, aversion: float) -> int:
+    """One, and another one after a shortened correction, or where most of what stays comes from
     errors of the knobs' changes, which a second measurement shows."""
-    return 2 if share < 1 or float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
+    return 2 if aversion or float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
 
 
-def _warnings(end: Point, share: float, settings: Sequence[Setting]) -> Iterable[str]:
-    if 0 < share < 1:
+def _warnings(
+    begin: Point, whole: Point, end: Point, aversion: float, settings: Sequence[Setting]
+) -> Iterable[str]:
+    if 0 < aversion < np.inf:
+        share = (begin.square - end.square) / (begin.square - whole.square)
         yield (
-            f"the settings are {100 * share:.0f} % of the most probable correction, since larger "
-            "ones may make the ring worse; measure again, and correct the rest"
+            f"the settings have {100 * share:.0f} % of the gain of the most probable correction, "
+            "since larger ones may make the ring worse; measure again, and correct the rest"
         )
     held = [setting.knob.name for setting in settings if setting.at_limit]
     if held:

@@ -75,6 +75,13 @@ class Estimate:
         drawn = known.correlated(random.standard_normal((len(known.rms), count)))
         return np.asarray((known.rms[:, None] * drawn)[self.kept].T)
 
+    def independent(self, slopes: Array) -> Array:
+        """Return slopes by independent errors of size 1 from those by the errors, [error, ...]."""
+        assert self.known is not None
+        every = np.zeros((len(self.known.rms), *slopes.shape[1:]))
+        every[self.kept] = self.known.rms[self.kept, None] * slopes
+        return self.known.correlated(every)
+
 
 def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -> Estimate:
     """Return the estimate of a ring with the posterior of its errors.

@@ -326,7 +326,7 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
     where = f"{path}: knob '{plain(name, 40)}'"
     if not name or (strange := set(given) - set(COLUMNS)):
         what = (
-            "a row without a knob"
+            f"{path}: a row without a knob"
             if not name
             else f"{where}: unknown column {plain(str(min(map(str, strange))), 40)}"
         )
@@ -368,7 +368,7 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
 def _check(where: str, knob: Knob) -> None:
     numbers = [knob.present, knob.step, knob.error, *(v for pair in knob.curve for v in pair)]
     if not all(map(math.isfinite, numbers)) or knob.step < 0 or knob.error < 0:
-        raise MeasurementError(f"{where}: settings are finite; step and error are not negative")
+        raise MeasurementError(f"{where}: its numbers must be finite, its step and error not < 0")
     if not knob.low < knob.high:
         raise MeasurementError(f"{where}: its limits are {knob.low:g} and {knob.high:g}")
     x, y = (np.array(v) for v in zip(*knob.curve, strict=True)) if knob.curve else (None, None)

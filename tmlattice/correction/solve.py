@@ -8,6 +8,12 @@ knobs and G those by its uncertain errors, the expected square after a change x 
 The first term can be reduced by the knobs. The second is a ridge without a free parameter: a knob's
 change has a relative error sigma_k, so that large changes which cancel one another cost more than
 they gain. The third is what the data do not determine: no knob lowers it.
+
+The change with the smallest expected square may still make one machine of the posterior worse: its
+gain -2 (e + G delta) J x - |J x|^2 has the variance 4 x D x, D = J^T G E[delta delta^T] G^T J. Of
+all changes that make the ring worse with one probability, the one of the largest expected gain
+minimises the expected square plus a multiple (the risk aversion) of x D x: directions whose slope
+is uncertain are shortened, the others are not.
 """
 
 import logging
@@ -43,9 +49,16 @@ MAX_HALVINGS = 6
 MAX_EXCESS = 5e-4, 2e-3
 """Excess over the smallest expected square that is allowed for fewer knobs: relative (0.025 % in
 rms), and in squares of the tolerances."""
-SIGMAS, MIN_SHARE = 3.0, 0.1
-"""Standard deviations by which a correction is expected to make the ring better; and the smallest
-share of its changes that is worth while: it has a fifth of the expected gain."""
+SIGMAS = 3.0
+"""Standard deviations by which a correction is expected to make the ring better: of a thousand such
+corrections one makes it worse."""
+MIN_GAIN = 0.01
+"""Smallest gain that is worth a change: share of the expected square; half of it in rms."""
+AVERSIONS, BISECTIONS = (1e-5, 1e5), 10
+"""Risk aversions between which one is sought, relative to the means of both quadratic forms; and
+halvings of this range: of two per cent."""
+NEAR = 1.03
+"""Standard deviations over `SIGMAS` at which a shortened correction is not lengthened again."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Numbers of knobs with a stated gain."""
 ROUNDING = 1e-10
@@ -193,12 +206,36 @@ class Point:
             shift = problem.energies * self.shown.per_energy
             for name, part in self.by_frequency.items():
                 total[name] += shift[:, None, None] * part
-        for first in range(0, len(estimate.hypotheses), AT_ONCE):
-            some = slice(first, first + AT_ONCE)
-            changes = self.shown.derivatives(estimate.hypotheses[some])
-            for name, part in problem.targets.changes(changes).items():
+        for some, changes in self._by_errors():
+            for name, part in changes.items():
                 total[name] += np.tensordot(problem.draws[:, some], part, 1)
         return total
+
+    def _by_errors(self) -> Iterator[tuple[slice, dict[str, Array]]]:
+        """Yield d errors / d amount of the uncertain errors, some at a time."""
+        hypotheses = self.problem.estimate.hypotheses
+        for first in range(0, len(hypotheses), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            yield some, self.problem.targets.changes(self.shown.derivatives(hypotheses[some]))
+
+    @cached_property
+    def squares(self) -> Array:
+        """Squares of the rows over the draws, [draw]."""
+        return np.asarray(np.sum((self.rows + self.problem.targets.rows(self.open)) ** 2, axis=-1))
+
+    @cached_property
+    def doubt(self) -> Array:
+        """Covariance of half the slopes of the square by the knobs, in units of their sizes, over
+        the posterior, [knob, knob]."""
+        problem, estimate = self.problem, self.problem.estimate
+        slopes = self.slopes / problem.sizes
+        parts = [problem.targets.rows(own) @ slopes for _, own in self._by_errors()]
+        whole = estimate.independent(np.concatenate(parts)) if parts else 0.0 * slopes
+        if estimate.energy_error:
+            shift = estimate.energy_error * self.shown.per_energy
+            energy = shift * problem.targets.rows(self.by_frequency) @ slopes
+            whole = np.concatenate([whole, energy])
+        return np.asarray(whole.T @ whole)
 
     @property
     def unsure(self) -> Array:
@@ -220,22 +257,44 @@ class Point:
         matrix.flat[:: len(matrix) + 1] += self.problem.sigma**2 + ROUNDING
         return matrix, -slopes.T @ start, float(start @ start)
 
-    def step(self, knobs: Indices) -> tuple[Array, float]:
+    def step(self, knobs: Indices, aversion: float = 0.0) -> tuple[Array, float]:
         """Return the amounts of some knobs, the others at zero, of the smallest linearised expected
-        square within the limits; and that square."""
+        square within the limits, with a risk aversion; and that square."""
         matrix, right, square = self._normal
         bounds = self.problem.bounds[:, knobs] * self.problem.sizes[knobs]
         matrix, right = matrix[np.ix_(knobs, knobs)], right[knobs]
-        found = bounded(matrix, right, *bounds)
+        found = bounded(matrix + self._ridge(knobs, aversion), right, *bounds)
         amounts = np.zeros(len(self.amounts))
         amounts[knobs] = found / self.problem.sizes[knobs]
         return amounts, square + float(found @ (matrix @ found - 2 * right))
 
-    def gains(self, knobs: Indices) -> Array:
+    def _ridge(self, knobs: Indices, aversion: float) -> Array | float:
+        return aversion * self.problem.begin.doubt[np.ix_(knobs, knobs)] if aversion else 0.0
+
+    def aversion(self, knobs: Indices, sigmas: float) -> float:
+        """Return the smallest risk aversion whose step gains these standard deviations, to first
+        order; infinite where none does."""
+        doubt = self.problem.begin.doubt[np.ix_(knobs, knobs)]
+        ends = np.log(AVERSIONS) + np.log(len(knobs) / max(float(np.trace(doubt)), 1e-300))
+
+        def safe(log: float) -> bool:
+            amounts, then = self.step(knobs, float(np.exp(log)))
+            own = (amounts * self.problem.sizes)[knobs]
+            return self._normal[2] - then >= 2 * sigmas * float(np.sqrt(own @ doubt @ own))
+
+        low, high = ends
+        if not safe(high):
+            return np.inf
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if safe(middle) else (middle, high)
+        return float(np.exp(high))
+
+    def gains(self, knobs: Indices, aversion: float) -> Array:
         """Return the falls of the linearised expected square by each knob after those before it,
-        without limits, [knob]."""
+        without limits, with a risk aversion, [knob]."""
         matrix, right, _ = self._normal
-        root = np.linalg.cholesky(matrix[np.ix_(knobs, knobs)])
+        root = np.linalg.cholesky(matrix[np.ix_(knobs, knobs)] + self._ridge(knobs, aversion))
         return np.asarray(solve_triangular(root, right[knobs], lower=True) ** 2)
 
     def by_gain(self) -> Iterator[int]:
@@ -326,23 +385,35 @@ def nearly(square: float, least: float) -> bool:
     return square <= (1 + relative) * least + beyond
 
 
-def shortened(begin: Point, end: Point) -> tuple[Point, float]:
-    """Return the point at the largest share of a correction's changes whose gain is expected to be
-    `SIGMAS` standard deviations above zero, at settings that the devices' steps allow; and that
-    share.
+def safest(begin: Point, end: Point, knobs: Indices) -> tuple[Point, float]:
+    """Return the point of the largest expected gain that is `SIGMAS` standard deviations above
+    zero, at settings that the devices' steps allow, and its risk aversion: 0 where the whole
+    correction is as safe; infinite, and the beginning, where nothing is.
 
-    In a draw with the rows r, and r + d after all changes, a share x changes the square by
-    x (2 r d + x d^2).
+    Args:
+        begin, end: before and after the whole correction.
+        knobs: indices of free knobs; the others are at zero.
     """
-    problem, amounts = end.problem, end.amounts
-    now, then = (p.rows + problem.targets.rows(p.open) for p in (begin, end))
-    slope = 2 * np.sum(now * (then - now), axis=1)
-    size = max(float(np.mean(np.sum((then - now) ** 2, axis=1))), 1e-30)
-    share = -float(slope.mean() + SIGMAS * slope.std()) / size
-    share = 0.0 if share < MIN_SHARE else min(share, 1.0)
-    pairs = zip(problem.knobs, (share * amounts).tolist(), strict=True)
-    new = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
-    return (end if np.array_equal(new, amounts) else problem.at(new)), share
+    problem, now, found = end.problem, begin.squares, (begin, np.inf)
+    amounts, aversion, sigmas = end.amounts, 0.0, SIGMAS
+    for _ in range(MAX_HALVINGS):
+        pairs = zip(problem.knobs, amounts.tolist(), strict=True)
+        new = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
+        point = end if np.array_equal(new, end.amounts) else problem.better(new, np.inf)
+        gain = now - (now if point is None else point.squares)
+        mean, deviation = float(gain.mean()), float(gain.std())
+        safe = mean >= SIGMAS * deviation
+        if point is not None and safe and mean >= MIN_GAIN * now.mean():
+            found = point, aversion
+        if safe and (not aversion or mean <= NEAR * SIGMAS * deviation):
+            break
+        if aversion:  # beyond first order
+            sigmas *= float(np.clip(1.01 * SIGMAS * deviation / max(mean, 1e-30), 0.5, 2.0))
+        aversion = end.aversion(knobs, sigmas)
+        if np.isinf(aversion):
+            break
+        amounts, _ = end.step(knobs, aversion)
+    return found
 
 
 def drawn(
