@@ -89,7 +89,7 @@ def correct(
 
     ESTIMATED is a lattice file of `diagnose --lattice-out`, with the file of remaining
     uncertainties next to it, or the folder of `diagnose --out` with it. Predicted rms errors have
-    68 % intervals. A correction whose expected gain is below its error changes no setting.
+    68 % intervals. Changes that may make the ring worse are shortened, or not made.
     """
     from tmlattice.correction import correct as run
     from tmlattice.correction.estimate import read_estimate

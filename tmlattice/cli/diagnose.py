@@ -203,7 +203,8 @@ def diagnose(
             from tmlattice.diagnosis.twin import known_of
 
             known = known_of(result)
-        correction = _correction(result, known)
+        # of what was changed on purpose it would be the way back
+        correction = None if asked else _correction(result, known)
         calibrations = applied(result, asked) if asked else []
         if calibrations:
             source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]
