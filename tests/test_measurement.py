@@ -231,7 +231,7 @@ def test_orbit_response_selects_and_reorders(response):
         ({"response": np.zeros((2, 2, 2))}, "need"),
         ({"noise": (0.0, 0.0)}, "above zero"),
         ({"rf": RfStep(0.0, 3840, 1.0)}, "RF"),
-        ({"rf": RfStep(5e8, 3840, 0.0, np.zeros((3, 2)))}, "not zero"),
+        ({"rf": RfStep(5e8, 3840, 0.0, np.zeros((3, 2)))}, "step of 0 Hz"),
         ({"rf": RfStep(5e8, 3840, 1.0, np.zeros((2, 2)))}, "shape"),
     ],
 )

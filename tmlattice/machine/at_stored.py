@@ -125,7 +125,7 @@ def _matched(
     for the curvature of the orbits.
 
     With the RF they fill its bucket. Without it each keeps its energy, on the closed orbit of that
-    energy to second order: beside it, it would oscillate before the kick.
+    energy to second order: on a straight one it would oscillate before the kick.
     """
     turn = functools.partial(engine.one_pass, line)
     matrix = at_orbit.one_turn(turn, state)

@@ -87,8 +87,6 @@ class Dispersion(Shown):
         steps = []
         for step in self.steps:
             check_rf(step)
-            if step.step == 0:
-                raise MeasurementError("an RF step of 0 Hz shows no dispersion; give its size")
             orbit = np.asarray(np.nan if step.orbit is None else step.orbit, dtype=float)
             if orbit.shape != (len(monitors), 2):
                 raise MeasurementError(

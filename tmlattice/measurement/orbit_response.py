@@ -49,12 +49,12 @@ LARGEST_KICK = 1e6
 def check_rf(rf: RfStep) -> None:
     """Raises a MeasurementError for a frequency, a harmonic or a step that cannot be."""
     there_is = 0 < rf.frequency < HIGHEST_RF and 0 < rf.harmonic < HIGHEST_RF
-    stepped = rf.step != 0 or rf.orbit is None
-    if not (there_is and stepped and abs(rf.step) < rf.frequency):
+    if rf.step == 0 and rf.orbit is not None:
+        raise MeasurementError("an RF step of 0 Hz shows no dispersion; give its size")
+    if not (there_is and abs(rf.step) < rf.frequency):
         raise MeasurementError(
             f"an RF of {rf.frequency:g} Hz, harmonic {float(rf.harmonic):g}, step {rf.step:g} Hz "
-            "cannot be; frequency and harmonic are above zero, the step is a small part of it and "
-            "not zero"
+            "cannot be; frequency and harmonic are above zero, the step is a small part of it"
         )
 
 

@@ -105,7 +105,7 @@ def lines(
         at: position of each monitor in the turn, s / C, [monitor]: the envelope of a later one is
             later. None: monitors are equidistant, in their order.
         chromatic: change of the modes by the relative energy in the model that `near` is from, as
-            a share of them, [monitor, plane, mode], 0 where it is not known. What oscillates
+            a share of them, [monitor, plane, mode], 0 where it is unknown. What oscillates
             changes its energy while the beam decoheres, which is not an error of the amplitudes.
 
     Raises:

@@ -54,11 +54,16 @@ monitors."""
 
 
 OTHERS = 6
-"""Nuisances of a shot and mode beside its amplitude: see `ManyTurns`."""
+"""Nuisances of a shot and mode other than its amplitude: see `ManyTurns`."""
 LINES = -2 * OTHERS - 2
 """End of the lines among the data of a shot."""
 ENERGY = 1e-3
 """rms relative energy of the particles of a stored beam: as much may differ what oscillates."""
+ASYMMETRY = 0.1
+"""Mean energy of what oscillates in phase with the beam, as a share of its spread: by the energies
+that a kick favours, and of some hundred particles."""
+PARTS = 8
+"""Of the turns, in which the power of a line is compared."""
 STEP = 0.1
 """Energy on both sides of the beam's, as a share of it, for the change of its modes."""
 AT_ONCE = 256
@@ -151,6 +156,21 @@ def _spread(found: Lines, shots: Sequence[int]) -> Array:
     return np.stack([g.max(axis=2), mean], axis=2)
 
 
+def _faded(found: Lines) -> Array:
+    """How far the beam decohered: 0 for a steady line, at most 1, [shot, mode]. It is about the
+    imaginary energy of what oscillates, in units of the beam's spread."""
+    power = np.zeros((*found.tune.shape, PARTS))
+    for i, turns in enumerate(found.turns):
+        edges = np.linspace(0, turns, PARTS, endpoint=False).astype(int)
+        squares = np.abs(found.envelope[i]) ** 2
+        power[i] = np.add.reduceat(squares, edges, axis=1) / np.diff([*edges, turns])
+    high, low = power.max(axis=2), power.min(axis=2)
+    seen = np.nansum((np.abs(found.amplitude) / found.noise[..., None]) ** 2, axis=(1, 2))
+    noise = np.sqrt(2 * PARTS / np.maximum(found.turns[:, None] * seen, 1e-300))
+    faded = (high - low) / np.maximum(high + low, 1e-300) - 3 * noise
+    return np.asarray(np.sqrt(np.clip(faded, 0.0, 1.0)))
+
+
 def _tracked(
     ring: Ring, beam: StoredBeam, wanted: ComplexArray, turns: int, at: Array
 ) -> tuple[ComplexArray, Array, Array, Flags]:
@@ -221,11 +241,11 @@ def _fill(
     more = np.where(there[:, None, None], np.abs(beyond * amplitude[:, None, None]), 0.0)
     shift.mode_error[shots] = 2 * SHARE * more
     shift.tune_error[shots] = 2 * SHARE * np.where(there, np.abs(beyond_tune), 0.0)
-    decohered = (spread[..., 0] - spread[..., 1]) / np.maximum(spread.sum(axis=2), 1e-300)
     # a small part is what terms of the usual size leave of one another
     seen = there[:, None]
     squares = np.where(seen, of_parts, 0.0) ** 2
     usual = np.sqrt(squares.sum(axis=2, keepdims=True) / np.maximum(seen.sum(axis=2), 1)[..., None])
+    decohered = (spread[..., 0] - spread[..., 1]) / np.maximum(spread.sum(axis=2), 1e-300)
     terms = SHARE * np.fmax(usual / np.maximum(of_parts, 1e-300), 1.0)
     own = np.sqrt(terms**2 + (decohered**2 + (2 * SHARE * share) ** 2)[:, None])
     shift.error[shots] = np.where(seen, own, SHARE)
@@ -539,9 +559,10 @@ def many_turns(
     size = np.nan_to_num(np.abs(found.amplitude)).max(axis=2, keepdims=True)
     error = np.sqrt(found.error**2 + (FLOOR * size) ** 2 + shift.mode_error**2).reshape(shots, -1)
     both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
-    # of shifts and energies, common to all shots: their mean is known no better than one
-    known = np.ones((shots, 2, OTHERS))
-    known[..., :2] = shift.error.swapaxes(1, 2)
+    # of shifts and energies, common to all shots: their mean is known no better than one. The mean
+    # phase of a symmetric beam is that of its mean energy, which is the ring's
+    energy = np.maximum(_faded(found), 1e-3)[..., None] * [ASYMMETRY, 1.0, 1.0, 1.0]
+    known = np.concatenate([shift.error.swapaxes(1, 2), energy], axis=2)
     known = known.reshape(shots, -1) * np.sqrt(shots)
     tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
     data = np.concatenate([both.reshape(shots, -1), np.zeros_like(known), tunes], axis=1)
