@@ -499,12 +499,13 @@ class ManyTurns(Stored):
 def _chromatic(beam: StoredBeam, at: Array) -> Moved:
     """Change of a beam by its energy in units of ENERGY, and by the square of it, [order, ...], at
     the same phase of each monitor: `lines` delays the envelope by its part of the turn."""
-    ends = [beam, *(StoredBeam(beam.model.at_energy(h * ENERGY)) for h in (STEP, -STEP))]
+    moved = (beam.model.at_energy(h * ENERGY) for h in (STEP, -STEP))
+    ends = [StoredBeam(model) for model in (beam.model, *moved)]  # all without the RF
 
     def orders(zero: Any, up: Any, down: Any) -> Any:
         return np.stack([(up - down) / (2 * STEP), (up - 2 * zero + down) / (2 * STEP**2)])
 
-    tunes = [(end.tunes - beam.tunes + 0.5) % 1.0 - 0.5 for end in ends]
+    tunes = [(end.tunes - ends[0].tunes + 0.5) % 1.0 - 0.5 for end in ends]
     delays = [np.exp(-2j * np.pi * at[:, None, None] * own) for own in tunes]
     modes = [end.modes * own for end, own in zip(ends, delays, strict=True)]
     return Moved(orders(*(end.model.readings for end in ends)), orders(*tunes), orders(*modes))
