@@ -159,12 +159,12 @@ def _spread(found: Lines, shots: Sequence[int]) -> Array:
 def _faded(found: Lines) -> Array:
     """How far the beam decohered: 0 for a steady line, at most 1, [shot, mode]. It is about the
     imaginary energy of what oscillates, in units of the beam's spread."""
-    power = np.zeros((*found.tune.shape, PARTS))
+    high, low = np.zeros(found.tune.shape), np.zeros(found.tune.shape)
     for i, turns in enumerate(found.turns):
-        edges = np.linspace(0, turns, PARTS, endpoint=False).astype(int)
-        squares = np.abs(found.envelope[i]) ** 2
-        power[i] = np.add.reduceat(squares, edges, axis=1) / np.diff([*edges, turns])
-    high, low = power.max(axis=2), power.min(axis=2)
+        squares = np.abs(found.envelope[i, :, :turns]) ** 2
+        parts = [own.mean(axis=1) for own in np.array_split(squares, PARTS, axis=1) if own.size]
+        if parts:
+            high[i], low[i] = np.max(parts, axis=0), np.min(parts, axis=0)
     seen = np.nansum((np.abs(found.amplitude) / found.noise[..., None]) ** 2, axis=(1, 2))
     noise = np.sqrt(2 * PARTS / np.maximum(found.turns[:, None] * seen, 1e-300))
     faded = (high - low) / np.maximum(high + low, 1e-300) - 3 * noise
