@@ -177,6 +177,13 @@ def _cosines(width: Array | float, turns: int) -> NDArray[np.int64]:
     return np.maximum(1, np.round(2 * np.asarray(width) * turns)).astype(np.int64)
 
 
+def _slow(values: ComplexArray, width: float) -> ComplexArray:
+    """Return values without what changes faster than a half width."""
+    slow = dct(values, norm="ortho")
+    slow[_cosines(width, len(values)) :] = 0
+    return np.asarray(idct(slow, norm="ortho"))
+
+
 def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[float, ComplexArray]:
     """Frequency and envelope of a line from its values by turn.
 
@@ -185,9 +192,7 @@ def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[f
     """
     turns = len(values)
     turn = np.arange(turns)
-    slow = dct(values * np.exp(-2j * np.pi * near * turn), norm="ortho")
-    slow[_cosines(width, turns) :] = 0
-    envelope = idct(slow, norm="ortho")
+    envelope = _slow(values * np.exp(-2j * np.pi * near * turn), width)
     if span:
         found = (float(strongest(envelope[:span])[0]) + 0.5) % 1.0 - 0.5
         if abs(found) < width:
@@ -314,9 +319,8 @@ def without(fit: LineFit, changes: ComplexArray) -> LineFit:
     residual = fit.residual.copy()
     for i, width in enumerate(_widths(lines, len(lines))):
         moving = np.exp(2j * np.pi * lines[i] * turn)
-        slow = dct((values[:, 2 * i] + 1j * values[:, 2 * i + 1]) / moving, norm="ortho")
-        slow[_cosines(width, len(turn)) :] = 0
-        residual -= np.real(np.outer(changes[:, i], idct(slow, norm="ortho") * moving)) * there
+        envelope = _slow((values[:, 2 * i] + 1j * values[:, 2 * i + 1]) / moving, width)
+        residual -= np.real(np.outer(changes[:, i], envelope * moving)) * there
     return replace(fit, residual=residual)
 
 

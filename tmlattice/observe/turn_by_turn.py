@@ -374,13 +374,14 @@ class ManyTurns(Stored):
 
     Attributes:
         shift: by the amplitude of each shot.
-        chromatic: change of the beam by its energy and by the square, of each shot.
+        chromatic: change of tunes and modes by the energy and by its square, in units of the
+            spread, [shot, order, mode] and [shot, order, monitor, 2, mode].
         warnings: a sentence for all data that could not be used.
     """
 
     counts: ClassVar[bool] = True
     shift: Shift = field(repr=False)
-    chromatic: tuple[Moved, ...] = field(repr=False)
+    chromatic: tuple[Array, ComplexArray] = field(repr=False)
     warnings: tuple[str, ...] = ()
 
     def neighbours(self, hypothesis: Hypothesis, among: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -440,16 +441,15 @@ class ManyTurns(Stored):
         """Return the states, shifted by the amplitude and by the energy of what oscillates."""
         by = 1 + nuisances[..., 2:4]
         energy = nuisances[..., 4::2] + 1j * nuisances[..., 5::2]
-        modes = np.einsum("ska,sampk->smpk", by, self.shift.modes)
-        tunes = np.einsum("ska,sak->sk", by, self.shift.tunes)
+        tunes, modes = self.chromatic
+        modes = np.einsum("sko,sompk->smpk", energy, modes)
+        modes += np.einsum("ska,sampk->smpk", by, self.shift.modes)
+        tunes = np.einsum("sko,sok->sk", energy.real, tunes)
+        tunes += np.einsum("ska,sak->sk", by, self.shift.tunes)
         return [
-            replace(
-                beam.shown,
-                modes=beam.modes + modes[i] + np.einsum("ko,ompk->mpk", energy[i], own.modes),
-                tunes=beam.tunes + tunes[i] + np.einsum("ko,ok->k", energy[i].real, own.tunes),
-            )
-            for i, (beam, own) in enumerate(zip(view.beams, self.chromatic, strict=True))
-        ]  # fmt: skip
+            replace(beam.shown, modes=beam.modes + own, tunes=beam.tunes + shift)
+            for beam, own, shift in zip(view.beams, modes, tunes, strict=True)
+        ]
 
     def read(self, view: Beams, nuisances: Array) -> Array:
         """Predicted readings with all nuisances but the amplitudes."""
@@ -496,9 +496,9 @@ class ManyTurns(Stored):
         return np.concatenate([flat, rest.reshape(nuisances.size, shots, -1)], axis=2)
 
 
-def _chromatic(beam: StoredBeam, at: Array) -> Moved:
-    """Change of a beam by its energy in units of ENERGY, and by the square of it, [order, ...], at
-    the same phase of each monitor: `lines` delays the envelope by its part of the turn."""
+def _chromatic(beam: StoredBeam, at: Array) -> tuple[Array, ComplexArray]:
+    """Change of tunes and modes by the energy in units of ENERGY, and by its square, [order, ...],
+    at the same phase of each monitor: `lines` delays the envelope by its part of the turn."""
     moved = (beam.model.at_energy(h * ENERGY) for h in (STEP, -STEP))
     ends = [StoredBeam(model) for model in (beam.model, *moved)]  # all without the RF
 
@@ -508,7 +508,7 @@ def _chromatic(beam: StoredBeam, at: Array) -> Moved:
     tunes = [(end.tunes - ends[0].tunes + 0.5) % 1.0 - 0.5 for end in ends]
     delays = [np.exp(-2j * np.pi * at[:, None, None] * own) for own in tunes]
     modes = [end.modes * own for end, own in zip(ends, delays, strict=True)]
-    return Moved(orders(*(end.model.readings for end in ends)), orders(*tunes), orders(*modes))
+    return orders(*tunes), orders(*modes)
 
 
 def many_turns(
@@ -541,19 +541,21 @@ def many_turns(
         used=np.zeros(shape, dtype=bool),
         places=places,
         shift=Shift.none(shots, count),
-        chromatic=(),
+        chromatic=(np.zeros((shots, 2, 2)), np.zeros((shots, 2, count, 2, 2), dtype=complex)),
     )
     beams = blank.view(()).beams
     design = np.array([beam.tunes for beam in beams])
     found, shift = spectrum, blank.shift
     at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
     each = {id(beam): _chromatic(beam, at) for beam in beams}
-    chromatic = tuple(each[id(beam)] for beam in beams)
+    of_tunes, of_modes = (
+        np.stack(own) for own in zip(*(each[id(beam)] for beam in beams), strict=True)
+    )
     if found is None:
         share = np.zeros_like(beams[0].modes)
         for mode in (0, 1):  # the other plane shows a mode by coupling alone
-            own = chromatic[0].modes[0, :, mode, mode] / beams[0].modes[:, mode, mode]
-            share[:, mode, mode] = own + 2j * np.pi * at * chromatic[0].tunes[0, mode]
+            own = of_modes[0, 0, :, mode, mode] / beams[0].modes[:, mode, mode]
+            share[:, mode, mode] = own + 2j * np.pi * at * of_tunes[0, 0, mode]
         found = lines(measured.in_order_of(names), near=design[0], at=at, chromatic=share)
         shift = shift_of(ring, beams, found, at)
     # the model's error is proportional to the line of the mode in its own plane
@@ -585,6 +587,6 @@ def many_turns(
         sigma=np.where(there, errors, 1.0),
         used=there,
         shift=shift,
-        chromatic=chromatic,
+        chromatic=(of_tunes, of_modes),
         warnings=(*found.warnings, *large),
     )
