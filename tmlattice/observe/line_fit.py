@@ -197,7 +197,7 @@ def _line(values: ComplexArray, near: float, width: float, span: int) -> tuple[f
         found = (float(strongest(envelope[:span])[0]) + 0.5) % 1.0 - 0.5
         if abs(found) < width:
             near, envelope = near + found, envelope * np.exp(-2j * np.pi * found * turn)
-    shift = _mean(envelope)
+    shift = growth(envelope).imag / (2 * np.pi)
     if abs(shift) < width:
         near, envelope = near + shift, envelope * np.exp(-2j * np.pi * shift * turn)
     size = np.sqrt(np.mean(np.abs(envelope) ** 2))
@@ -221,17 +221,11 @@ def _peak(signal: ComplexArray) -> float:
     return at
 
 
-def _mean(envelope: ComplexArray) -> float:
-    """Mean frequency of an envelope's power: that of the mean energy of what oscillates."""
-    power = (np.abs(envelope) ** 2).sum()
-    return float(np.vdot(envelope, np.gradient(envelope)).imag / (2 * np.pi * max(power, 1e-300)))
-
-
 def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
     """Frequency of an envelope, and its error from noise and from the drift between two halves.
 
     It is the peak of the spectrum with the modulus as window, which the noise moves least; or the
-    mean one, if the noise does not explain the difference.
+    mean one, that of the mean energy of what oscillates, if noise does not explain the difference.
 
     Args:
         envelope: [turn].
@@ -251,7 +245,7 @@ def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
     peaks = [_peak(np.abs(envelope[half]) * envelope[half]) for half in halves]
     expected = sum(statistical(power[half]) for half in halves)
     drift = max((peaks[0] - peaks[1]) ** 2 - 9 * expected, 0.0) / 4
-    peak, mean = _peak(np.abs(envelope) * envelope), _mean(envelope)
+    peak, mean = _peak(np.abs(envelope) * envelope), growth(envelope).imag / (2 * np.pi)
     noise = (np.abs(np.gradient(envelope)) ** 2).sum() + power[0] + power[-1]
     noise *= variance / max(2 * np.pi * power.sum(), 1e-300) ** 2
     if (peak - mean) ** 2 > 9 * noise:
@@ -362,8 +356,7 @@ def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
     return found
 
 
-def later(envelope: ComplexArray, share: Array) -> ComplexArray:
-    """Return an envelope some share of a turn later over itself, averaged over the line's power."""
-    growth = np.gradient(envelope)
-    first, second = (np.vdot(envelope, own) for own in (growth, np.gradient(growth)))
-    return np.asarray(1 + (share * first + share**2 / 2 * second) / (np.abs(envelope) ** 2).sum())
+def growth(envelope: ComplexArray) -> complex:
+    """Growth of an envelope per turn, averaged over the line's power."""
+    power = (np.abs(envelope) ** 2).sum()
+    return complex(np.vdot(envelope, np.gradient(envelope)) / max(power, 1e-300))

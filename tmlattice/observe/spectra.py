@@ -33,7 +33,7 @@ from tmlattice.observe.line_fit import (
     change,
     fit_lines,
     floor,
-    later,
+    growth,
     noise_at,
     without,
 )
@@ -152,7 +152,7 @@ def lines(
             found.tune[i, mode] = abs(mirrored - fit.frequency[line])
             found.tune_error[i, mode] = fit.frequency_error[line]
             found.envelope[i, mode, :used] = turned(fit.envelope[line])
-            late = later(fit.envelope[line], np.repeat(place, 2)[usable])
+            late = 1 + np.repeat(place, 2)[usable] * growth(fit.envelope[line])
             values = found.amplitude[i].reshape(-1, 2)
             values[usable, mode] = turned(fit.amplitude[:, line] / late)
             errors = found.error[i].reshape(-1, 2)
