@@ -157,7 +157,8 @@ def test_what_decoheres_has_an_imaginary_energy(small_ring):
     more = point.nuisances.copy()
     more[..., 4] += 0.1
     moved = problem.read(point.view, more) - problem.read(point.view, point.nuisances)
-    chromaticity = off_momentum(TaylorNetwork.from_ring(small_ring, 6), small_ring.length).chromaticity
+    network = TaylorNetwork.from_ring(small_ring, 6)
+    chromaticity = off_momentum(network, small_ring.length).chromaticity
     assert_allclose(moved[0, -2:], 1e-4 * chromaticity, rtol=1e-2)
     found = diagnose(small_ring, simulate_turns(small_ring, [weak], **beam, noise=2e-6).measured)
     (only,) = found.findings
