@@ -5,7 +5,8 @@
 Each machine has all usual errors of the catalogue, and quadrupoles displaced by `--offset` rms, m.
 Machines whose beam completes the first turn are not counted. Six shots of two turns are read as far
 as the beam gets, diagnosed, and corrected with the target `first_turn`; then again from the
-estimated ring and its posterior, `--rounds` times at most.
+estimated ring and its posterior, `--rounds` times at most. Where a diagnosis refuses its data,
+the machine is measured again, as a round.
 The oracle knows all errors of the ring. A beam circulates if it is launched on the axis and read on
 20 turns. Machines that FILE has already are not measured again.
 """
@@ -71,8 +72,8 @@ def case(ring, seed, options):
             estimate = estimate_of(diagnose(model, replace(data, settings=()), known=known))
             own = changes(correct(estimate, targets=TARGET))
         except TmlatticeError as error:
-            found["stopped"] = str(error)
-            break
+            found.setdefault("refused", {})[number] = str(error)
+            continue  # and measure again
         kicks.update(own)
         model = apply(estimate.ring, [
             Cause(f"corrector_kick_{'xy'['h' not in ring[name].kind[0]]}", name, kick)
