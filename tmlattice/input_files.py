@@ -191,6 +191,15 @@ def _whole(digits: str) -> int:
     return int(digits)
 
 
+def number(text: str) -> float:
+    """A number of a table.
+
+    Raises:
+        ValueError: it is none; `1_000`, which Python takes for one, is none either.
+    """
+    return float(text.replace("_", "?"))
+
+
 def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:
     """The value of a YAML file: texts, lists and objects. No scalar is turned into a number, a
     date or a truth value; an empty one, `~` and `null` are None.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import MeasurementError
-from tmlattice.input_files import content_of
+from tmlattice.input_files import content_of, number
 from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement.rows import not_csv
 
@@ -194,15 +194,6 @@ def _csv(path: Path) -> list[Column]:
     if separator != ",":
         rows = [(i, [_DECIMAL.sub(r"\1.\2", field) for field in row]) for i, row in rows]
     return [Column(*named(name), [row[i] for _, row in rows]) for i, name in enumerate(header)]
-
-
-def number(text: str) -> float:
-    """A number of a table.
-
-    Raises:
-        ValueError: it is none; `1_000`, which Python takes for one, is none either.
-    """
-    return float(text.replace("_", "?"))
 
 
 def _is_number(text: str) -> bool:
