@@ -222,7 +222,7 @@ def test_monitors_and_readings_of_their_own_are_noted(small_ring, healthy):
     assert f"{names[4]} in x and {names[8]} in x" in found["copied monitors"]
     assert f"{names[11]} in y" in found["frozen monitors"]
     assert names[14] in found["silent monitors"]
-    assert f"{names[20]} in x, shot 1" in found["spikes"]
+    assert f"{names[20]} in x, shot 1" in found["outliers"]
     assert f"shot 4 has no reading behind {names[27]} " in found["lost beam"]
     assert len(found) == 5
 

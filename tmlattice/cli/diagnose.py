@@ -21,6 +21,7 @@ from tmlattice.cli.options import (
     named_data,
     open_ring,
     outputs,
+    print_report,
     radiation_option,
     read_data,
     seed_option,
@@ -396,10 +397,6 @@ def _print_weights(ring: "Ring", reading: "WeightReading") -> None:
     )
 
 
-LINES = 34
-"""Of a report on a terminal; with what is written where, and a correction, 40."""
-
-
 def _print(
     result: "Diagnosis",
     correction: "Correction | None",
@@ -407,15 +404,12 @@ def _print(
     json_file: Path | None,
     rings: dict[str, tuple[str, ...]],
 ) -> None:
-    from tmlattice.report.plain import report_text
     from tmlattice.report.text import wrapped
 
     screen = console()
-    width = min(screen.width, 120)
-    most = LINES if screen.is_terminal else None  # a pipe takes all of it
-    screen.print(report_text(result, width, most), soft_wrap=True)
+    print_report(screen, result)
     if correction is not None:
-        text = "\n".join(wrapped(f"Correction: {correction.words}", "", width))
+        text = "\n".join(wrapped(f"Correction: {correction.words}", "", screen.width))
         screen.print(f"\n{text}", soft_wrap=True)
     if result.parts:
         what = ", ".join(f"{part.label} ({part.readings} readings)" for part in result.parts)

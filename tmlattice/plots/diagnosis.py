@@ -367,9 +367,9 @@ def gap_labels(diagnosis: Diagnosis) -> list[str]:
     """Labels of the held-out residuals: the design, then the errors added by each model."""
     steps = 0 if diagnosis.heldout is None else len(diagnosis.heldout.misfits)
     if diagnosis.priors:
-        return [diagnosis.ring.model, "+ distributed errors", "+ findings"][:steps]
+        return [diagnosis.starting_model, "+ distributed errors", "+ findings"][:steps]
     faults = (f"+ {find(c.effect).words} {c.element or ''}".rstrip() for c in diagnosis.faults)
-    return [diagnosis.ring.model, *faults][:steps]
+    return [diagnosis.starting_model, *faults][:steps]
 
 
 # --- credible set ---------------------------------------------------------------------------------

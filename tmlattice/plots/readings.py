@@ -92,7 +92,7 @@ def plot_readings(
     s = np.array([monitor.s for monitor in monitors])
     read, dropped = readings[shot, first], view.dropped[shot, first]
     grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
-    names = (diagnosis.ring.model, "with the findings")
+    names = (diagnosis.starting_model, "with the findings")
     styles = ((BEFORE, "-"), (AFTER, "-"))
     for plane, name in enumerate("xy"):
         orbit, residual = grid[2 * plane], grid[2 * plane + 1]
