@@ -274,7 +274,7 @@ def checked(ring, data):
 
 def expected_notes(causes):
     """What a dead monitor's fault makes a true note."""
-    return {"silent monitors", "frozen monitors"} if any(
+    return {"silent BPMs", "frozen BPMs"} if any(
         cause.effect == "monitor_dead" for cause in causes
     ) else set()  # fmt: skip
 

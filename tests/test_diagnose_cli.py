@@ -272,7 +272,7 @@ def test_dead_monitor_in_report_and_json(small_ring, schema, tmp_path):
     data = simulate(small_ring, [Cause("monitor_dead", "end_3", 1.0)], **SHOTS).measurement()
     diagnosis = diagnose(small_ring, data)
     text = report_text(diagnosis)
-    assert "IDENTIFIED: monitor end_3, no signal." in text
+    assert "IDENTIFIED: BPM end_3, no signal." in text
     assert "no effect on the stored beam" in text
     write_json(tmp_path / "a.json", diagnosis.as_json())
     document = json.loads((tmp_path / "a.json").read_text())

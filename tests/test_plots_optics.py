@@ -29,7 +29,9 @@ def test_betas_are_smooth_between_elements_vs_at(small_ring):
     _, _, at_ends = sliced.get_optics(range(len(sliced)), method=at.linopt4)
     for plane in (0, 1):
         there = np.interp(at_ends.s_pos, s, beta[:, plane])
-        assert np.abs(there / at_ends.beta[:, plane] - 1).max() < 0.012  # straight lines: 0.06, 0.10
+        assert (
+            np.abs(there / at_ends.beta[:, plane] - 1).max() < 0.012
+        )  # straight lines: 0.06, 0.10
     assert np.diff(s).max() < 0.0201
 
 

@@ -94,7 +94,7 @@ log = logging.getLogger(__name__)
     metavar="FILE",
     help="The estimated ring, with its errors: .json (the package's own), .at.json (AT), "
     ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json next to it "
-    "holds the calibration of monitors and correctors (`tmlattice predict`).",
+    "holds the calibration of BPMs and correctors (`tmlattice predict`).",
 )
 @click.option(
     "--corrected-out",
@@ -423,7 +423,7 @@ def _print(
         held, good = result.response.held, result.response.good
         what = (
             f"{len(held) - 1} correctors, {int(held.sum())} of them held out, {int(good.sum())} "
-            "monitors"
+            "BPMs"
         )
     made = result.provenance
     screen.print(f"\n{result.ring.name}: {what}, seed {made['seed']}, {made['seconds']:.1f} s")

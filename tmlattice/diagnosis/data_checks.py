@@ -130,7 +130,7 @@ def check_data(
     return Checkup(kind, tuple(checks), provenance)
 
 
-_REPORTED = ("energy", "large readings", "copied monitors", "lost beam", GLOBAL, "launches")
+_REPORTED = ("energy", "large readings", "copied BPMs", "lost beam", GLOBAL, "launches")
 """Notes that the diagnosis does not find by itself."""
 
 

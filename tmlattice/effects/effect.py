@@ -122,7 +122,7 @@ class Effect(ABC):
     @property
     def label(self) -> str:
         """Short name."""
-        return self.name.replace("_", " ")
+        return self.name.replace("monitor_", "BPM_").replace("_", " ")
 
     @abstractmethod
     def places(self, ring: Ring) -> list[str | None]:

@@ -89,7 +89,7 @@ def _of_readings(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     if first is not None:
         yield (
             "scan-near",
-            "The same scan around the clearest finding, linear, with the monitors. Later findings "
+            "The same scan around the clearest finding, linear, with the BPMs. Later findings "
             "show only once this one is in the model.",
             plot_scan_near(diagnosis, first),
         )

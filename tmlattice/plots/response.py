@@ -65,7 +65,7 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
             interpolation="nearest",
         )  # fmt: skip
         ax.axvline(float((plane == 0).sum()) - 0.5, color="k", linewidth=0.8)
-        ax.set_ylabel("monitor")
+        ax.set_ylabel("BPM")
         ax.set_title(title, loc="left", fontsize=10)
         figure.colorbar(shown, ax=ax, label="µm")
     axes[-1].set_xlabel("corrector, along s: horizontal, then vertical")
@@ -91,7 +91,7 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
         ax.set_title(f"{name}: {rms:.3g} µm rms", loc="left", fontsize="medium")
         ax.set_xlabel("corrector: horizontal, then vertical")
         ax.locator_params(integer=True)
-    axes[0].set_ylabel("monitor, along the ring")
+    axes[0].set_ylabel("BPM, along the ring")
     figure.colorbar(image, ax=axes, label="measured less model [µm]")
     return figure
 

@@ -18,7 +18,7 @@ from tmlattice.report.action_texts import SETTLED
 from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
 from tmlattice.report.text import times_usual
 
-TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
+TITLES = {"monitors": "BPMs", "correctors": "Correctors"}
 """Titles by the group of an effect; all other elements are magnets."""
 
 Supported = tuple[Cause, float, Support]
