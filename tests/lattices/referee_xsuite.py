@@ -35,7 +35,7 @@ def main():
             "element_names": deck.get("cell", content["cell"]) * content["cells"],
         })  # fmt: skip
         line.particle_ref = xt.Particles(**content["particle"])
-        deck |= figures(line)
+        deck.update(figures(line))
     composed = content["composed"]
     line = xt.Environment.from_dict(composed["file"])["ring"]
     line.particle_ref = xt.Particles(**content["particle"])
