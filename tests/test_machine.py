@@ -59,17 +59,6 @@ def test_seed_gives_the_same_launches_with_either_engine_and_any_machine(small_r
     assert not np.isclose(another.nominal[:, :4], one.nominal[:, :4]).any()
 
 
-def test_first_shots_do_not_depend_on_how_many_follow(small_ring):
-    few, many = (
-        simulate(small_ring, engine="ocelot", shots=n, amplitude=1e-4, kicks=1e-5, turns=2, seed=3)
-        for n in (4, CHUNK + 3)
-    )
-    np.testing.assert_array_equal(few.shots.launches, many.shots.launches[:4])
-    assert few.shots.settings == many.shots.settings[:4]
-    # tracked in another number at once: rounding, far below the noise
-    np.testing.assert_allclose(readings(few), readings(many)[:4], rtol=0, atol=1e-15)
-
-
 def test_noise_is_the_same_whatever_the_engine_and_the_fault(small_ring):
     options = {"engine": "ocelot", "shots": 3, "amplitude": 1e-4, "seed": 4}
     noise = []

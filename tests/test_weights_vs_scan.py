@@ -9,8 +9,8 @@ import torch
 
 from tmlattice import TaylorMap, TaylorNetwork, fine_tune
 from tmlattice.beam.model import Model
-from tmlattice.effects import CATALOGUE, Cause
-from tmlattice.errors import LatticeError, MeasurementError
+from tmlattice.effects import Cause
+from tmlattice.errors import MeasurementError
 from tmlattice.fitting.weight_parts import layer_effects
 from tmlattice.fitting.weights import read_network
 from tmlattice.inference.newton import fit
@@ -148,15 +148,6 @@ def test_the_designs_network_has_no_score(unchanged):
     assert not reading.split.shares.any()
 
 
-def test_before_the_first_monitor_nothing_is_seen(small_ring, small_network, measurement, effects):
-    """A kick that no monitor has behind it, or that the free launch explains, has no score."""
-    last = [m.name for m in small_ring.monitors[-1:]]
-    alone = replace(measurement.select(monitors=last), launch_sigma=None)
-    blind = read_network(small_ring, small_network, alone, effects)
-    largest = np.array([CATALOGUE[name].largest for name, _ in blind.hypotheses])
-    assert (blind.sigma > 1e3 * largest).all()  # infinite, but for rounding
-
-
 def test_fine_tuned_network_of_all_layers(small_ring, small_network, measurement, unchanged):
     launched = replace(measurement, launches=unchanged.launches)
     fitted = fine_tune(small_network, launched, epochs=100, progress=False)
@@ -165,14 +156,6 @@ def test_fine_tuned_network_of_all_layers(small_ring, small_network, measurement
     assert np.abs(reading.score).max() > 0.1
     np.testing.assert_allclose(reading.split.shares.sum(axis=1)[10:-10], 1, atol=1e-9)
     json.dumps(reading.as_json(), allow_nan=False)
-
-
-def test_another_rings_network_is_refused(small_ring, petra3_network, measurement, small_network):
-    with pytest.raises(LatticeError, match="another lattice"):
-        read_network(small_ring, petra3_network, measurement)
-    maps = replace(small_network.maps, W1=1.01 * small_network.maps.W1)
-    with pytest.raises(LatticeError, match="another lattice"):
-        read_network(small_ring, TaylorNetwork(maps), measurement)
 
 
 def test_shots_with_settings_are_refused(small_ring, small_network, measurement):
