@@ -130,7 +130,7 @@ def _single(own: Plane) -> list[str]:
     said = []
     for what, names, alike in (
         ("correctors", own.correctors, own.columns() * sign),
-        ("monitors", list(own.monitors), np.diagonal(monitors)),
+        ("BPMs", list(own.monitors), np.diagonal(monitors)),
     ):
         against = [name for name, r in zip(names, alike.tolist(), strict=True) if r < -ODD]
         nothing = [n for n, r in zip(names, alike.tolist(), strict=True) if 0 < abs(r) <= ODD]

@@ -224,7 +224,7 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
         if own.any():
             ax.plot(
                 s[own], found.statistic[own], linestyle="none", marker=".", color=colour,
-                ms=size, label=name, zorder=2,
+                ms=size, label=name.replace("monitors", "BPMs"), zorder=2,
             )  # fmt: skip
     named, kicks = thresholds(diagnosis)
     ax.axhline(

@@ -328,7 +328,8 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
         group = find(effect).group
         hover = [f"{found.hypotheses[i][1]}\n{_amount(effect, found.amount[i])}" for i in own]
         traces.append(
-            _trace(s[own], found.statistic[own], group, COLOURS[group], mode="markers", size=4,
+            _trace(s[own], found.statistic[own], group.replace("monitors", "BPMs"),
+                   COLOURS[group], mode="markers", size=4,
                    hover=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>fall of chi² %{{y}}",
                    text=hover, legendgroup=group, showlegend=group not in shown)
         )  # fmt: skip
