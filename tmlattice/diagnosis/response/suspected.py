@@ -3,7 +3,8 @@
 >>> seen = Seen(state, suspects_of(state, single_causes(state.data)))
 
 A cause that is one number of a family (a quadrupole's gradient, a gain, a roll), or a sum of some
-(a supply), is in the normal equations already. Others are compared by their signatures.
+(a supply), is in the normal equations already. Others are compared by their signatures; the usual
+errors of their effect, of which the fit has no family, reduce their statistics.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
+from tmlattice.diagnosis.response.others import KINDS
 from tmlattice.diagnosis.response.small_errors import sizes_in
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import weighed, weight
@@ -148,7 +150,7 @@ class Weighed:
     """The statistics of each suspect given distributed errors.
 
     Attributes:
-        statistic: fall of chi-square, [suspect].
+        statistic: fall of chi-square, given the usual scatter of the amount, [suspect].
         amount, sigma: best amount, and its error, [suspect].
         information: by block, [2, suspect].
     """
@@ -169,6 +171,9 @@ class Seen:
 
     def __init__(self, state: State, suspects: Sequence[Suspect]) -> None:
         self.state, self.suspects = state, suspects
+        alone = ["", *(kind.variable for kind in KINDS)]
+        self.scatter = np.array([(find(one.cause[0]).background or 0.0) * (one.variable in alone)
+                                 for one in suspects])  # fmt: skip
         blocks = [block for block in (0, 1) if state.of_block(block)]
         there = {block: linear(state, block) for block in blocks}
         self.blocks = {block: self._block(block, there[block]) for block in blocks}
@@ -223,4 +228,5 @@ class Seen:
         pull = inner.sum(axis=0)
         amount = np.where(total > 0, pull / safe, 0.0)
         sigma = np.where(total > 0, 1 / np.sqrt(safe), np.inf)
-        return Weighed(amount * pull, amount, sigma, information)
+        statistic = amount * pull / (1 + total * self.scatter**2)
+        return Weighed(statistic, amount, sigma, information)
