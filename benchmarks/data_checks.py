@@ -274,7 +274,7 @@ def checked(ring, data):
 
 def expected_notes(causes):
     """What a dead monitor's fault makes a true note."""
-    return {"silent monitors", "frozen monitors"} if any(
+    return {"silent BPMs", "frozen BPMs"} if any(
         cause.effect == "monitor_dead" for cause in causes
     ) else set()  # fmt: skip
 
@@ -325,7 +325,7 @@ def main(rings):
                 found, took = checked(ring, own)
                 bad = [c for c in found.reported if c.name not in expected_notes(causes)]
                 if seed in OFF_AXIS:  # notes that the beam was lost or the noise is large are true
-                    true = ("lost beam", "noise", "launches", "spikes")
+                    true = ("lost beam", "noise", "launches", "outliers")
                     bad = [c for c in bad if c.status == "wrong" or c.name not in true]
                 count[what] = count.get(what, 0) + 1
                 told[what] = told.get(what, 0) + bool(bad)

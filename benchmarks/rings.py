@@ -192,7 +192,7 @@ def green(row: dict) -> bool:
 
 AGREEMENT = (
     ("ring", "ring", "{}"), ("length", "m", "{:.1f}"), ("energy", "GeV", "{:.3g}"),
-    ("magnets", "magnets", "{}"), ("monitors", "monitors", "{}"),
+    ("magnets", "magnets", "{}"), ("monitors", "BPMs", "{}"),
     ("correctors", "correctors", "{}"),
     ("tunes", "tunes", "{0[0]:.4f} / {0[1]:.4f}"), ("tunes_at", "less AT's", "{:.0e}"),
     ("chromaticity", "chromaticity", "{0[0]:+.2f} / {0[1]:+.2f}"),

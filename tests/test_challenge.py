@@ -1,11 +1,8 @@
 """The challenge is blind, its signal to noise is what it says, and its scores are those by hand."""
 
-import gc
 import json
 import shutil
-import warnings
 from importlib import resources
-from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -14,11 +11,10 @@ from command import tmlattice
 from conftest import SMALL
 
 from tmlattice.challenge import make, read_case, read_truth, run, score
-from tmlattice.challenge.baselines import baselines
 from tmlattice.challenge.case import Truth, ring_of
 from tmlattice.challenge.figures import calibration, confusion, pulls, summary
 from tmlattice.challenge.oracle import evaluate, refitted
-from tmlattice.challenge.record import Places, baseline_answer, exact, one_action
+from tmlattice.challenge.record import Places, exact, one_action
 from tmlattice.challenge.score import row_of
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
@@ -150,34 +146,6 @@ def test_the_oracle_of_several_causes_is_given_the_others(tmp_path):
     freedom = told.problem.freedom
     assert told.left == pytest.approx(freedom, abs=6 * np.sqrt(2 * freedom))
     assert untold.left > told.left + 100
-
-
-def test_plain_methods_name_three_and_no_more(made):
-    guesses = baselines(read_case(made, "0000"))
-    assert set(guesses) == {"svd_gradients", "omp", "lasso", "weight_change"}
-    layers = {magnet.name for magnet in ring_of(LATTICE).magnets}
-    assert len({guess["element"] for guess in guesses["weight_change"]}) == 3
-    assert {guess["element"] for guess in guesses["weight_change"]} <= layers
-    assert all(len(found) <= 3 for found in guesses.values())
-
-
-def test_baselines_of_several_causes_give_a_finding_each():
-    guesses = [{"effect": "a", "element": str(i)} for i in range(3)]
-    assert len(baseline_answer(guesses)["findings"]) == 1
-    assert len(baseline_answer(guesses)["findings"][0]["credible_set"]) == 3
-    apart = baseline_answer(guesses, separate=2)
-    assert [f["element"] for f in apart["findings"]] == ["0", "1"]
-    assert baseline_answer([], separate=2) == {"verdict": "none", "findings": []}
-
-
-def test_unknowns_and_a_reduced_catalogue_share_tier_d(tmp_path):
-    make("D", 2, 1, tmp_path, lattice=LATTICE, progress=False)
-    first, second = (read_truth(tmp_path, name) for name in ("0000", "0001"))
-    assert first.causes == ()
-    assert first.unknown["kind"] != "taken_out"
-    assert second.unknown == {"kind": "taken_out"}
-    assert second.causes[0].effect not in read_case(tmp_path, "0001").options["effects"]
-    assert read_case(tmp_path, "0000").options == {}
 
 
 # --- scores by hand ---
@@ -362,17 +330,6 @@ def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
         with pytest.raises(TmlatticeError, match=r"was made with another 'ring\.py'"):
             again(folder, jobs=1, progress=False, lattice="ring.py")
     ring_of.cache_clear()
-
-
-def test_a_damaged_truth_is_closed_again(made, tmp_path):
-    folder = Path(shutil.copytree(made, tmp_path / "set"))
-    (folder / "truth" / "0001.npz").write_bytes(b"PK\3\4 cut off")
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        with pytest.raises(TmlatticeError, match="does not hold arrays of a truth"):
-            read_truth(folder, "0001")
-        gc.collect()
-    assert not [own for own in told if own.category is ResourceWarning]
 
 
 def test_a_damaged_result_or_truth_is_reported_and_not_fatal(made, tmp_path):

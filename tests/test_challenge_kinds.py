@@ -141,33 +141,6 @@ def test_a_cause_is_drawn_among_what_is_measured_of_the_case(monkeypatch, tmp_pa
     assert len(asked) == len(parts) < 4
 
 
-def test_the_supply_of_a_family_of_sextupoles_is_one_change(small_ring, tmp_path):
-    make(
-        "P", 1, 1, tmp_path, lattice=LATTICE, effects=["family_sextupole"], progress=False,
-        kinds=["closed_orbit"],
-    )  # fmt: skip
-    truth, case = read_truth(tmp_path, "0000"), read_case(tmp_path, "0000")
-    assert set(case.before) == {"closed_orbit"}
-    (one,) = truth.causes
-    assert {e.family for e in small_ring.elements if e.kind == "sextupole"} >= {one.element}
-    assert (one.effect, one.element) in refitted(case, truth).seen.hypotheses
-    finding = {
-        "effect": one.effect, "element": one.element, "s": None,
-        "amount": one.amount, "amount_sigma": 0.01, "probability": 1.0, "mass": 1.0,
-        "credible_set": [{"effect": one.effect, "element": one.element, "probability": 1.0}],
-    }  # fmt: skip
-    result = {
-        "verdict": "identified", "findings": [finding], "gap": {"explained": None, "heldout": None},
-        "next_measurement": None,
-    }  # fmt: skip
-    row = row_of(result, truth, None, None, Places(small_ring))
-    assert row["answers"]["tool"]["first"]
-    assert row["answers"]["tool"]["place"]
-    result |= {"verdict": "none", "findings": []}
-    row = row_of(result, truth, None, None, Places(small_ring))
-    assert not row["answers"]["tool"]["place"]
-
-
 def test_what_many_find_where_one_does_not_by_hand(small_ring):
     name = "QD::3"
     right = {

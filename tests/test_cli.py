@@ -117,7 +117,7 @@ def test_the_weights_that_are_kept_are_those_of_the_best_method(outcome, petra3)
 
 def test_tune_fit_prints_the_table_and_writes_three_figures(outcome):
     folder, done = outcome
-    for words in ("1519 layers", "246 monitors", "true, perturbed (OCELOT)", "relative to the frac",
+    for words in ("1519 layers", "246 BPMs", "true, perturbed (OCELOT)", "relative to the frac",
                   "rms [µm]", "noise", "seconds", "(of sparse)"):  # fmt: skip
         assert words in done.stdout
     assert sorted(p.name for p in (folder / "figures").iterdir()) == [

@@ -219,10 +219,10 @@ def test_monitors_and_readings_of_their_own_are_noted(small_ring, healthy):
     found = {c.name: c.sentence for c in told(
         check_data(small_ring, replace(healthy, readings=readings)), "note")}  # fmt: skip
     names = [monitor.name for monitor in small_ring.monitors]
-    assert f"{names[4]} in x and {names[8]} in x" in found["copied monitors"]
-    assert f"{names[11]} in y" in found["frozen monitors"]
-    assert names[14] in found["silent monitors"]
-    assert f"{names[20]} in x, shot 1" in found["spikes"]
+    assert f"{names[4]} in x and {names[8]} in x" in found["copied BPMs"]
+    assert f"{names[11]} in y" in found["frozen BPMs"]
+    assert names[14] in found["silent BPMs"]
+    assert f"{names[20]} in x, shot 1" in found["outliers"]
     assert f"shot 4 has no reading behind {names[27]} " in found["lost beam"]
     assert len(found) == 5
 
@@ -382,7 +382,7 @@ def test_a_beam_that_is_lost_is_used_up_to_there(small_ring, left):
 
 
 def test_one_monitor_and_unknown_assumptions_are_one_sentence(small_ring, healthy):
-    with pytest.raises(MeasurementError, match="two monitors at least"):
+    with pytest.raises(MeasurementError, match="two BPMs at least"):
         diagnose(small_ring, healthy.select(monitors=healthy.monitors[:1]))
     with pytest.raises(UnknownNameError, match="did you mean 'x-reversed'"):
         diagnose(small_ring, healthy, assume=["x-revers"])
@@ -395,7 +395,7 @@ def test_one_monitor_and_unknown_assumptions_are_one_sentence(small_ring, health
 def test_a_lattice_without_monitors_is_told(small_ring, healthy):
     bare = small_ring.with_elements({})
     bare = replace(bare, elements=tuple(e for e in bare.elements if e.kind != "monitor"))
-    with pytest.raises(MeasurementError, match="has no monitor"):
+    with pytest.raises(MeasurementError, match="has no BPM"):
         diagnose(bare, healthy)
 
 
@@ -442,4 +442,4 @@ def test_check_prints_a_table_and_writes_its_schema(tmp_path, machine):
     assert document["status"] == "wrong"
     tmlattice("check", SMALL, "bad", "--assume", "x-reversed", "-q", cwd=tmp_path, check=0)
     done = tmlattice("diagnose", SMALL, "bad", cwd=tmp_path, check=2)
-    assert "x has the wrong sign at every monitor" in done.stderr
+    assert "x has the wrong sign at every BPM" in done.stderr

@@ -242,7 +242,7 @@ def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, sch
         ("ambiguous", ["alternatives: sextupole sd::5"]),
         ("localised", ["no effect of the catalogue fits", "Next: Inspect this section",
                      "(bpm::5, QD::5, end_5)", "the gap of held-out readings stays"]),
-        ("none", ["No error is detected", "Detection limits",
+        ("none", ["No error is detected", "detection limit",
                      "wrong strength of a quadrupole"]),
         ("distributed", ["Distributed errors", "that distributed errors hide", "--reference"]),
     ],
@@ -256,7 +256,7 @@ def test_report_says_what_a_control_room_needs(diagnoses, verdict, words):
     assert "held out (shots" in flat
     assert "noise of a reading" in flat
     assert "nan" not in flat
-    assert "Detection limits" not in flat or verdict == "none"
+    assert "detection limit" not in flat or verdict == "none"
     assert max(map(len, text.splitlines())) <= 100
 
 
@@ -272,7 +272,7 @@ def test_dead_monitor_in_report_and_json(small_ring, schema, tmp_path):
     data = simulate(small_ring, [Cause("monitor_dead", "end_3", 1.0)], **SHOTS).measurement()
     diagnosis = diagnose(small_ring, data)
     text = report_text(diagnosis)
-    assert "IDENTIFIED: monitor end_3, no signal." in text
+    assert "IDENTIFIED: BPM end_3, no signal." in text
     assert "no effect on the stored beam" in text
     write_json(tmp_path / "a.json", diagnosis.as_json())
     document = json.loads((tmp_path / "a.json").read_text())

@@ -164,3 +164,8 @@ def test_example_files_of_the_formats_are_read_as_they_stand(site, tmp_path):
             plain = html.unescape(re.sub(r"<[^>]+>", "", marked))
             (tmp_path / kind / name).write_text(plain)
         assert tmlattice.read_measurement(tmp_path / kind).monitors == ("bpm_1", "bpm_2")
+
+
+def test_pages_have_at_most_26_000_words():
+    pages = [page.read_text(encoding="utf-8") for page in PAGES if page.name != "CONTRIBUTING.md"]
+    assert sum(any(c.isalnum() for c in word) for word in " ".join(pages).split()) < 26_000

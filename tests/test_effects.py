@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from places import PLACES, THIN, kicked
+from places import PLACES
 
 from tmlattice import load_ring
 from tmlattice.beam.model import Model
@@ -188,74 +188,6 @@ def petra3_turns(ring, launch):
     from tmlattice import TaylorNetwork
 
     return TaylorNetwork.from_ring(ring, 6).track([[*launch[:4], 0.0, launch[4]]], 2)[0]
-
-
-def test_kicks_have_the_signs_of_the_table(petra3):
-    """Thin limits by hand: what px and py gain at one millimetre in x and two in y."""
-    x, y = 1e-3, 2e-3
-    state = np.array([x, 0.0, y, 0.0])
-
-    def gain(name, element, amount, **settings):
-        changed = apply(petra3, [Cause(name, element, amount)], settings)
-        change = element_map(changed[element], 6.0)(state) - element_map(
-            apply(petra3, [], settings)[element], 6.0
-        )(state)
-        return change[[1, 3]]
-
-    quad, sextupole, bend = petra3["qd::12"], petra3["s1::48"], petra3["b::28"]
-    k1l = quad.k1 * quad.length
-    # a thick quadrupole of 0.7 m bends the way inside it: 10 %
-    assert gain("quadrupole_gradient", quad.name, 0.01) == pytest.approx(
-        [-0.01 * k1l * x, 0.01 * k1l * y], rel=0.1
-    )
-    assert gain("gradient_absolute", quad.name, 0.01) == pytest.approx(
-        [-0.01 * x, 0.01 * y], rel=0.1
-    )
-    assert gain("skew_gradient", sextupole.name, 0.01) == pytest.approx(
-        [0.01 * y, 0.01 * x], rel=0.01
-    )
-    # the centre moves: the beam is at x - dx in the field
-    assert gain("quadrupole_offset_x", quad.name, 1e-3) == pytest.approx([k1l * 1e-3, 0], rel=0.1)
-    assert gain("quadrupole_offset_y", quad.name, 1e-3) == pytest.approx([0, -k1l * 1e-3], rel=0.1)
-    # a field turned by theta: k1s = k1 sin 2 theta; the kick is that of a skew quadrupole -2 theta
-    assert gain("quadrupole_roll", quad.name, 1e-3) == pytest.approx(
-        [-2e-3 * k1l * y, -2e-3 * k1l * x], rel=0.1
-    )
-    assert gain("dipole_field", bend.name, 1e-3) == pytest.approx(
-        [-1e-3 * bend.angle, 0], rel=1e-3, abs=1e-9
-    )
-    assert gain("dipole_roll", bend.name, 1e-2) == pytest.approx(
-        [1e-4 * bend.angle / 2, -1e-2 * bend.angle], rel=2e-3
-    )
-    k2l = sextupole.k2 * sextupole.length
-    assert gain("sextupole_strength", sextupole.name, 0.1) == pytest.approx(
-        [-0.1 * k2l / 2 * (x**2 - y**2), 0.1 * k2l * x * y], rel=1e-3
-    )
-    assert gain("sextupole_offset_x", sextupole.name, 1e-3) == pytest.approx(
-        [-k2l / 2 * ((x - 1e-3) ** 2 - x**2), -k2l * 1e-3 * y], rel=1e-3
-    )
-    kick = {"hcor_sw_4": {"kick": 1e-4}}
-    assert gain("corrector_calibration", "hcor_sw_4", 0.1, **kick) == pytest.approx([1e-5, 0])
-    assert gain("corrector_roll", "hcor_sw_4", 0.01, **kick) == pytest.approx(
-        [-0.5e-8, 1e-6], rel=1e-3
-    )
-    assert gain("corrector_kick_y", "hcor_sw_4", 1e-5) == pytest.approx([0, 1e-5])
-    assert gain("insertion_device_focusing", "wiggler::3", 0.01) == pytest.approx(
-        [-0.01 * x, 0.01 * y], rel=0.03
-    )
-
-
-@pytest.mark.parametrize("name", THIN)
-def test_thin_kicks_are_those_of_the_table(petra3, name):
-    """What `sign` says stands in the model's map: of a marker, or of a wiggler's entrance."""
-    state = [1e-3, 1e-4, 2e-3, -2e-4]
-    marker = "a3" in PLACES[name]
-    place = "a3" if marker else PLACES[name][0]
-    changed = element_map(apply(petra3, [Cause(name, place, 0.01)])[place], 6.0)(state)
-    after = kicked(name, 0.01, state)
-    expected = after if marker else element_map(petra3[place], 6.0)(after)
-    assert np.abs(changed - expected).max() < 1e-15  # rounding
-    assert np.abs(after - state).max() > 1e-6
 
 
 def test_a_kick_in_a_cavity_sits_in_its_middle(tmp_path):

@@ -51,12 +51,6 @@ def test_loss_is_the_sum_of_squares_over_monitors_per_shot(small_network, weaken
     np.testing.assert_allclose(result.penalty[0], expected, rtol=1e-12)
 
 
-def test_same_input_gives_the_same_weights(small_network, weakened):
-    one, other = (fit(small_network, weakened, epochs=30) for _ in range(2))
-    assert one.loss == other.loss
-    assert torch.equal(one.network.W1, other.network.W1)
-
-
 def test_weights_kept_are_those_of_least_loss(small_network, weakened):
     result = fit(small_network, weakened, learning_rate=3e-3)  # it overshoots and oscillates
     assert result.best_epoch == int(np.argmin(result.loss))
@@ -147,22 +141,6 @@ def test_measurements_that_do_not_fit_are_refused(small_network, weakened):
         fit(small_network, strange)
     with pytest.raises(ValueError, match="l3"):
         fit(small_network, weakened, regularization="l3")
-
-
-def test_any_torch_optimiser_works(small_network, weakened):
-    network = small_network.copy()
-    target = torch.from_numpy(weakened.readings[:, 0])
-    optimiser = torch.optim.LBFGS([network.W1], max_iter=20, line_search_fn="strong_wolfe")
-    before = rms(network, weakened)
-
-    def closure():
-        optimiser.zero_grad()
-        loss = 1e6 * (network(LAUNCH) - target).square().sum()
-        loss.backward()
-        return loss
-
-    optimiser.step(closure)
-    assert rms(network, weakened) < 0.5 * before
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def test_arrays_make_each_kind_in_one_line(small_ring):
     [
         (lambda x: Measurement.from_arrays(x, x[:-1], "abcde"), r"y has the shape \(4,\)"),
         (lambda x: Measurement.from_arrays(None, None, "abcde"), "neither x nor y"),
-        (lambda x: ClosedOrbit.from_arrays([[x, x]], x, "abcde"), "should be .shot, 5 monitors"),
+        (lambda x: ClosedOrbit.from_arrays([[x, x]], x, "abcde"), "should be .shot, 5 BPMs"),
         (lambda x: ClosedOrbit.from_arrays(x, x, "abcde", unit="inch"), "no unit 'inch'"),
         (lambda x: OrbitResponse.from_arrays([x], [x], "abcde", ["h"], 1e-5), "give planes="),
         (lambda x: Dispersion.from_arrays([x, x], None, "abcde", step=1.0, frequency=5e8,

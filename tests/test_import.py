@@ -231,12 +231,12 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
         (lambda d: {"LocoMeasData_M": d["M"][np.random.default_rng(1).permutation(len(d["M"]))]},
          "the data are not those of"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 3, -1, 1)[:, None]},
-         "single monitors of x have the sign against the others: 'bpm::3'"),
+         "single BPMs of x have the sign against the others: 'bpm::3'"),
         (lambda d: {"LocoMeasData_M": d["M"][[*range(2), 5, 3, 4, 2, *range(6, 32)]]},
          "'bpm::2' and 'bpm::5' read each other's x"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 20, 1e-6, 1)[:, None]
                     + 1e-4 * np.random.default_rng(2).standard_normal((32, 32))},
-         "single monitors of y do not correlate with the design: 'bpm::4'"),
+         "single BPMs of y do not correlate with the design: 'bpm::4'"),
     ],
 )  # fmt: skip
 def test_a_convention_that_the_data_contradict_is_named_and_kept(simulated, brought, fields, told):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import SMALL
 
-from tmlattice import Cause, diagnose, load_ring, simulate
+from tmlattice import Cause, diagnose, simulate
 from tmlattice.challenge import make, read_case, read_truth
 from tmlattice.challenge.case import read_set
 from tmlattice.challenge.make import evenly
@@ -129,9 +129,3 @@ def test_a_learnt_response_may_step_some_correctors(small_ring, tmp_path, monkey
     monkeypatch.setattr(sys.modules["tmlattice.challenge.make"], "measure", lost)
     make("B", 1, folder=tmp_path / "lost", learnt=True, progress=False, **some)
     assert read_case(tmp_path / "lost", "0000").learnt is None
-
-
-def test_planes_have_as_many_correctors_each():
-    ring = load_ring("petra3")
-    kinds = [ring[name].kind for name in evenly(ring, 20)]
-    assert kinds.count("hcorrector") == kinds.count("vcorrector") == 10

@@ -119,7 +119,7 @@ FORMS = {
                   "it is taken in MHz"),
     "Eta in two columns": (put("LocoMeasData", Eta=lambda e: e.reshape(2, -1).T), ""),
     "BPMSTD of each entry": (put("LocoMeasData", BPMSTD=lambda s: np.tile(s[:, None], 32)),
-                             "the rms of each monitor"),
+                             "the rms of each BPM"),
     "flags of good ones": (put("BPMData", HBPMGoodDataIndex=lambda g: np.ones(16, dtype=bool)), ""),
     "an empty good list": (put("CMData", HCMGoodDataIndex=lambda g: np.zeros((0, 0))),
                            "HCMGoodDataIndex is empty"),
@@ -131,7 +131,7 @@ FORMS = {
         "RINGData", CavityHarmNumber=lambda h: np.zeros((0, 0)))), ""),
     "an RF of 0": (put("LocoMeasData", RF=lambda f: 0.0), ""),
     "a cavity of empty fields": (empty_cavity, ""),
-    "monitors for x and for y": (monitors_of_each_plane, "each is one monitor"),
+    "monitors for x and for y": (monitors_of_each_plane, "each is one BPM"),
     "flags that say nothing": (put("LocoFlags", ResponseMatrixMeasurement=lambda f: np.zeros(0)),
                                "no LocoFlags state it"),
 }  # fmt: skip

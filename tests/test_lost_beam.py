@@ -55,7 +55,7 @@ def test_constants_after_a_bpm_in_all_shots_are_a_lost_beam(small_ring, data, va
     result = diagnose(small_ring, lost)
     the_fault_alone(result)
     assert [w for w in result.warnings if "no signal" in w] == [check.sentence]
-    assert not any("35 monitors" in w or "they are ignored" in w for w in result.warnings)
+    assert not any("35 BPMs" in w or "they are ignored" in w for w in result.warnings)
 
 
 def test_a_beam_lost_near_the_end_leaves_no_dead_bpms(small_ring, data):
@@ -96,7 +96,7 @@ def test_one_frozen_bpm_is_frozen(small_ring, data, at):
     frozen = replace(data, readings=readings)
     checks = {check.name: check for check in check_data(small_ring, frozen).checks}
     assert checks["lost beam"].status == "fine"
-    assert data.monitors[at] in checks["frozen monitors"].sentence
+    assert data.monitors[at] in checks["frozen BPMs"].sentence
     found = {(f.effect, f.element) for f in diagnose(small_ring, frozen).findings}
     assert found == {("monitor_dead", data.monitors[at]), (FAULT.effect, FAULT.element)}
 
@@ -208,5 +208,5 @@ def test_turns_of_a_stored_beam_that_was_lost(small_ring):
     frozen = 1e-3 * np.random.default_rng(2).standard_normal((1, 64, len(names), 2))
     frozen[0, 20:, 5] = 0.0
     found = {c.name: c for c in signals.monitors(small_ring, names, frozen[0])}
-    assert found["frozen monitors"].status == "note"
-    assert names[5] in found["frozen monitors"].sentence
+    assert found["frozen BPMs"].status == "note"
+    assert names[5] in found["frozen BPMs"].sentence

@@ -106,13 +106,13 @@ def test_a_ring_without_monitors_ends_in_the_sentence_that_mends_it(file, tmp_pa
         ["dev", "study", "tune-fit", file, "--out", "study"],
     ):
         done = tmlattice(*command, cwd=tmp_path, check=2)
-        assert "has no monitor; state which" in done.stderr, command
+        assert "has no BPM; state which" in done.stderr, command
         assert "monitors = ['BPM*'] in tmlattice.toml" in done.stderr
         assert "such as 'pos'" in done.stderr
     assert list(tmp_path.glob("*/measurement.json")) == []
     ring = load_ring(file)
     for work in (simulate, simulate_response):
-        with pytest.raises(LatticeError, match="has no monitor; state which"):
+        with pytest.raises(LatticeError, match="has no BPM; state which"):
             work(ring)
     tmlattice("init", file, "--monitors", "POS", "-q", cwd=tmp_path, check=0)
     words = ["--shots", 2, "--amplitude", "1e-5", "--out", "day", "-q"]

@@ -152,9 +152,9 @@ def test_chi2_of_pure_noise_is_one(rng):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"noise": (0.0, 1e-5)}, "noise of monitor 'bpm_a' in x is 0 m"),
+        ({"noise": (0.0, 1e-5)}, "noise of BPM 'bpm_a' in x is 0 m"),
         ({"noise": (1e-5, -1e-5)}, "above zero"),
-        ({"noise": (1e-5, np.inf)}, "no monitor has"),
+        ({"noise": (1e-5, np.inf)}, "no BPM has"),
         ({"noise": (1e-5, 1e-5, 1e-5)}, "neither a pair"),
         ({"noise": {"bpm_x": (1e-5, 1e-5)}}, "no monitor 'bpm_x'"),
         ({"monitors": ("bpm_a", "bpm_b", "BPM_A")}, "stands twice"),

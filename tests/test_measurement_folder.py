@@ -494,7 +494,7 @@ def test_stopped_writer_leaves_the_old_folder(folder):
 @pytest.mark.parametrize(
     ("shot", "words"),
     [
-        ((0, np.zeros(5), None, {}, np.full((1, 1, 2), 0.5)), "monitor 'a' reads 0.5 m in x"),
+        ((0, np.zeros(5), None, {}, np.full((1, 1, 2), 0.5)), "BPM 'a' reads 0.5 m in x"),
         ((0, np.zeros(5), None, {}, np.full((1, 1, 2), np.inf)), "reads inf"),
         ((0, np.zeros(5), None, {}, np.zeros((1, 2, 2))), "shape"),
         ((0, [np.nan] * 5, None, {}, np.zeros((1, 1, 2))), "launch of shot 0 is not finite"),

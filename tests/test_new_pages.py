@@ -126,7 +126,7 @@ def test_the_check_of_the_page_finds_clipped_readings_alone(
         data = simulate_turns(small_ring, turns=64).measured
     else:
         data = simulate(small_ring, shots=8, amplitude=1e-4, noise=1e-6).measurement()
-    (own,) = [c for c in check_data(small_ring, data).checks if c.name == "saturated monitors"]
+    (own,) = [c for c in check_data(small_ring, data).checks if c.name == "saturated BPMs"]
     assert own.status == "fine"
     readings = data.readings.copy()
     m = data.monitors.index("end_2")
@@ -138,6 +138,6 @@ def test_the_check_of_the_page_finds_clipped_readings_alone(
                  "--json", str(tmp_path / "check.json")]  # fmt: skip
     assert CliRunner().invoke(command, arguments).exit_code in (0, 1)
     checks = json.loads((tmp_path / "check.json").read_text())["checks"]
-    (own,) = [c for c in checks if c["name"] == "saturated monitors"]
+    (own,) = [c for c in checks if c["name"] == "saturated BPMs"]
     assert own["status"] == "note"
     assert "in end_2:" in own["sentence"]

@@ -218,7 +218,7 @@ def test_reading_errors_of_madx_are_stated_and_unknown_ones_rejected(madx):
     one = madx(deck())
     one.use("ring")
     one.input("select, flag=error, class=monitor; ealign, mrex=1e-3, mscalx=0.1;")
-    with pytest.warns(UserWarning, match=r"errors of EALIGN of the monitor of m \(1\)"):
+    with pytest.warns(UserWarning, match=r"errors of EALIGN of the BPM of m \(1\)"):
         load_ring(one)
     one.input("select, flag=error, clear; select, flag=error, pattern=qd; ealign, dtheta=1e-4;")
     with pytest.raises(LatticeError, match="DTHETA of EALIGN of QUADRUPOLE 'qd' is not modelled"):

@@ -31,30 +31,6 @@ def measured(ring, causes, plane, launches_known=True, seed=1, **options):
     return one_plane(made, plane, launches_known)
 
 
-@pytest.mark.parametrize("launches_known", [True, False], ids=["launched", "unknown"])
-@pytest.mark.parametrize("plane", PLANES)
-@pytest.mark.parametrize("amplitude", [3e-4, 1e-3, 3e-3])
-def test_a_healthy_ring_is_healthy_in_one_plane(small_ring, plane, launches_known, amplitude):
-    """At 3 mm sextupoles move the orbit by 100 µm with the plane that is not read: five sigma."""
-    data = measured(small_ring, [], plane, launches_known, amplitude=amplitude)
-    result = diagnose(small_ring, data)
-    assert (result.verdict, result.findings) == ("none", ())
-    assert result.fit_after.chi2_per_dof < 1.2
-    assert not any("settled" in warning for warning in result.warnings)
-
-
-@pytest.mark.parametrize("launches_known", [True, False], ids=["launched", "unknown"])
-@pytest.mark.parametrize("plane", PLANES)
-def test_a_weak_quadrupole_is_found_in_one_plane(small_ring, plane, launches_known):
-    cause = Cause("quadrupole_gradient", "QD::5", -0.1)
-    result = diagnose(small_ring, measured(small_ring, [cause], plane, launches_known))
-    (finding,) = result.findings
-    members = {(m.effect, m.element): m for m in finding.credible_set}
-    assert (cause.effect, cause.element) in members
-    own = members[cause.effect, cause.element]
-    assert own.amount == pytest.approx(cause.amount, abs=4 * finding.amount_sigma)
-
-
 @pytest.mark.parametrize(
     ("plane", "cause"),
     [
@@ -130,28 +106,6 @@ def stored(kind, ring, causes, plane):
         return replace(data, orbit=blank(data.orbit, plane))
     steps = (replace(step, orbit=blank(step.orbit, plane)) for step in data.steps)
     return replace(data, steps=tuple(steps))
-
-
-@pytest.mark.parametrize("plane", PLANES)
-@pytest.mark.parametrize("kind", ["turn_by_turn", "closed_orbit", "dispersion"])
-def test_a_stored_beam_of_a_healthy_ring_is_healthy_in_one_plane(small_ring, kind, plane):
-    data = stored(kind, small_ring, [], plane)
-    assert check_data(small_ring, data).status == "note"
-    result = diagnose(small_ring, data)
-    assert (result.verdict, result.findings) == ("none", ())
-    assert not any("settled" in warning for warning in result.warnings)
-
-
-@pytest.mark.parametrize(
-    ("kind", "plane"), [("turn_by_turn", "x"), ("turn_by_turn", "y"), ("dispersion", "x")]
-)
-def test_a_weak_quadrupole_is_found_with_a_stored_beam_in_one_plane(small_ring, kind, plane):
-    """The line of the other mode has an amplitude that no reading sees."""
-    cause = Cause("quadrupole_gradient", "QD::5", -0.02)
-    result = diagnose(small_ring, stored(kind, small_ring, [cause], plane))
-    (finding,) = result.findings
-    members = {(m.effect, m.element): m.amount for m in finding.credible_set}
-    assert members[cause.effect, cause.element] == pytest.approx(-0.02, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -57,18 +57,6 @@ def test_gradients(n, relative, rng):
     assert torch.autograd.gradcheck(lambda a, b: penalty_parts(a, b, design), (W1, W2))
 
 
-def test_design_layers_are_symplectic_to_their_order(petra3_network):
-    constant, linear, quadratic = (
-        penalty_parts(petra3_network.W1, petra3_network.W2).sum(0).tolist()
-    )
-    assert constant < 1e-20  # OCELOT's matrices: rounding
-    assert linear < 1e-9  # OCELOT's T of a thick magnet: 2e-6 relative
-    assert 0 < quadratic < 1  # a truncated thick magnet: not zero by design
-    design = symplectic_coefficients(petra3_network.W1, petra3_network.W2)
-    departure = symplectic_penalty(petra3_network.W1, petra3_network.W2, design)
-    assert departure.sum().item() < 1e-25
-
-
 def test_six_coordinates_need_the_opposite_sign_of_the_last_pair(small_ring):
     network = TaylorNetwork.from_ring(small_ring, 6)
     constant = penalty_parts(network.W1, network.W2)[:, 0]

@@ -43,14 +43,3 @@ def test_figure_says_the_rms_before_and_behind_in_micrometres(weak):
     wanted = [f"{np.sqrt(np.mean(left[at] ** 2)):.1f}" for at in (before, ~before)]
     assert f"rms of the design {wanted[0]} before the finding, {wanted[1]} behind" in text
     plt.close(figure)
-
-
-@pytest.mark.parametrize(
-    "cause", [Cause("monitor_gain_x", "end_3", -0.5), Cause("quadrupole_gradient", "QD::0", -0.1)]
-)
-def test_launch_is_fitted_everywhere_where_nothing_acts_or_nothing_is_before(small_ring, cause):
-    """A wrong monitor acts on no trajectory; before the first magnet no launch can be told."""
-    result = found(small_ring, cause)
-    assert result.findings
-    assert before_findings(result) is None
-    assert (design_readings(result) == result.trajectories.before).all()

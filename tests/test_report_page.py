@@ -26,7 +26,15 @@ CHROMIUM = next(filter(None, BROWSERS), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt install chromium")
 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
+TERMINALS = (40, 60, 80, 100)
 PHONE = {"width": 390, "height": 800}
+
+
+def fits_terminals(diagnosis):
+    for width in TERMINALS:
+        assert max(map(len, diagnosis.report(width).splitlines())) <= width
+        assert len(diagnosis.report(width, 34).splitlines()) <= 34
+    return diagnosis
 
 
 def written(diagnosis, folder):
@@ -41,7 +49,9 @@ def written(diagnosis, folder):
 def first_turns(small_ring, tmp_path_factory):
     data = simulate(small_ring, [WEAK], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
                     noise=2e-6).measurement()  # fmt: skip
-    return written(diagnose(small_ring, data), tmp_path_factory.mktemp("first_turns"))
+    return written(
+        fits_terminals(diagnose(small_ring, data)), tmp_path_factory.mktemp("first_turns")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +62,7 @@ def response(small_ring, tmp_path_factory):
     ).measured  # fmt: skip
     found = diagnose(small_ring, data, effects=["quadrupole_gradient", "monitor_gain_x",
                                                 "corrector_calibration"])  # fmt: skip
-    return written(found, tmp_path_factory.mktemp("response"))
+    return written(fits_terminals(found), tmp_path_factory.mktemp("response"))
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +72,8 @@ def together(small_ring, tmp_path_factory):
                      noise=2e-6).measurement()  # fmt: skip
     beam = StoredBeam(ResponseModel(apply(small_ring, [WEAK])))
     tunes = TuneReading(tune=beam.tunes[None], tune_error=np.full((1, 2), 1e-4))
-    return written(
-        diagnose(small_ring, {"turns": turns, "tunes": tunes}), tmp_path_factory.mktemp("together")
-    )
+    found = diagnose(small_ring, {"turns": turns, "tunes": tunes})
+    return written(fits_terminals(found), tmp_path_factory.mktemp("together"))
 
 
 @pytest.fixture(scope="module")

@@ -178,7 +178,7 @@ def test_a_cause_s_rows_are_what_it_does_to_the_readings(small_ring, measured, c
 
 def test_what_is_missing_is_said(small_ring, measured):
     sparse = measured.select(monitors=measured.monitors[:4])
-    with pytest.raises(MeasurementError, match="too few columns or monitors determine it: state"):
+    with pytest.raises(MeasurementError, match="too few columns or BPMs determine it: state"):
         diagnose(small_ring, replace(sparse, noise=None))
     with pytest.raises(MeasurementError, match="cannot be split"):
         diagnose(small_ring, measured.select(correctors=measured.correctors[:2]))
@@ -244,7 +244,7 @@ def remembering(ring, rng):
         (remembering, "hysteresis: a share of earlier steps"),
         (wandering_gradients, "drift of the gradients (focusing, defocusing)"),
         (drifting, "drift of the orbit (betatron waves)"),
-        (cubic, "nonlinear monitors (cubic)"),
+        (cubic, "nonlinear BPMs (cubic)"),
     ],
 )
 def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
@@ -258,7 +258,7 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
     assert rows[effect] == min(rows.values(), key=lambda row: row.heldout_rms_in_plane)
     # calibrations, kept where single columns want them, take a part of what cubic monitors do
     expected = {
-        "nonlinear monitors (cubic)": (8e-4, 0.25),
+        "nonlinear BPMs (cubic)": (8e-4, 0.25),
         # rms of two, of which one is zero; what a corrector keeps of itself is its calibration
         "hysteresis: a share of earlier steps": (4e-3 / np.sqrt(2), 0.15),
     }  # fmt: skip

@@ -236,7 +236,7 @@ def test_one_plane_alone(rng):
     result = found(readings)
     assert np.isnan(result.amplitude[:, :, 1]).all()
     assert_pulls(pulls(result, amplitude))
-    assert "no monitor reads y" in " ".join(result.warnings)
+    assert "no BPM reads y" in " ".join(result.warnings)
 
 
 def test_mode_that_was_not_kicked_is_missing_and_reported(rng):

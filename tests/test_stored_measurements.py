@@ -146,7 +146,7 @@ NAN = math.nan
     ("make", "words"),
     [
         (lambda: turns_of((1, 15, 3, 2)), "15 turns are no turn-by-turn .* 'trajectory'"),
-        (lambda: turns_of((1, 16, 2, 2)), "turns at 3 monitors need"),
+        (lambda: turns_of((1, 16, 2, 2)), "turns at 3 BPMs need"),
         (lambda: turns_of(shots=(1, 1)), "2 shots need 2 shot ids"),
         (lambda: turns_of(settings=({},)), "1 settings for 2 shots"),
         (lambda: turns_of(settings=({"q": {"k3": 1.0}}, {})), "no setting 'k3'"),
@@ -275,6 +275,6 @@ def test_too_large_readings_are_not_written(tmp_path):
         ClosedOrbit(np.full((1, 1, 2), 0.3), ("a",)),
         Dispersion((RfStep(5e8, 100, 1.0, np.full((1, 2), 0.3)),), ("a",)),
     ):
-        with pytest.raises(MeasurementError, match=r"monitor 'a' reads 0.3 m in x"):
+        with pytest.raises(MeasurementError, match=r"BPM 'a' reads 0.3 m in x"):
             write_measurement(tmp_path / "m", measured)
     assert not (tmp_path / "m").exists()

@@ -5,11 +5,9 @@ from importlib.resources import files
 from pathlib import Path
 
 import jsonschema
-import numpy as np
 import pytest
 from command import tmlattice
 
-from tmlattice import TaylorNetwork, one_turn_optics
 from tmlattice.errors import TmlatticeError
 from tmlattice.fitting.study import (
     UNSTABLE,
@@ -18,7 +16,6 @@ from tmlattice.fitting.study import (
     run_case,
     study_tune_fit,
     summarise,
-    turned_launches,
 )
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
@@ -107,19 +104,6 @@ def test_pairs_and_sextupoles(small_ring):
     assert case.right, case
 
 
-def test_turned_launches_stay_on_their_ellipses(petra3_network, rng):
-    optics = one_turn_optics(petra3_network)
-    start = np.array([1e-3, 2e-5, -5e-4, 1e-5])
-    turned = turned_launches(optics, start, 2 * np.pi * rng.random((5, 2)))
-    area = [
-        (s[:, 0::2] ** 2 + (optics.alpha * s[:, 0::2] + optics.beta * s[:, 1::2]) ** 2)
-        for s in (turned, start[None])
-    ]
-    np.testing.assert_allclose(area[0], np.repeat(area[1], 5, 0), rtol=1e-12)
-    same = turned_launches(optics, start, np.zeros((1, 2)))
-    np.testing.assert_allclose(same[0], start, rtol=1e-13)
-
-
 def test_summary_counts_coverage_and_right_magnets():
     def case(error, sigma, found):
         return Case("a", 1.0, "sparse", 0, (0.1, 0.2), (error, 0.0), (0, 0), (sigma, 1.0),
@@ -130,12 +114,3 @@ def test_summary_counts_coverage_and_right_magnets():
     assert entry["coverage"]["x"] == pytest.approx(2 / 3)
     assert entry["right"] == pytest.approx(2 / 3)
     assert entry["abs_dq"]["x"]["worst"] == 3.0
-
-
-def test_design_network_is_made_for_each_ring(small_ring):
-    from tmlattice.fitting.study import _network_of
-
-    other = small_ring.with_changed("QD::5", k1=-0.85)
-    first, second = _network_of(small_ring), _network_of(other)
-    assert isinstance(first, TaylorNetwork)
-    assert np.abs(first.maps.W1 - second.maps.W1).max() > 1e-3

@@ -1,7 +1,5 @@
 """Symplectic layers: against S, finite differences, the second-order layers, and AT."""
 
-import time
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ import torch
 from tmlattice import TaylorNetwork, one_turn_optics
 from tmlattice.errors import BeamLostError
 from tmlattice.maps.taylor import symplectic_form
-from tmlattice.network import SymplecticNetwork
 from tmlattice.network.generators import exponents
 
 
@@ -96,20 +93,6 @@ def test_action_does_not_drift_in_5000_turns(petra3_network):
     assert drift(petra3_network, 5000).max() > 1e-3
 
 
-def test_tracking_repeats_the_one_turn_chain(small_network, rng):
-    """Matrices between flows are merged when tracking, kicks among them."""
-    network = disturbed(small_network.symplectic(), rng, 1e-3)
-    with torch.no_grad():
-        network.generator[::3] = 0.0  # some layers are matrices with a kick, some even without
-        network.W0[::6] = 0.0
-    launch = 1e-4 * rng.standard_normal((20, 4))
-    state = launch
-    turns = network.track(launch, 2)
-    for turn in (1, 2):
-        state = network.maps.closing(network.states(state)[:, -1])
-        np.testing.assert_allclose(turns[:, turn], state, rtol=1e-11, atol=1e-16)
-
-
 @pytest.mark.parametrize("batch", [1, 3])
 def test_gradients_match_finite_differences(tmp_path, rng, batch):
     (tmp_path / "short.py").write_text(
@@ -162,32 +145,9 @@ def test_too_strong_a_generator_is_named(small_network):
         network([[1e-4, 0, 1e-4, 0]])
 
 
-def test_copy_keeps_the_design(small_network, rng):
-    network = disturbed(small_network.symplectic(), rng)
-    copy = network.copy()
-    assert isinstance(copy, SymplecticNetwork)
-    np.testing.assert_array_equal(copy.correction(), network.correction())
-    assert copy.ring is network.ring
-
-
 def test_a_layer_far_from_symplectic_is_refused(small_network):
     network = small_network.copy()
     with torch.no_grad():
         network.W1[5] *= 3.0
     with pytest.raises(ValueError, match="layer 5"):
         network.symplectic()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("particles", "turns"), [(1, 300), (64, 60)])
-def test_costs_at_most_four_truncated_sweeps(petra3_network, particles, turns):
-    launch = np.outer(np.linspace(0.1, 1.0, particles), [3e-3, 0, 3e-3, 0])
-    networks = petra3_network, petra3_network.symplectic()
-    best = [np.inf, np.inf]
-    for _ in range(8):  # in turn: a busy machine slows both
-        for i, network in enumerate(networks):
-            network.track(launch, 2)
-            begun = time.process_time()
-            network.track(launch, turns)
-            best[i] = min(best[i], time.process_time() - begun)
-    assert best[1] <= 4 * best[0]

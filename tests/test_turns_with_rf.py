@@ -2,13 +2,10 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from tmlattice import Cause, diagnose, load_ring, simulate
 from tmlattice.beam import Model
-from tmlattice.beam.chain import Chain
 from tmlattice.beam.rf import rf_of
-from tmlattice.effects import apply
 from tmlattice.machine import Machine, draw_shots
 
 RADIATION = [Cause(f"radiation_loss_{kind}", None, 1.0) for kind in ("bends", "wigglers")]
@@ -144,26 +141,6 @@ def test_radiation_is_found_over_turns_without_rf(small_ring):
     found = diagnose(small_ring, measured, effects=["radiation_loss_bends"])
     assert found.causes[0].effect == "radiation_loss_bends"
     assert abs(found.causes[0].amount - 1) < 0.02  # the wiggler's share is 0.1 %
-
-
-def test_trajectory_of_a_chain_is_that_of_the_model(radiating):
-    model, launches, paths = radiating
-    chain = Chain.from_ring(apply(model.design, RADIATION), 6)
-    for shot, settings in enumerate(({}, FREQUENCY)):
-        start = np.insert(launches[shot], 4, 0.0)
-        states, tangents = chain.trajectory(start, TURNS, model.assembly.cavities(settings))
-        assert_allclose(states, paths.states[shot], atol=1e-15)
-        assert_allclose(tangents, paths.tangents[shot], atol=1e-12)
-
-
-@pytest.mark.parametrize(("length", "harmonic"), [(2303.952, 3840), (196.805, 328), (561.571, 936)])
-def test_harmonic_numbers_of_known_rings(tmp_path, length, harmonic):
-    """PETRA III, ALS and Diamond run near 499.65 MHz; their files need not say so."""
-    path = tmp_path / "ring.py"
-    path.write_text(
-        f"from ocelot import *\nenergy = 3.0\nring = [Quadrupole(l=1.0), Drift(l={length - 1})]\n"
-    )
-    assert rf_of(load_ring(path)).harmonic == harmonic
 
 
 def test_a_cavity_gives_its_harmonic_and_voltage(with_cavities):

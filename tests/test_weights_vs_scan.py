@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +9,9 @@ import torch
 
 from tmlattice import TaylorMap, TaylorNetwork, fine_tune
 from tmlattice.beam.model import Model
-from tmlattice.effects import CATALOGUE, Cause
-from tmlattice.errors import LatticeError, MeasurementError
-from tmlattice.fitting.weight_parts import layer_effects, symplectic_directions
+from tmlattice.effects import Cause
+from tmlattice.errors import MeasurementError
+from tmlattice.fitting.weight_parts import layer_effects
 from tmlattice.fitting.weights import read_network
 from tmlattice.inference.newton import fit
 from tmlattice.inference.scan import scan
@@ -20,7 +19,6 @@ from tmlattice.machine import simulate
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 
-SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 FAULT = Cause("quadrupole_gradient", "QD::7", 0.03)
 
 
@@ -49,12 +47,6 @@ def changed(network, layer, weights):
 
 def layer_of(ring, name):
     return [magnet.name for magnet in ring.magnets].index(name)
-
-
-def taken_apart(stacked):
-    """W0, W1, W2 of one stacked change."""
-    n = len(stacked)
-    return stacked[:, 0], stacked[:, 1 : 1 + n], stacked[:, 1 + n :]
 
 
 @pytest.mark.parametrize("dimension", [4, 6])
@@ -147,85 +139,6 @@ def test_a_change_that_is_not_symplectic_is_the_rest(
     assert shares.sum() == pytest.approx(1, abs=1e-12)
 
 
-def test_scaling_x_is_half_a_stretch_and_half_a_growth(
-    small_ring, small_network, measurement, effects
-):
-    layer = layer_of(small_ring, "QF::5")
-    own = [getattr(small_network.maps, w)[layer] for w in ("W0", "W1", "W2")]
-    norms = {}
-    for name, scale in (("x", (1, 0)), ("growth", (0.5, 0.5)), ("stretch", (0.5, -0.5))):
-        weights = [1e-4 * np.diag([*scale, 0.0, 0.0]) @ w for w in own]
-        network = changed(small_network, layer, weights)
-        norms[name] = read_network(small_ring, network, measurement, effects).split.parts[layer]
-    assert norms["x"][2] > 0
-    assert norms["stretch"][2] < 1e-6 * norms["x"][2]
-    assert norms["x"][2] == pytest.approx(norms["growth"][2], rel=1e-6)
-
-
-def test_parts_add_up_to_the_information_of_the_whole(
-    small_ring, small_network, measurement, effects, rng
-):
-    """Over many trajectories the mean square of a change's kicks, by drawing them."""
-    layer = layer_of(small_ring, "QD::5")
-    weights = [1e-6 * rng.standard_normal(s) for s in ((4,), (4, 4), (4, 10))]
-    weights[0] *= 1e-3
-    network = changed(small_network, layer, weights)
-    reading = read_network(small_ring, network, measurement, effects)
-    states = small_network.states(reading.launches[:, :4])
-    closing = small_network.maps.closing
-    states = np.concatenate([states, closing(states[:, -1])[:, None]], axis=1)
-    x = np.sqrt((states**2).mean(axis=(0, 1))) * rng.standard_normal((200_000, 4))
-    i, j = np.triu_indices(4)
-    kicks = weights[0] + x @ weights[1].T + (x[:, i] * x[:, j]) @ weights[2].T
-    # what readings know of a kick, by tracking it with the launch refitted
-    M, still = np.zeros((4, 4)), np.zeros(4)
-    sigma = measurement.noise[0, 0]
-    for shot in range(3):
-        launch = reading.launches[shot, :4]
-
-        def read(launch, kick=still):
-            moved = changed(small_network, layer, [kick, np.zeros((4, 4)), np.zeros((4, 10))])
-            return moved(launch[None]).detach().numpy().reshape(-1) / sigma
-
-        step = 1e-7 * np.eye(4)
-        A = np.stack([(read(launch, d) - read(launch, -d)) / 2e-7 for d in step], axis=1)
-        L = np.stack([(read(launch + d) - read(launch - d)) / 2e-7 for d in step], axis=1)
-        prior = np.diag(1 / measurement.launch_sigma[shot, :4] ** 2)
-        M += A.T @ A - A.T @ L @ np.linalg.solve(L.T @ L + prior, L.T @ A)
-    referee = np.einsum("ti,ij,tj->t", kicks, M, kicks)
-    error = referee.std() / np.sqrt(len(referee))
-    found = (reading.split.parts[layer] ** 2).sum()
-    assert found == pytest.approx(referee.mean(), abs=4 * error + 1e-4 * found)
-
-
-@pytest.mark.parametrize("name", ["QD::3", "bend::4", "sf::5"])
-def test_symplectic_directions_are_all_and_only_those_without_defect(small_network, name):
-    """34 of 60 weights: the null space of the linearised conditions of degree 0 and 1."""
-    layer = small_network.layers.index(name)
-    maps = small_network.maps
-    own = [getattr(maps, w)[layer] for w in ("W0", "W1", "W2")]
-    if name.startswith("sf"):
-        own[2] = own[2] / 10
-    directions = symplectic_directions(*own)
-
-    def defect(change):
-        sides = []
-        for sign in (1, -1):
-            parts = [w + sign * c for w, c in zip(own, taken_apart(change), strict=True)]
-            zero, one, _ = TaylorMap(parts).symplectic_defect()
-            sides.append(np.concatenate([zero.ravel(), one.ravel()]))
-        return (sides[0] - sides[1]) / 2  # quadratic in the weights: exact
-
-    basis = np.eye(60).reshape(60, 4, 15)
-    conditions = np.array([defect(b) for b in basis]).T
-    values = np.linalg.svd(conditions, compute_uv=False)
-    assert (values < 1e-9 * values[0]).sum() == 34 == len(directions)
-    rows = directions.reshape(34, -1)
-    assert np.linalg.matrix_rank(rows) == 34
-    size = np.abs(conditions).max() * np.abs(rows).max()
-    assert np.abs(conditions @ rows.T).max() < 1e-5 * size  # OCELOT's own defect is 2e-6
-
-
 def test_the_designs_network_has_no_score(unchanged):
     reading = unchanged
     assert not reading.raw.any()
@@ -233,15 +146,6 @@ def test_the_designs_network_has_no_score(unchanged):
     assert not reading.score.any()
     assert not reading.split.parts.any()
     assert not reading.split.shares.any()
-
-
-def test_before_the_first_monitor_nothing_is_seen(small_ring, small_network, measurement, effects):
-    """A kick that no monitor has behind it, or that the free launch explains, has no score."""
-    last = [m.name for m in small_ring.monitors[-1:]]
-    alone = replace(measurement.select(monitors=last), launch_sigma=None)
-    blind = read_network(small_ring, small_network, alone, effects)
-    largest = np.array([CATALOGUE[name].largest for name, _ in blind.hypotheses])
-    assert (blind.sigma > 1e3 * largest).all()  # infinite, but for rounding
 
 
 def test_fine_tuned_network_of_all_layers(small_ring, small_network, measurement, unchanged):
@@ -252,14 +156,6 @@ def test_fine_tuned_network_of_all_layers(small_ring, small_network, measurement
     assert np.abs(reading.score).max() > 0.1
     np.testing.assert_allclose(reading.split.shares.sum(axis=1)[10:-10], 1, atol=1e-9)
     json.dumps(reading.as_json(), allow_nan=False)
-
-
-def test_another_rings_network_is_refused(small_ring, petra3_network, measurement, small_network):
-    with pytest.raises(LatticeError, match="another lattice"):
-        read_network(small_ring, petra3_network, measurement)
-    maps = replace(small_network.maps, W1=1.01 * small_network.maps.W1)
-    with pytest.raises(LatticeError, match="another lattice"):
-        read_network(small_ring, TaylorNetwork(maps), measurement)
 
 
 def test_shots_with_settings_are_refused(small_ring, small_network, measurement):

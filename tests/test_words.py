@@ -89,6 +89,16 @@ TEXTS = {
 FILES = {path: taken for glob, taken in TEXTS.items() for path in sorted(ROOT.glob(glob))}
 
 
+MONITOR = re.compile(r"(?<!position )\bmonitors?\b", re.IGNORECASE)
+
+
+@pytest.mark.parametrize("path", [p for p, taken in FILES.items() if taken is not module],
+                         ids=lambda path: str(path.relative_to(ROOT)))  # fmt: skip
+def test_a_beam_position_monitor_is_a_bpm(path):
+    text = FILES[path](path)
+    assert not [text[m.start() - 40 : m.end() + 20] for m in MONITOR.finditer(text)]
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_words_are_the_fields(path):
     text = FILES[path](path)

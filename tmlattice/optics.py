@@ -114,6 +114,26 @@ class Twiss(Speaks):
         """Both betas, m, [row, 2]."""
         return np.column_stack([self.betx, self.bety])
 
+    def along(self, step: float = 0.1) -> tuple[Array, Array]:
+        """Return both betas between the rows as well, [point, 2], at s, [point]: cubics with the
+        slope -2 alpha at the rows, exact in drifts.
+
+        Args:
+            step: largest distance of two points, m; at least 1/8000 of the ring.
+        """
+        alpha = np.column_stack([self.alfx, self.alfy])
+        s, beta = [self.s[:1]], [self.beta[:1]]
+        for i, length in enumerate(np.diff(self.s)):
+            count = int(np.ceil(length / max(step, self.s[-1] / 8000)))
+            if count < 1:  # thin, or a drift back
+                continue
+            t = np.arange(1, count + 1)[:, None] / count
+            ends, slopes = self.beta[i : i + 2], -2 * length * alpha[i : i + 2]
+            turned = (1 - t) * (slopes[0] - ends[1] + ends[0]) + t * (ends[1] - ends[0] - slopes[1])
+            s.append(self.s[i] + t[:, 0] * length)
+            beta.append((1 - t) * ends[0] + t * ends[1] + t * (1 - t) * turned)
+        return np.concatenate(s), np.concatenate(beta)
+
     def to_dataframe(self) -> Any:
         """Return a pandas DataFrame, its index the names, its columns from `s` to `dpy`."""
         pandas = import_module("pandas")

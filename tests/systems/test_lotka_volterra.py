@@ -5,7 +5,7 @@ import pytest
 
 from tmlattice.maps import taylor_map_of_ode
 from tmlattice.systems.learning import follow, weights_of
-from tmlattice.systems.lotka_volterra import EQUATION, STEP, UNSEEN, Cell, learn, race, solutions
+from tmlattice.systems.lotka_volterra import EQUATION, STEP, UNSEEN, Cell, learn, solutions
 
 
 def test_solutions_keep_their_invariant():
@@ -34,21 +34,3 @@ def test_the_map_of_one_solution_predicts_the_unseen():
 )
 def test_the_criterion(learned, unseen, verdict):
     assert Cell("", "none", 1, learned, unseen, 1).verdict == verdict
-
-
-def test_a_race_repeats_itself_and_leaves_torch_as_it_was():
-    import torch
-
-    threads, state = torch.get_num_threads(), torch.get_rng_state()
-    first, again = (race(epochs=(10,), cells=(5,), regularizations=("dropout",)) for _ in range(2))
-    assert [c.learned for c in first.cells] == [c.learned for c in again.cells]
-    assert torch.get_num_threads() == threads
-    assert torch.equal(torch.get_rng_state(), state)
-    assert first.cells[0].verdict == "generalised"
-
-
-@pytest.mark.slow
-def test_no_other_network_generalises():
-    done = race(epochs=(3000,), cells=(5, 100), regularizations=("none",))
-    verdicts = [c.verdict for c in done.cells]
-    assert verdicts == ["generalised", "memorised", "memorised", "memorised"]

@@ -85,17 +85,6 @@ def test_third_order_against_the_unexpanded_equations(h, k1, k2):
     assert errors[1] < errors[0] / 15  # the fourth power is left, or a higher one
 
 
-def test_bodies_are_symplectic_to_their_order(petra3):
-    for kind in ("quadrupole", "bend", "sextupole"):
-        element = next(
-            e for e in petra3.magnets if e.kind == kind and (e.k1, e.k2, e.angle) != (0, 0, 0)
-        )
-        defect = magnet_map(element, 3).symplectic_defect()
-        for part in defect[:3]:
-            assert np.abs(part).max() < 1e-12
-        assert np.abs(defect[3]).max() + np.abs(defect[4]).max() > 0
-
-
 @pytest.mark.parametrize("size", [1e-3, 3e-3])
 def test_third_order_brings_a_turn_to_at_exact_tracking(petra3, size):
     ring = at_lattice(petra3, 40)

@@ -243,7 +243,7 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
             shown.add_row(name, _share(entry["refused"]), _share(entry["place"]),
                           _plain(entry["aliased"]), str(entry["aliased"]["cases"]))  # fmt: skip
         screen.print(shown)
-        shown = table("not aliased, within one monitor gap", "place")
+        shown = table("not aliased, within one BPM gap", "place")
         for name in (name for name in METHODS if name in result["place_by_method"]):
             shown.add_row(METHODS[name], _share(result["place_by_method"][name]))
         screen.print(shown)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import Careful, console, json_option, outputs
+from tmlattice.cli.options import Careful, console, json_option, outputs, print_report
 
 
 @click.command("compare", cls=Careful)
@@ -25,6 +25,6 @@ def compare(first: str, second: str, json_file: Path | None) -> None:
         found = run(first, second)
         write(found.as_json())
     screen = console()
-    screen.print(found.report(), soft_wrap=True)
+    print_report(screen, found)
     if json_file:
         screen.print(f"written: {json_file}")

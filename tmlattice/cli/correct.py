@@ -16,6 +16,7 @@ from tmlattice.cli.options import (
     named_number,
     open_ring,
     outputs,
+    print_report,
     require,
 )
 from tmlattice.cli.progress import tell
@@ -95,7 +96,6 @@ def correct(
     from tmlattice.correction.estimate import read_estimate
     from tmlattice.correction.knobs import write_knobs
     from tmlattice.files import output_file
-    from tmlattice.report.correction_texts import correction_text
     from tmlattice.report.speaking import write_correction
 
     with outputs(out, json_file) as (folder, write):
@@ -120,7 +120,7 @@ def correct(
             write_correction(found, folder)
         write(found.as_json())
     screen = console()
-    screen.print(correction_text(found, min(screen.width, 120)), soft_wrap=True)
+    print_report(screen, found)
     for sentence in warnings:
         screen.print(f"\nNote: {sentence}.", soft_wrap=True)
     written = [f"{out}/: report.html, settings.csv, ..."] if out else []

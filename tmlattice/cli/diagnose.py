@@ -21,6 +21,7 @@ from tmlattice.cli.options import (
     named_data,
     open_ring,
     outputs,
+    print_report,
     radiation_option,
     read_data,
     seed_option,
@@ -93,7 +94,7 @@ log = logging.getLogger(__name__)
     metavar="FILE",
     help="The estimated ring, with its errors: .json (the package's own), .at.json (AT), "
     ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json next to it "
-    "holds the calibration of monitors and correctors (`tmlattice predict`).",
+    "holds the calibration of BPMs and correctors (`tmlattice predict`).",
 )
 @click.option(
     "--corrected-out",
@@ -396,10 +397,6 @@ def _print_weights(ring: "Ring", reading: "WeightReading") -> None:
     )
 
 
-LINES = 34
-"""Of a report on a terminal; with what is written where, and a correction, 40."""
-
-
 def _print(
     result: "Diagnosis",
     correction: "Correction | None",
@@ -407,15 +404,12 @@ def _print(
     json_file: Path | None,
     rings: dict[str, tuple[str, ...]],
 ) -> None:
-    from tmlattice.report.plain import report_text
     from tmlattice.report.text import wrapped
 
     screen = console()
-    width = min(screen.width, 120)
-    most = LINES if screen.is_terminal else None  # a pipe takes all of it
-    screen.print(report_text(result, width, most), soft_wrap=True)
+    print_report(screen, result)
     if correction is not None:
-        text = "\n".join(wrapped(f"Correction: {correction.words}", "", width))
+        text = "\n".join(wrapped(f"Correction: {correction.words}", "", screen.width))
         screen.print(f"\n{text}", soft_wrap=True)
     if result.parts:
         what = ", ".join(f"{part.label} ({part.readings} readings)" for part in result.parts)
@@ -429,7 +423,7 @@ def _print(
         held, good = result.response.held, result.response.good
         what = (
             f"{len(held) - 1} correctors, {int(held.sum())} of them held out, {int(good.sum())} "
-            "monitors"
+            "BPMs"
         )
     made = result.provenance
     screen.print(f"\n{result.ring.name}: {what}, seed {made['seed']}, {made['seconds']:.1f} s")

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     help="Write a template of each kind of file and a machine file into --out, for --lattice "
     "(else the machine file's, or petra3), and import nothing.",
 )
-@click.option("--keep-bad", is_flag=True, help="Take monitors and correctors that are called bad.")
+@click.option("--keep-bad", is_flag=True, help="Take BPMs and correctors that are called bad.")
 @click.option("--force", is_flag=True, help="Replace a measurement that is there.")
 def import_files(
     files: tuple[Path, ...],

@@ -17,9 +17,12 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from tmlattice.correction import Correction
+    from tmlattice.diagnosis import Diagnosis
     from tmlattice.lattice import Ring
     from tmlattice.machine_file import MachineFile
     from tmlattice.measurement import AnyMeasurement
+    from tmlattice.report.compare import Differences
 
 log = logging.getLogger(__name__)
 
@@ -437,8 +440,8 @@ def read_data(path: Path, ring: "Ring") -> "tuple[AnyMeasurement, tuple[str, ...
 
 
 def console() -> "Console":
-    """Where results are printed: as wide as the terminal, else 100 columns; nowhere with `--quiet`.
-    Names from files steer nothing there."""
+    """Where results are printed: as wide as the terminal, up to 120 columns, else 100; nowhere with
+    `--quiet`. Names from files steer nothing there."""
     from rich.console import Console
     from rich.text import Text
 
@@ -458,7 +461,17 @@ def console() -> "Console":
 
     look: dict[str, Any] = {"highlight": False, "markup": False, "quiet": is_quiet()}
     wide = Screen(**look)
-    return wide if wide.is_terminal else Screen(**look, width=100)
+    return Screen(**look, width=min(wide.width, 120) if wide.is_terminal else 100)
+
+
+LINES = 34
+"""Of a report on a terminal; with what is written where, and a correction, 40."""
+
+
+def print_report(screen: "Console", found: "Diagnosis | Correction | Differences") -> None:
+    """Print a report; on a terminal, which scrolls, its most important lines."""
+    most = LINES if screen.is_terminal else None
+    screen.print(found.report(screen.width, most), soft_wrap=True)
 
 
 def table(*columns: str) -> "Table":

@@ -19,7 +19,7 @@ from tmlattice.cli.options import (
     "--calibration",
     type=FILE,
     metavar="FILE",
-    help="JSON with the gains, rolls and couplings of monitors, the calibrations and rolls of "
+    help="JSON with the gains, rolls and couplings of BPMs, the calibrations and rolls of "
     "correctors, and the energies of the beam.",
 )
 @click.option(
@@ -67,6 +67,6 @@ def predict(
         orbits = list(zip(columns.names, kick * response, strict=True))
         write_response_table(file, monitors, orbits)
     console().print(
-        f"{ring.name}: {len(columns.names)} correctors, {len(monitors)} monitors, kick "
+        f"{ring.name}: {len(columns.names)} correctors, {len(monitors)} BPMs, kick "
         f"{1e6 * kick:g} µrad\nwritten: {out}"
     )

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, console
+from tmlattice.cli.options import FILE, Careful, console, print_report
 
 
 @click.command("report", cls=Careful)
@@ -23,6 +23,6 @@ def report(result: Path, out: Path | None) -> None:
 
     found = render(result, out)
     screen = console()
-    screen.print(found.report(), soft_wrap=True)
+    print_report(screen, found)
     place = out or (result if result.is_dir() else result.parent)
-    screen.print(f"\nwritten: {place / 'report.html'}")
+    screen.print(f"\nwritten: {place / 'report.html'}", soft_wrap=True)

@@ -84,7 +84,7 @@ CAUSE = Word(
     "--amplitude",
     type=click.FloatRange(0, min_open=True),
     default=1e-3,
-    help="Rms orbit over monitors and planes, m.",
+    help="Rms orbit over BPMs and planes, m.",
 )
 @click.option(
     "--noise",
@@ -204,7 +204,7 @@ def _run(kind: str, ring: Any, causes: list[Any], options: dict[str, Any]) -> tu
     from tmlattice.machine import simulate, stored_beam
     from tmlattice.machine.response import simulate_response
 
-    monitors = f"{len(ring.monitors)} monitors"
+    monitors = f"{len(ring.monitors)} BPMs"
     made: Any
     if kind == "trajectory":
         made = simulate(ring, causes, **options)

@@ -187,7 +187,7 @@ def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
             others={m.method: m.fit.loss[-1] for m in outcome.methods[1:] if m.fit is not None},
         )  # fmt: skip
         orbits = "one orbit" if outcome.shots == 1 else f"{outcome.shots} orbits"
-        ax.set_title(f"Fine-tuning on {orbits} of {monitors} monitors")
+        ax.set_title(f"Fine-tuning on {orbits} of {monitors} BPMs")
     for name, figure in figures.items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         plt.close(figure)
@@ -210,7 +210,7 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
     screen.print(
         f"{outcome.ring.name}: {outcome.ring.length:.3f} m, "
         f"{outcome.ring.energy:g} GeV, {len(network.layers)} layers, "
-        f"{len(network.monitors)} monitors\n{what}"
+        f"{len(network.monitors)} BPMs\n{what}"
     )
     tunes = table("fractional tunes", "Qx", "Qy")
     tunes.add_row("design (OCELOT)", *map("{:.6f}".format, outcome.design_tunes))

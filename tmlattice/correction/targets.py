@@ -47,13 +47,11 @@ class Target:
 
 TARGETS: dict[str, Target] = {
     "beta_beating": Target("beta beating", "relative", 0.01, ("x", "y")),
-    "phase_advance": Target("phase advance between BPMs", "2 pi", 1e-3, ("x", "y")),
+    "phase_advance": Target("phase advance", "2 pi", 1e-3, ("x", "y")),
     "dispersion": Target("dispersion error", "m", 0.01, ("x", "y")),
     "tunes": Target("tune error", "", 1e-3, ("x", "y")),
     "chromaticity": Target("chromaticity error", "", 0.1, ("x", "y")),
-    "coupling": Target(
-        "coupling (amplitude in the other plane)", "relative", 0.01, ("x to y", "y to x")
-    ),
+    "coupling": Target("coupling", "relative", 0.01, ("x to y", "y to x")),
     "closed_orbit": Target("closed orbit", "m", 1e-4, ("x", "y")),
     "first_turn": Target("trajectory on the first two turns", "m", 1e-3, ("x", "y")),
 }

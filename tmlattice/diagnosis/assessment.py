@@ -282,7 +282,7 @@ STATEMENTS = (
         "cannot be tested",
         lambda own: own.verdict == "none" and own.change
         and own.remainder not in _UNEXPLAINED,
-        lambda own: "Nothing changed since the reference beyond the usual drifts of monitors, "
+        lambda own: "Nothing changed since the reference beyond the usual drifts of BPMs, "
         "correctors and magnets.",
         _LEAVES_MORE,
     ),

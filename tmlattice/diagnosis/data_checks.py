@@ -130,7 +130,7 @@ def check_data(
     return Checkup(kind, tuple(checks), provenance)
 
 
-_REPORTED = ("energy", "large readings", "copied monitors", "lost beam", GLOBAL, "launches")
+_REPORTED = ("energy", "large readings", "copied BPMs", "lost beam", GLOBAL, "launches")
 """Notes that the diagnosis does not find by itself."""
 
 
@@ -228,8 +228,8 @@ def _sentence(searched: Search, verdict: Verdict) -> Check:
     sure = verdict.worth > CERTAIN or isinstance(searched, Compared)
     text = (
         f"{words if sure else f'possibly {words}'}{f' ({others})' if others else ''}: "
-        f"{verdict.of} {before} as stated, {after} with that corrected; {corrections}, or go on "
-        f"with {_options(verdict.names)}"
+        f"{verdict.of} {before} with the data as given, {after} with that corrected; "
+        f"{corrections}, or go on with {_options(verdict.names)}"
     )
     chi2 = (verdict.before, verdict.after) if isinstance(searched, OfTurns) else (None, None)
     make = wrong if sure else note
@@ -276,7 +276,7 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
         *checks,
         _launches(checked),
         _noise(checked, passes, found),
-        _spikes(checked, passes, found),
+        _outliers(checked, passes, found),
     ]
 
 
@@ -391,9 +391,9 @@ def _micro(metres: float) -> str:
     return f"{1e6 * metres:.3g} µm"
 
 
-def _spikes(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
+def _outliers(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
     """The check for outliers, where the same section of other shots agrees."""
-    none = fine("spikes", "no reading is an outlier")
+    none = fine("outliers", "no reading is an outlier")
     there = found.freedom > 2
     if len(found.misfit) < 3 or not there.any():
         return none
@@ -411,7 +411,7 @@ def _spikes(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
             reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
     if not reported:
         return none
-    return note("spikes", f"outliers: {signals.some(reported)}; leave them empty")
+    return note("outliers", f"{signals.some(reported)}; leave them empty")
 
 
 # --- what is compared with the design's -----------------------------------------------------------

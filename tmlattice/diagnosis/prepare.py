@@ -205,12 +205,12 @@ def _dead_monitors(
                 frozen.append(m)
     absent = sum(1 for name in model.maps.monitors if name.casefold() not in listed)
     if absent:
-        messages.append(f"{absent} of the ring's {count} monitors are not in the measurement")
+        messages.append(f"{absent} of the ring's {count} BPMs are not in the measurement")
     unread = [plane for plane, read in zip("xy", data.planes, strict=True) if not read]
     if unread:
         messages.append(signals.one_plane(unread[0]))
     elif half:
-        messages.append(f"{len(half)} monitors read one plane only: {first_of(half, 3)}")
+        messages.append(f"{len(half)} BPMs read one plane only: {first_of(half, 3)}")
     if len(silent) > judgement.silent * count:
         messages.append(f"{len(silent)} BPMs have no signal; they are ignored")
         silent = []
@@ -225,7 +225,7 @@ def _with_noise(data: Data, start: Fit) -> tuple[Data, bool]:
     """The data with a noise for every reading, and whether it is estimated."""
     missing = ~np.isfinite(data.sigma) & data.valid
     if (data.sigma[data.valid & ~missing] <= 0).any():
-        raise MeasurementError("a monitor's noise is zero or negative; leave it out if unknown")
+        raise MeasurementError("a BPM's noise is zero or negative; leave it out if unknown")
     estimated = bool(missing.any())
     if estimated:
         found = estimate(data, start.point.view)

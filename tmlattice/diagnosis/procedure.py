@@ -242,7 +242,7 @@ def _report(
         # errors of held-out readings do not include undetermined distributed errors
         compared = compared_of(fitted, heldout if small is None else None)
         stated = (f"{part.label}: {one}" for part in parts for one in part.messages)
-        notes = list(spikes(parts, problem, found))
+        notes = list(outlier_messages(parts, problem, found))
     else:
         heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
@@ -361,7 +361,9 @@ def with_silent(ring: Ring, part: Part, measured: Any) -> Part:
     return replace(part, messages=(*part.messages, messages))
 
 
-def spikes(parts: Sequence[Part], problem: CombinedProblem, found: Explanation) -> Iterator[str]:
+def outlier_messages(
+    parts: Sequence[Part], problem: CombinedProblem, found: Explanation
+) -> Iterator[str]:
     """A message for each measurement with single readings that the search rejected."""
     ends = np.cumsum([part.valid.size for part in problem.parts])
     own: dict[int, list[int]] = {}

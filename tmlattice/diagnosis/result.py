@@ -311,7 +311,7 @@ class Diagnosis(Speaks):
             reference=bool(options.get("reference")),
             change=self.since_reference,
             measured=self.measured,
-            model=self.ring.model,
+            model=self.starting_model,
             false_alarm=options.get("false_alarm", DEFAULT.false_alarm),
         )
 
@@ -362,6 +362,11 @@ class Diagnosis(Speaks):
     def since_reference(self) -> bool:
         """Whether the result is a change from an earlier measurement (except of trajectories)."""
         return self.kind != "trajectory" and self.has_reference
+
+    @property
+    def starting_model(self) -> str:
+        """What the residuals before the findings are from: the reference, else the lattice."""
+        return "reference" if self.since_reference else self.ring.model
 
     @property
     def has_reference(self) -> bool:

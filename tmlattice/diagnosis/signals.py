@@ -169,7 +169,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     there = np.isfinite(values)
     if not np.count_nonzero(values[there]):
         text = "every reading is zero: nothing was read; give the readings of a beam"
-        return [wrong("frozen monitors", text)]
+        return [wrong("frozen BPMs", text)]
     checks = []
     large = too_large(values)
     if large.any():
@@ -185,12 +185,12 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     ]
     if len(silent) > DEFAULT.silent * len(names):
         text = f"{len(silent)} of {len(names)} BPMs have no reading; they are ignored"
-        checks.append(note("silent monitors", text))
+        checks.append(note("silent BPMs", text))
     elif silent:
         text = f"no reading of {some(silent)}"
-        checks.append(note("silent monitors", text))
+        checks.append(note("silent BPMs", text))
     else:
-        checks.append(fine("silent monitors", f"each of {len(names)} BPMs has a reading"))
+        checks.append(fine("silent BPMs", f"each of {len(names)} BPMs has a reading"))
     many = there.sum(axis=0) > 2
     with np.errstate(invalid="ignore"):
         high = np.where(there, values, -np.inf).max(axis=0)
@@ -207,18 +207,18 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
             f"{len(frozen)} of {len(names)} BPMs read the same in every shot and turn: one "
             "reading was copied over the others; give what was read each time"
         )
-        checks.append(wrong("frozen monitors", text))
+        checks.append(wrong("frozen BPMs", text))
     elif frozen:
         text = f"the same reading again and again: {some(frozen)}; leave the signal out"
-        checks.append(note("frozen monitors", text))
+        checks.append(note("frozen BPMs", text))
     else:
-        checks.append(fine("frozen monitors", "no BPM is frozen"))
+        checks.append(fine("frozen BPMs", "no BPM is frozen"))
     copies = _copies(ring, names, values, stuck)
     if copies:
         text = f"the same readings, to the last digit, of {some(copies)}; one of them is a copy"
-        checks.append(note("copied monitors", text))
+        checks.append(note("copied BPMs", text))
     else:
-        checks.append(fine("copied monitors", "no two BPMs read the same"))
+        checks.append(fine("copied BPMs", "no two BPMs read the same"))
     return checks
 
 
@@ -315,8 +315,8 @@ def few(ring: Ring, data: AnyMeasurement) -> Check | None:
     """The check for too few BPMs."""
     if not ring.monitors and not isinstance(data, TuneReading):
         return wrong(
-            "monitors", f"'{ring.name}' has no monitor; name those elements of the lattice that "
-            "are monitors",
+            "monitors", f"'{ring.name}' has no BPM; name those elements of the lattice that "
+            "are BPMs",
         )  # fmt: skip
     if not isinstance(data, Measurement):
         return None
@@ -324,7 +324,7 @@ def few(ring: Ring, data: AnyMeasurement) -> Check | None:
     read = int(there.any(axis=(0, 1, 3)).sum())
     if read < 2:
         return wrong(
-            "monitors", f"{read} monitor was read; a trajectory needs two monitors at least, and "
+            "monitors", f"{read} BPM was read; a trajectory needs two BPMs at least, and "
             "more for a diagnosis: read more",
         )  # fmt: skip
     return None

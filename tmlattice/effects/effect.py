@@ -122,7 +122,7 @@ class Effect(ABC):
     @property
     def label(self) -> str:
         """Short name."""
-        return self.name.replace("_", " ")
+        return self.name.replace("monitor_", "BPM_").replace("_", " ")
 
     @abstractmethod
     def places(self, ring: Ring) -> list[str | None]:
@@ -383,7 +383,7 @@ MIN_FIELD = 0.1
 class ReadingEffect(Effect):
     """An effect on one monitor's readings."""
 
-    sits_on_text: ClassVar[str] = "monitors"
+    sits_on_text: ClassVar[str] = "BPMs"
     group: ClassVar[Group] = "monitors"
 
     def places(self, ring: Ring) -> list[str | None]:

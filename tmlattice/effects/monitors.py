@@ -40,7 +40,7 @@ class MonitorOffsetX(_Offset):
     """A horizontal offset of a monitor."""
 
     name = "monitor_offset_x"
-    words = "horizontal offset of a monitor"
+    words = "horizontal offset of a BPM"
     quantity = "offset in x"
     plane = 0
 
@@ -50,7 +50,7 @@ class MonitorOffsetY(_Offset):
     """A vertical offset of a monitor."""
 
     name = "monitor_offset_y"
-    words = "vertical offset of a monitor"
+    words = "vertical offset of a BPM"
     quantity = "offset in y"
     plane = 1
 
@@ -87,7 +87,7 @@ class MonitorGainX(_Gain):
 
     name = "monitor_gain_x"
     responds = True
-    words = "wrong horizontal gain of a monitor"
+    words = "wrong horizontal gain of a BPM"
     quantity = "gain in x"
     plane = 0
 
@@ -98,7 +98,7 @@ class MonitorGainY(_Gain):
 
     name = "monitor_gain_y"
     responds = True
-    words = "wrong vertical gain of a monitor"
+    words = "wrong vertical gain of a BPM"
     quantity = "gain in y"
     plane = 1
 
@@ -109,7 +109,7 @@ class MonitorRoll(ReadingEffect):
 
     name = "monitor_roll"
     responds = True
-    words = "monitor rolled about the beam axis"
+    words = "BPM rolled about the beam axis"
     quantity = "roll"
     recommended_action = "turn {} upright, or its readings"
     to_check = "Measure its roll, and check the mounting of its pick-ups."
@@ -135,7 +135,7 @@ class MonitorCoupling(ReadingEffect):
 
     name = "monitor_coupling"
     responds = True
-    words = "monitor that mixes its planes"
+    words = "BPM that mixes its planes"
     quantity = "coupling of its planes"
     recommended_action = "calibrate the electronics of {}"
     to_check = "Measure crosstalk between its channels; compare the gains of its four buttons."
@@ -160,7 +160,7 @@ class MonitorSwap(ReadingEffect):
 
     name = "monitor_swap"
     responds = True
-    words = "monitor with its planes exchanged"
+    words = "BPM with its planes exchanged"
     quantity = "planes exchanged"
     recommended_action = "swap the cables of {} back"
     to_check = "Follow its cables from the pick-ups to the electronics: x and y are swapped."
@@ -184,7 +184,7 @@ class MonitorTurnOffset(ReadingEffect):
     """A monitor with a wrong turn count."""
 
     name = "monitor_turn_offset"
-    words = "monitor that counts its turns off"
+    words = "BPM that counts its turns off"
     quantity = "count of turns"
     recommended_action = "set the turn count of {}"
     to_check = "Check its trigger and the delay of its turn clock."
@@ -210,7 +210,7 @@ class MonitorDead(ReadingEffect):
     """A monitor without a signal, or one whose reading is frozen."""
 
     name = "monitor_dead"
-    words = "dead monitor"
+    words = "dead BPM"
     quantity = "readings"
     recommended_action = "repair {}"
     to_check = "Check its cables, power and electronics, and whether its data are refreshed."

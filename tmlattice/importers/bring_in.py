@@ -206,7 +206,7 @@ def _without_bad(brought: Imported, stated: Stated) -> Imported:
         return brought
     kept = [name for name in data.monitors if name not in bad]
     brought = replace(brought, measurement=data.select(monitors=kept))
-    return brought.saying(f"bad monitors, left out as stated: {counted(bad)}")
+    return brought.saying(f"bad BPMs, left out as stated: {counted(bad)}")
 
 
 def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
@@ -220,7 +220,7 @@ def _with_all_noise(brought: Imported, data: OrbitResponse) -> Imported:
     names = [data.monitors[i] for i in np.unique(np.nonzero(unknown & read)[0])]
     if not names:
         return brought
-    return brought.saying(f"no noise is given for {counted(names)}: that of the typical monitor")
+    return brought.saying(f"no noise is given for {counted(names)}: that of the typical BPM")
 
 
 def _bring(

@@ -280,8 +280,8 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
     lengths = [len(values) for _, _, values in flat]
     if not lengths:
         raise MeasurementError(
-            f"'{path}' holds no readings: an array for each monitor and plane, or x and y [shot, "
-            "monitor] with the monitors' names"
+            f"'{path}' holds no readings: an array for each BPM and plane, or x and y [shot, "
+            "monitor] with the BPMs' names"
         )
     most = max(set(lengths), key=lengths.count)
     for name, _, values in flat:

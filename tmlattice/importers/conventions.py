@@ -130,7 +130,7 @@ def _single(own: Plane) -> list[str]:
     said = []
     for what, names, alike in (
         ("correctors", own.correctors, own.columns() * sign),
-        ("monitors", list(own.monitors), np.diagonal(monitors)),
+        ("BPMs", list(own.monitors), np.diagonal(monitors)),
     ):
         against = [name for name, r in zip(names, alike.tolist(), strict=True) if r < -ODD]
         nothing = [n for n, r in zip(names, alike.tolist(), strict=True) if 0 < abs(r) <= ODD]
@@ -142,7 +142,7 @@ def _single(own: Plane) -> list[str]:
                 said.append(f"single {what} of {own.plane} {how}: {counted(which)}")
     odd = np.flatnonzero((np.diagonal(monitors) < ODD) & own.measured.any(axis=0))
     said += [
-        f"monitors '{own.monitors[i]}' and '{own.monitors[k]}' read each other's {own.plane}"
+        f"BPMs '{own.monitors[i]}' and '{own.monitors[k]}' read each other's {own.plane}"
         for i in odd
         for k in odd
         if i < k and min(monitors[i, k], monitors[k, i]) > SURE

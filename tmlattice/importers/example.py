@@ -16,10 +16,10 @@ KICK = 1e-4
 """rad; of the correctors in the template of a response."""
 
 FILES = {
-    "readings_wide.csv": "a row a shot, a column a monitor and plane",
-    "readings_long.csv": "a row a shot and monitor",
-    "readings.h5": "x and y [shot, monitor], with the monitors' names",
-    "response.csv": "an orbit response: a row a corrector and monitor (here the design's)",
+    "readings_wide.csv": "a row a shot, a column a BPM and plane",
+    "readings_long.csv": "a row a shot and BPM",
+    "readings.h5": "x and y [shot, monitor], with the BPMs' names",
+    "response.csv": "an orbit response: a row a corrector and BPM (here the design's)",
     "tmlattice.toml": "what the files do not state: lattice, unit, names, bad BPMs (--machine)",
 }
 

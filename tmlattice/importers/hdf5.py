@@ -140,8 +140,7 @@ def bring_hdf5(
         devices=device_names((placed.correctors[mapping[name]], name) for name in names),
     )
     said = (
-        "monitors stand in the order of the lattice, x then y; inputs are found by the table of "
-        "names",
+        "BPMs stand in the order of the lattice, x then y; inputs are found by the table of names",
         of_orbits,
         "the RF frequency stood still while correctors were stepped",
         of_noise,

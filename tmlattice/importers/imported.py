@@ -174,14 +174,14 @@ def described(brought: Imported) -> str:
             f"an RF step of {data.rf.step:+g} Hz"
         )  # fmt: skip
         return (
-            f"orbit response: monitors {read[0]} x, {read[1]} y; correctors {planes[0]} x, "
+            f"orbit response: BPMs {read[0]} x, {read[1]} y; correctors {planes[0]} x, "
             f"{planes[1]} y; {step}{noise}"
         )
     if not isinstance(data, Measurement | TurnByTurn):
         return in_words(data)
     shots, turns, monitors, _ = data.readings.shape
     what = "turn by turn" if isinstance(data, TurnByTurn) else "first turns"
-    return f"{what}: {shots} shots, {turns} turns, {monitors} monitors"
+    return f"{what}: {shots} shots, {turns} turns, {monitors} BPMs"
 
 
 def write_imported(brought: Imported, folder: Path, force: bool = False) -> None:

@@ -85,7 +85,7 @@ def bring_loco(
     for plane, index in reads.items():
         if len(index) and not 0 <= index.min() <= index.max() < len(at_monitor):
             raise MeasurementError(
-                f"'{path}': a monitor of plane {plane} is not among the {len(at_monitor)} of "
+                f"'{path}': a BPM of plane {plane} is not among the {len(at_monitor)} of "
                 "BPMIndex; correct BPMData"
             )
     elements, of_lattice, model = _elements(lattice, content.get("FitParameters"), iteration)
@@ -296,7 +296,7 @@ def _good(
                     [placed.monitors[index[k]] for k in bad] if kind == "BPM"
                     else [placed.correctors[int(index[k]), plane] for k in bad]
                 )  # fmt: skip
-                what = "monitors in" if kind == "BPM" else "correctors of"
+                what = "BPMs in" if kind == "BPM" else "correctors of"
                 done = "kept" if keep_bad else "left out"
                 said.append(f"{what} {plane} that {name} calls bad, {done}: {counted(names)}")
             good[key] = np.ones_like(flags) if keep_bad else flags

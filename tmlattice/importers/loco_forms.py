@@ -200,7 +200,7 @@ def _monitors(monitors: dict[str, Any], said: list[str]) -> None:
             return  # for the reader to refuse
         monitors[name] = number[own.astype(np.int64) - 1] + 1.0
     monitors["BPMIndex"] = places[order]
-    said.append("BPMIndex names places twice, for x and for y: each is one monitor")
+    said.append("BPMIndex names places twice, for x and for y: each is one BPM")
 
 
 def _places(correctors: dict[str, Any], said: list[str]) -> None:
@@ -268,7 +268,7 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
             continue
         if name == "BPMSTD" and given.ndim == 2 and given.shape == np.shape(data.get("M", ())):
             given = np.sqrt(np.nanmean(given**2, axis=1))
-            said.append("BPMSTD is of every entry of M: the rms of each monitor is taken")
+            said.append("BPMSTD is of every entry of M: the rms of each BPM is taken")
         given = given.ravel(order="F" if given.shape != (2, x) else "C")  # x, then y
         if given.size == len(rows) < x + y:
             every = np.full(x + y, np.nan)

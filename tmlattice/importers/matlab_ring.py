@@ -259,7 +259,7 @@ def _names(ring: Ring, families: Sequence[str], places: Iterable[int]) -> dict[i
         family = families[place]
         if len(there[family]) != seen[family]:
             raise LatticeError(
-                f"'{family}' of the lattice is a monitor or corrector here and a wiggler's slice "
+                f"'{family}' of the lattice is a BPM or corrector here and a wiggler's slice "
                 "there; give them names of their own"
             )
         names[place] = there[family][number[place]]

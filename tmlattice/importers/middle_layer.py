@@ -78,7 +78,7 @@ def bring_middle_layer(
         for r in range(2):
             where = _devices(blocks[r][p].get("Monitor"), "Monitor")
             orbits = _orbits(blocks[r][p], steps, len(where))
-            at = [_look_up(reads[r], device, f"monitor of {'xy'[r]}") for device in where]
+            at = [_look_up(reads[r], device, f"BPM of {'xy'[r]}") for device in where]
             change[:, at, r] = orbits.T
         names += [model.correctors[i] for i in found]
         planes += [plane] * len(found)
@@ -163,7 +163,7 @@ def _monitors(data: Fields, model: OrbitResponse, plane: int) -> dict[Device, in
             if len(read) != len(devices):
                 raise MeasurementError(f"{name} has {len(devices)} devices, not {len(read)}")
             return dict(zip(devices, read.tolist(), strict=True))
-    raise MeasurementError("LocoMeasData has no devices of the monitors (HBPM, BPMx)")
+    raise MeasurementError("LocoMeasData has no devices of the BPMs (HBPM, BPMx)")
 
 
 def _look_up(table: Mapping[Device, int], device: Device, what: str) -> int:
@@ -239,7 +239,7 @@ def _noise(
         part = _part(with_dispersion, f"BPM{plane}Data")
         if part is None or "Sigma" not in part:
             return None
-        at = [_look_up(reads[p], d, f"monitor of {plane}") for d in _devices(part, "BPMxData")]
+        at = [_look_up(reads[p], d, f"BPM of {plane}") for d in _devices(part, "BPMxData")]
         unit = _unit(part.get("UnitsString", "mm"), METRES, "noise")
         noise[at, p] = np.sqrt(2) * unit * numbers(part["Sigma"], "Sigma", (len(at),))
     return np.where(noise > 0, noise, np.nan)
@@ -258,7 +258,7 @@ def _rf(
         if part is None:
             return None
         at = [
-            _look_up(reads[p], d, f"monitor of {plane}")
+            _look_up(reads[p], d, f"BPM of {plane}")
             for d in _devices(part.get("Monitor"), "BPMxDisp.Monitor")
         ]
         length, _, per = str(part.get("UnitsString", "")).partition("/")

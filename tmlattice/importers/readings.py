@@ -121,7 +121,7 @@ def bring_readings(
         where = order[shot], turn, at, place.plane
         if taken[where]:
             raise MeasurementError(
-                f"{path}: monitor '{names[at]}' stands twice in one shot; give a column 'shot' or "
+                f"{path}: BPM '{names[at]}' stands twice in one shot; give a column 'shot' or "
                 "'turn' that separates them"
             )
         taken[where] = True
@@ -160,7 +160,7 @@ def bring_readings(
         of_unit, beam, of_noise, *finder.said, *sums, *missing, *said_of_large,
         *_unused(columns, stated),
     ]  # fmt: skip
-    doubts = (f"not monitors of the lattice, left out: {counted(left)}",) if left else ()
+    doubts = (f"not BPMs of the lattice, left out: {counted(left)}",) if left else ()
     return Imported(data, ring, tuple(said), doubts, guessed)
 
 
@@ -245,7 +245,7 @@ def _long(path: str, columns: Sequence[Column], stated: Stated) -> Found | None:
                 parts.append(([Place(name, own) for name in names.values], column))
     if not parts:
         raise MeasurementError(
-            f"{path}: monitors' names without readings; give columns x and y, or a value with "
+            f"{path}: BPMs' names without readings; give columns x and y, or a value with "
             "the plane in its name"
         )
     return _joined(path, [(shots, turns, places, column) for places, column in parts])
@@ -271,7 +271,7 @@ def _wide(path: str, columns: Sequence[Column], stated: Stated) -> Found:
             )
         raise MeasurementError(
             f"{path}: no column holds readings that are known; name columns such as "
-            "'bpm_1 x [mm]', a monitor and a plane (`tmlattice import --example` writes some)"
+            "'bpm_1 x [mm]', a BPM and a plane (`tmlattice import --example` writes some)"
         )
     turns = turns or [0] * rows
     return _joined(
@@ -425,9 +425,9 @@ class _Finder:
             if len(devices) != len(self._names):
                 raise MeasurementError(
                     f"{path}: {len(devices)} devices, and the lattice has {len(self._names)} "
-                    "monitors; name them in [channels], they are not the same in order"
+                    "BPMs; name them in [channels], they are not the same in order"
                 )
-            self.said.append("devices are the lattice's monitors in beam order, as stated")
+            self.said.append("devices are the lattice's BPMs in beam order, as stated")
             found: dict[str, int | None] = {device: i for i, device in enumerate(devices)}
         else:
             found = {device: self.find(device) for device in devices}

@@ -118,7 +118,7 @@ def bring_turns(
         single = int((read.sum(axis=1) == 1).sum())
         said = [
             f"read as '{one}' of turn_by_turn; readings are in {unit or 'mm'}",
-            f"monitors: {int(read[:, 0].sum())} in x, {int(read[:, 1].sum())} in y"
+            f"BPMs: {int(read[:, 0].sum())} in x, {int(read[:, 1].sum())} in y"
             + (f", {single} of one plane" if single else ""),
         ]
         turns = data.readings.shape[1]
@@ -157,7 +157,7 @@ def _of_ring(data: Measurement, ring: Ring, stated: Stated) -> tuple[Measurement
         data.select(monitors=[name for _, name in there]),
         monitors=tuple(ours.names[at] for at, _ in there),
     )
-    what = f"monitors that the lattice does not have, left out: {counted(missing)}"
+    what = f"BPMs that the lattice does not have, left out: {counted(missing)}"
     return data, (what,) if missing else ()
 
 

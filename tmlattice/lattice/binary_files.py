@@ -391,7 +391,7 @@ def _brackets(text: str) -> None:
     bare = re.sub(r"[\s\\]", "", text)
     stated, whole = bare.count("->{{"), len(re.findall(VALUES_PATTERN, bare))
     if any(bare.count(a) != bare.count(b) for a, b in ("{}", "()")) or stated != whole:
-        raise RefusedError(f"it is cut off: {whole} monitors of {stated} are whole; copy it anew")
+        raise RefusedError(f"it is cut off: {whole} BPMs of {stated} are whole; copy it anew")
 
 
 def _last_line(text: str) -> None:
@@ -422,7 +422,7 @@ def _rows(text: str) -> None:
     stated = len(monitors) * turns * particles
     if rows != stated:
         raise RefusedError(
-            f"it has {rows} rows of {len(monitors)} monitors, {turns} turns and {particles} "
+            f"it has {rows} rows of {len(monitors)} BPMs, {turns} turns and {particles} "
             f"particles, which are {stated}: it is cut off, or particles are lost"
         )
 

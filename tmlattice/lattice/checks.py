@@ -101,7 +101,7 @@ def need_monitors(ring: Ring) -> None:
         names = dict.fromkeys(e.family for e in ring.elements if e.kind == "marker")
         example = f", such as '{next(iter(names))}'" if names else ""
         raise LatticeError(
-            f"'{ring.name}' has no monitor; state which of its elements are: [lattice] monitors = "
+            f"'{ring.name}' has no BPM; state which of its elements are: [lattice] monitors = "
             f"['BPM*'] in tmlattice.toml (in Python: monitors='BPM*'), names of markers or "
             f"drifts{example}"
         )

@@ -280,7 +280,7 @@ def _with_errors_of(
     moved = {} if align is None else {k: v for k, v in align._asdict().items() if v}
     if part.keyword in ("monitor", "hmonitor", "vmonitor"):
         if moved:
-            report.left_out("errors of EALIGN of the monitor", part.name)
+            report.left_out("errors of EALIGN of the BPM", part.name)
         moved = {}
     for key, amount in moved.items():
         if key not in SHIFTS or key not in MODELLED.get(part.keyword, ()):

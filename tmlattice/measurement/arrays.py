@@ -55,7 +55,7 @@ def readings_of(
     if x is None and y is None:
         raise MeasurementError("neither x nor y is given; give one at least")
     given = {}
-    wanted = f"[{', '.join((*axes, f'{len(monitors)} monitors'))}]"
+    wanted = f"[{', '.join((*axes, f'{len(monitors)} BPMs'))}]"
     for name, values in (("x", x), ("y", y)):
         if values is None:
             continue

@@ -303,8 +303,8 @@ def _shifts() -> dict[str, Assumption]:
         count = f"{abs(by)} place{'s' * (abs(by) > 1)} {'down' if by > 0 else 'up'}stream"
         found[f"monitors-shifted={by}"] = _of(
             _READ,
-            f"the names of the monitors are shifted: what was read stands {count} of its monitor",
-            "give each reading its own monitor's name",
+            f"the names of the BPMs are shifted: what was read stands {count} of its BPM",
+            "give each reading its own BPM's name",
             _reordered, partial(_shift, by=by),
         )  # fmt: skip
     return found
@@ -314,15 +314,11 @@ SIGN = "change the sign of {}"
 UNIT = "give {} in {}"
 
 ASSUMPTIONS: dict[str, Assumption] = {
-    "x-reversed": _of(
-        _ORBITS, "x has the wrong sign at every monitor", SIGN.format("x"), _sign, -1, 1
-    ),
-    "y-reversed": _of(
-        _ORBITS, "y has the wrong sign at every monitor", SIGN.format("y"), _sign, 1, -1
-    ),
+    "x-reversed": _of(_ORBITS, "x has the wrong sign at every BPM", SIGN.format("x"), _sign, -1, 1),
+    "y-reversed": _of(_ORBITS, "y has the wrong sign at every BPM", SIGN.format("y"), _sign, 1, -1),
     "readings-reversed": _of(
         _ORBITS,
-        "x and y have the wrong sign at every monitor",
+        "x and y have the wrong sign at every BPM",
         SIGN.format("x and y"),
         _sign,
         -1,
@@ -356,15 +352,15 @@ ASSUMPTIONS: dict[str, Assumption] = {
     **_shifts(),
     "monitors-backwards": _of(
         _READ,
-        "the monitors stand in the reverse order",
-        "give each reading its own monitor's name",
+        "the BPMs stand in the reverse order",
+        "give each reading its own BPM's name",
         _reordered,
         _reverse,
     ),
     "monitors-alphabetical": _of(
         _READ,
         "the readings stand in the order of the sorted names",
-        "give each reading its own monitor's name",
+        "give each reading its own BPM's name",
         _reordered,
         _alphabet,
     ),

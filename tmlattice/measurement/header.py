@@ -59,7 +59,7 @@ def read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) -> 
     unread = [name for name in table.names if names.find(name) is None]
     if unread and known is None:
         warnings.warn(
-            f"the noise names {len(unread)} monitors of which nothing was read, such as "
+            f"the noise names {len(unread)} BPMs of which nothing was read, such as "
             f"'{plain(unread[0], 60)}'; correct the name where it should be another",
             stacklevel=2,
         )

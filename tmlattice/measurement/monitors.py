@@ -115,19 +115,19 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
             table[:] = np.asarray(noise, dtype=float)
     except (TypeError, ValueError):
         raise MeasurementError(
-            "the noise is neither a pair (x, y) in m nor one such pair a monitor"
+            "the noise is neither a pair (x, y) in m nor one such pair a BPM"
         ) from None
     if (table > LARGEST_NOISE).any() or ((table > 0) & (table < SMALLEST_NOISE)).any():
         low, high = np.nanmin(table), np.nanmax(table)
         raise MeasurementError(
-            f"the noise is stated as {low:g} to {high:g} m, which no monitor has; it is the rms of "
+            f"the noise is stated as {low:g} to {high:g} m, which no BPM has; it is the rms of "
             "one reading in metres"
         )
     wrong = ~(np.isnan(table) | ((table > 0) & np.isfinite(table)))
     if wrong.any():
         place, plane = (int(i) for i in np.argwhere(wrong)[0])
         raise MeasurementError(
-            f"the noise of monitor '{monitors[place]}' in {'xy'[plane]} is "
+            f"the noise of BPM '{monitors[place]}' in {'xy'[plane]} is "
             f"{table[place, plane]:g} m; it is an rms: above zero, or absent where unknown"
         )
     return None if np.isnan(table).all() else table
@@ -159,7 +159,7 @@ def check_size(readings: Array, monitors: Sequence[str]) -> None:
     if large.any():
         *_, monitor, plane = np.argwhere(large)[0]
         raise MeasurementError(
-            f"monitor '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
+            f"BPM '{monitors[monitor]}' reads {readings[large][0]:g} m in {'xy'[plane]}, above "
             f"{LARGEST_READING} m, which no reader takes; readings are in metres"
         )
 

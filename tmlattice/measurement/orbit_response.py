@@ -151,7 +151,7 @@ class OrbitResponse(Shown):
         if response.shape != (columns, monitors, 2):
             raise MeasurementError(
                 f"the response has the shape {response.shape}; {columns} correctors and "
-                f"{monitors} monitors need [{columns}, {monitors}, 2]"
+                f"{monitors} BPMs need [{columns}, {monitors}, 2]"
             )
         if len(self.planes) != columns or kicks.shape != (columns,):
             raise MeasurementError(f"{columns} correctors need as many planes and kicks")

@@ -75,7 +75,7 @@ class Shots(Shown):
             axes = ", ".join(f"{axis}s" for axis in self.AXES)
             raise MeasurementError(
                 f"{self.READ}: the shape is {read.shape}; {self.AXES[-1]}s at {len(monitors)} "
-                f"monitors need [{axes}, {len(monitors)}, 2]"
+                f"BPMs need [{axes}, {len(monitors)}, 2]"
             )
         check_values(read, "reading")
         check_energy(own.energy)

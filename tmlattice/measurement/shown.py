@@ -17,7 +17,7 @@ class Shown(Speaks):
         "tmlattice.plots.speaking",
         "plot_measurement",
         "Draw what was read: along `ring` where it is given (a Ring, a name or a path), else by "
-        "the number of the monitor; a matplotlib Figure.",
+        "the number of the BPM; a matplotlib Figure.",
     )
 
     to_dataframe = Method(
@@ -28,7 +28,7 @@ class Shown(Speaks):
     to_xarray = Method(
         "tmlattice.measurement.frames",
         "to_xarray",
-        "Return the same as an xarray Dataset, with shots, turns, monitors as its axes.",
+        "Return the same as an xarray Dataset, with shots, turns, BPMs as its axes.",
     )
     from_dataframe = ClassMethod(
         "tmlattice.importers.frames",

@@ -112,7 +112,7 @@ def read_turn_by_turn(
         for plane, (names, values) in enumerate(planes):
             index = [place[name] for name in names]
             if len(set(index)) < len(index):
-                raise MeasurementError(f"{path}: a monitor stands twice; name each once")
+                raise MeasurementError(f"{path}: a BPM stands twice; name each once")
             readings[shot, : values.shape[1], index, plane] = scale * values
     if (np.abs(readings) > LARGEST_READING).any():
         raise MeasurementError(

@@ -195,7 +195,7 @@ def estimated_noise(measured: OrbitResponse, where: Places) -> Array:
     sizes = np.array(found)
     if not np.isfinite(sizes).any():
         raise MeasurementError(
-            "the noise of the readings is not stated, and too few columns or monitors determine "
+            "the noise of the readings is not stated, and too few columns or BPMs determine "
             "it: state it"
         )
     sizes = np.where(np.isfinite(sizes), sizes, np.nanmax(sizes))

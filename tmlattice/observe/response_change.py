@@ -40,7 +40,7 @@ def alike(
     columns = [name for name in before.correctors if name in set(after.correctors)]
     monitors = [name for name in before.monitors if name in set(after.monitors)]
     for what, own, all_of in (
-        ("correctors", columns, after.correctors), ("monitors", monitors, after.monitors),
+        ("correctors", columns, after.correctors), ("BPMs", monitors, after.monitors),
     ):  # fmt: skip
         if len(own) < max(MIN_SHARED, len(all_of) // 4):
             raise MeasurementError(

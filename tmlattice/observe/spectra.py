@@ -215,7 +215,7 @@ def _shot(
     there, signals = there[:, :last], signals[:, :last]
     usable = (there.sum(axis=1) >= max(MIN_TURNS, last // 4)) & _moves(signals, there)
     if not usable.any():
-        warn(f"no monitor has {MIN_TURNS} turns of a beam that moves")
+        warn(f"no BPM has {MIN_TURNS} turns of a beam that moves")
         return None
     there = there[usable]
     data = np.where(there, signals[usable], 0.0)
@@ -261,7 +261,7 @@ def _doubts(fit: LineFit, planes: Planes, modes: Modes, warn: Callable[[str], No
     there = [line for line in modes if line is not None]
     for plane in (0, 1):
         if not (planes == plane).any():
-            warn(f"no monitor reads {'xy'[plane]}")
+            warn(f"no BPM reads {'xy'[plane]}")
     if not there:
         warn("no betatron line exceeds the noise")
     if len(there) != 1:
@@ -303,7 +303,7 @@ def _louder(turns: TurnByTurn, noise: Array) -> list[str]:
     typical = float(np.nanmedian(ratio))
     if 0.5 < typical < 2:
         return []
-    return [f"the residual noise is {typical:.2g} times the stated noise at a typical monitor"]
+    return [f"the residual noise is {typical:.2g} times the stated noise at a typical BPM"]
 
 
 SLOWEST = 0.02

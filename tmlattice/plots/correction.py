@@ -9,7 +9,7 @@ from tmlattice.correction.targets import TARGETS
 from tmlattice.plots.readings import AFTER, BEFORE
 from tmlattice.plots.strip import lattice_strip
 
-CAPTION = "At the BPMs now, and expected after the correction, with 68 % bands."
+CAPTION = "At the BPMs now, and expected after the correction, with 68 % intervals."
 
 
 def plot_correction(correction: Correction, figure: Figure | None = None) -> Figure:
@@ -31,8 +31,10 @@ def plot_correction(correction: Correction, figure: Figure | None = None) -> Fig
     for plane, ax in enumerate(axes):
         for values, colour, label in shown:
             middle, low, high = scale * np.array(values)[:, plane].T
-            ax.plot(correction.s, middle, ".-", color=colour, lw=0.9, ms=4, label=label)
-            ax.fill_between(correction.s, low, high, color=colour, alpha=0.25, lw=0)
+            ax.errorbar(
+                correction.s, middle, (middle - low, high - middle), color=colour, label=label,
+                fmt="o" if label == "now" else "s", ms=4, elinewidth=1, alpha=0.8,
+            )  # fmt: skip
         ax.axhline(0.0, color="k", lw=0.7)
         ax.set_ylabel(f"{target.words} {'xy'[plane]} [{unit}]", fontsize="small")
         ax.grid(alpha=0.25)

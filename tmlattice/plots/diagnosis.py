@@ -89,7 +89,7 @@ def _of_readings(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     if first is not None:
         yield (
             "scan-near",
-            "The same scan around the clearest finding, linear, with the monitors. Later findings "
+            "The same scan around the clearest finding, linear, with the BPMs. Later findings "
             "show only once this one is in the model.",
             plot_scan_near(diagnosis, first),
         )
@@ -224,7 +224,7 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
         if own.any():
             ax.plot(
                 s[own], found.statistic[own], linestyle="none", marker=".", color=colour,
-                ms=size, label=name, zorder=2,
+                ms=size, label=name.replace("monitors", "BPMs"), zorder=2,
             )  # fmt: skip
     named, kicks = thresholds(diagnosis)
     ax.axhline(
@@ -367,9 +367,9 @@ def gap_labels(diagnosis: Diagnosis) -> list[str]:
     """Labels of the held-out residuals: the design, then the errors added by each model."""
     steps = 0 if diagnosis.heldout is None else len(diagnosis.heldout.misfits)
     if diagnosis.priors:
-        return [diagnosis.ring.model, "+ distributed errors", "+ findings"][:steps]
+        return [diagnosis.starting_model, "+ distributed errors", "+ findings"][:steps]
     faults = (f"+ {find(c.effect).words} {c.element or ''}".rstrip() for c in diagnosis.faults)
-    return [diagnosis.ring.model, *faults][:steps]
+    return [diagnosis.starting_model, *faults][:steps]
 
 
 # --- credible set ---------------------------------------------------------------------------------

@@ -11,4 +11,5 @@ def brief(name: str) -> str:
 
 def plural(kind: str) -> str:
     """Of a kind of elements."""
+    kind = "BPM" if kind == "monitor" else kind
     return f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"

@@ -29,9 +29,10 @@ def plot_betas(
     """
     figure = plt.figure(figsize=(11, 4.2), layout="constrained") if figure is None else figure
     ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
+    s, beta = twiss.along()
     for plane, colour in enumerate(("C0", "C3")):
         name = "xy"[plane]
-        ax.plot(twiss.s, twiss.beta[:, plane], color=colour, linewidth=0.9, label=f"beta {name}")
+        ax.plot(s, beta[:, plane], color=colour, linewidth=0.9, label=f"beta {name}")
     ax.set_ylabel("beta [m]")
     ax.set_ylim(bottom=0)
     ax.grid(alpha=0.25)

@@ -26,7 +26,7 @@ def plot_parts(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
         s = np.array([places[diagnosis.ring[name].name] for name in part.monitors])
         order = np.argsort(s)
         before, after = np.maximum(part.left[:, order], 1e-2)
-        ax.plot(s[order], before, ".-", color=BEFORE, lw=0.8, ms=4, label=diagnosis.ring.model)
+        ax.plot(s[order], before, ".-", color=BEFORE, lw=0.8, ms=4, label=diagnosis.starting_model)
         ax.plot(s[order], after, ".-", color=AFTER, lw=0.8, ms=4, label="with the findings")
         ax.axhline(1.0, color="k", linestyle="--", linewidth=1)
         plain_log(ax)

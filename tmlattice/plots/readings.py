@@ -47,7 +47,7 @@ def readings_caption(diagnosis: Diagnosis) -> str:
         )
     return (
         "Readings of one shot of the fit, and what each model leaves of them. The launch of the "
-        "design is fitted to the monitors before the first finding alone, so that the gap is seen "
+        "design is fitted to the BPMs before the first finding alone, so that the gap is seen "
         "to begin there."
     )
 
@@ -92,11 +92,11 @@ def plot_readings(
     s = np.array([monitor.s for monitor in monitors])
     read, dropped = readings[shot, first], view.dropped[shot, first]
     grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
-    names = (diagnosis.ring.model, "with the findings")
+    names = (diagnosis.starting_model, "with the findings")
     styles = ((BEFORE, "-"), (AFTER, "-"))
     for plane, name in enumerate("xy"):
         orbit, residual = grid[2 * plane], grid[2 * plane + 1]
-        orbit.plot(s, 1e3 * read[:, plane], "k.", ms=3, label="read by the monitors")
+        orbit.plot(s, 1e3 * read[:, plane], "k.", ms=3, label="read by the BPMs")
         sigma = 1e3 * diagnosis.noise[plane]
         residual.axhspan(-2 * sigma, 2 * sigma, color="0.88", zorder=0, label="noise, 2 rms")
         texts = []
@@ -126,7 +126,7 @@ def plot_readings(
     )
     title = f"Shot {shot + 1} of the {len(readings)} of the fit"
     if before is not None:
-        title += f"; the {names[0]}'s launch from the {int(before.sum())} monitors before"
+        title += f"; the {names[0]}'s launch from the {int(before.sum())} BPMs before"
     grid[0].set_title(title, loc="left", fontsize="medium")
     lattice_strip(diagnosis.ring, grid[4])
     mark(grid[4], diagnosis)

@@ -18,7 +18,7 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         yield (
             "maps",
             "Orbit change by corrector and BPM, each corrector in its own plane: measured, and "
-            f"residuals of the {_before(result)} and of the result. Grey: rejected.",
+            f"residuals of the {result.starting_model} and of the result. Grey: rejected.",
             plot_maps(result),
         )
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
@@ -37,11 +37,6 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         )
 
 
-def _before(result: Diagnosis) -> str:
-    """What the fit began at."""
-    return "reference" if result.since_reference else result.ring.model
-
-
 def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Measured response, and what the design (or the reference) and the result leave of it; columns
     by plane and place."""
@@ -53,7 +48,7 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
     order = np.lexsort((place, plane))
     rows = [
         ("measured", view.data),
-        (f"measured - {_before(result)}", view.data - view.design),
+        (f"measured - {result.starting_model}", view.data - view.design),
         ("measured - result", view.data - view.model),
     ]
     axes = figure.subplots(3, 1, sharex=True)
@@ -70,7 +65,7 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
             interpolation="nearest",
         )  # fmt: skip
         ax.axvline(float((plane == 0).sum()) - 0.5, color="k", linewidth=0.8)
-        ax.set_ylabel("monitor")
+        ax.set_ylabel("BPM")
         ax.set_title(title, loc="left", fontsize=10)
         figure.colorbar(shown, ax=ax, label="µm")
     axes[-1].set_xlabel("corrector, along s: horizontal, then vertical")
@@ -86,7 +81,7 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
     shown = [k for k in np.argsort(plane, kind="stable") if not view.held[k]]
     axes = figure.subplots(1, 2, sharey=True)
     limit = 0.0
-    models = {_before(result): view.design, "result": view.model}
+    models = {result.starting_model: view.design, "result": view.model}
     for ax, (name, model) in zip(axes, models.items(), strict=True):
         left = 1e6 * (view.data - model)[shown][:, view.good]
         left = left[np.arange(len(shown)), :, plane[shown]]
@@ -96,7 +91,7 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
         ax.set_title(f"{name}: {rms:.3g} µm rms", loc="left", fontsize="medium")
         ax.set_xlabel("corrector: horizontal, then vertical")
         ax.locator_params(integer=True)
-    axes[0].set_ylabel("monitor, along the ring")
+    axes[0].set_ylabel("BPM, along the ring")
     figure.colorbar(image, ax=axes, label="measured less model [µm]")
     return figure
 
@@ -150,11 +145,11 @@ def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Beta of the result relative to the design, above the lattice."""
     figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
     ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
-    before, after = (twiss(r) for r in (result.ring, result.corrected))
+    (s, before), (_, after) = (twiss(r).along() for r in (result.ring, result.corrected))
     for plane, colour in enumerate(("C0", "C3")):
-        beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
-        ax.plot(before.s, beat, color=colour, linewidth=0.8, label="xy"[plane])
-    ax.set_ylabel(f"beta / {result.ring.model} - 1 [%]")
+        beat = 100 * (after[:, plane] / before[:, plane] - 1)
+        ax.plot(s, beat, color=colour, linewidth=0.8, label="xy"[plane])
+    ax.set_ylabel(f"beta / {result.starting_model} - 1 [%]")
     ax.grid(alpha=0.25)
     ax.legend(frameon=False)
     lattice_strip(result.ring, strip)

@@ -102,7 +102,7 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
         axes[plane].set_ylabel(f"{'xy'[plane]} [mm]")
         axes[plane].grid(alpha=0.25)
     if known is None:
-        axes[1].set_xlabel("monitor")
+        axes[1].set_xlabel("BPM")
     if len(axes[0].lines) <= MOST:
         axes[0].legend(
             fontsize="small", ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False

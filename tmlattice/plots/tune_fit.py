@@ -51,7 +51,7 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
     for plane, name in enumerate("xy"):
         orbit, residual = grid[2 * plane], grid[2 * plane + 1]
         measured = outcome.measured[:, plane]
-        plot_orbit(outcome.s, measured, orbit, "read by the monitors", "k.")
+        plot_orbit(outcome.s, measured, orbit, "read by the BPMs", "k.")
         plot_orbit(outcome.s, outcome.before[:, plane], orbit, "design network", "C0-")
         fitted = [m for m in reversed(outcome.methods) if m.fit is not None]  # the first on top
         for method in fitted:

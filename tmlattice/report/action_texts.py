@@ -13,6 +13,7 @@ from tmlattice.lattice import Ring
 from tmlattice.report.amounts import amount_text, probability_text, words
 
 _KINDS = {
+    "monitor": "BPM",
     "bend": "bending magnet",
     "hcorrector": "horizontal corrector",
     "vcorrector": "vertical corrector",

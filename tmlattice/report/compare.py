@@ -25,7 +25,7 @@ from tmlattice.lattice.ring import Errors
 from tmlattice.measurement import OrbitResponse, in_words
 from tmlattice.measurement.header import FORMAT as MEASUREMENT
 from tmlattice.optics import twiss
-from tmlattice.report.text import columns, verdict_sentence
+from tmlattice.report.text import WIDTH, columns, verdict_sentence, wrapped
 from tmlattice.speaks import Speaks
 
 _UNITS = {
@@ -112,13 +112,15 @@ class Differences(Speaks):
             "rows": [vars(row) | {"pull": row.pull} for row in self.rows],
         }
 
-    def report(self) -> str:
-        """The notes and the first rows as plain text."""
-        lines = [*self.notes]
+    def report(self, width: int = WIDTH, most: int | None = None) -> str:
+        """The notes and the first rows as plain text of so many columns, and of at most so many
+        lines where the notes leave room."""
+        lines = [line for note in self.notes for line in wrapped(note, "", width)]
         if not self.rows:
             return "\n".join([*lines, f"The two {self.kind} do not differ."])
         table = [("quantity", "element", "first", "second", "difference", "unit", "sigmas")]
-        for row in self.rows[:SHOWN]:
+        count = SHOWN if most is None else max(most - len(lines) - 5, 1)
+        for row in self.rows[:count]:
             error = f" ± {row.sigma:.2g}" if row.sigma > 0 else ""
             if row.quantity == ORBIT and error:
                 error = f" (noise {row.sigma:.2g})"
@@ -127,9 +129,9 @@ class Differences(Speaks):
                 _text(row.difference) + error if math.isfinite(row.difference) else "",
                 row.unit, f"{row.pull:.1f}" if math.isfinite(row.pull) else "",
             ))  # fmt: skip
-        lines += [f"first: {self.names[0]}, second: {self.names[1]}", "", *columns(table)]
-        if len(self.rows) > SHOWN:
-            lines.append(f"and {len(self.rows) - SHOWN} more rows (--json has all)")
+        lines += [f"first: {self.names[0]}, second: {self.names[1]}", "", *columns(table, width)]
+        if len(self.rows) > count:
+            lines.append(f"and {len(self.rows) - count} more rows (--json has all)")
         return "\n".join(lines)
 
 

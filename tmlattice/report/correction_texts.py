@@ -4,7 +4,7 @@ from math import isfinite
 
 from tmlattice.correction.result import Correction
 from tmlattice.correction.targets import TARGETS
-from tmlattice.report.text import columns, wrapped
+from tmlattice.report.text import WIDTH, columns, wrapped
 
 MOST = 20
 """Devices that are listed; the table has all."""
@@ -12,10 +12,10 @@ ROUNDING = 1e-6
 """Share of a tolerance below which an error is shown as 0: rounding of the optics."""
 
 
-def setting_rows(correction: Correction) -> list[list[str]]:
-    """Head and rows of the table of settings, the first `MOST`."""
+def setting_rows(correction: Correction, most: int = MOST) -> list[list[str]]:
+    """Head and rows of the table of the first settings."""
     rows = [["device", "present", "new", "change", "unit", "limits", "gain"]]
-    for setting in correction.settings[:MOST]:
+    for setting in correction.settings[:most]:
         knob = setting.knob
         ends = [f"{end:.6g}" if isfinite(end) else "" for end in (knob.low, knob.high)]
         limits = " to ".join(ends) if any(ends) else "-"
@@ -40,7 +40,7 @@ def expected_rows(correction: Correction) -> list[list[str]]:
             shown = [amount(name, value) for value in (now, then, low, high, reach, data)]
             words = target.words + ("" if name in correction.targets else " (no target)")
             rows.append([words, target.planes[plane], shown[0], shown[1],
-                         f"{shown[2]} to {shown[3]}", *shown[4:]])  # fmt: skip
+                         f"{shown[2].split(' ')[0]} to {shown[3]}", *shown[4:]])  # fmt: skip
     return rows
 
 
@@ -66,20 +66,22 @@ def gain_rows(correction: Correction) -> list[list[str]]:
     ]
 
 
-def correction_text(correction: Correction, width: int = 100) -> str:
-    """The whole report as plain text."""
+def correction_text(correction: Correction, width: int = WIDTH, most: int | None = None) -> str:
+    """The whole report as plain text of so many columns; with fewer settings where only so many
+    lines are wanted."""
     lines = wrapped(correction.words, "", width)
-    if correction.settings:
-        lines += ["", *columns(setting_rows(correction))]
-        if len(correction.settings) > MOST:
-            lines += [f"and {len(correction.settings) - MOST} more (settings.csv)"]
-    lines += ["", *columns(expected_rows(correction))]
+    more = ["", *columns(expected_rows(correction), width)]
     if correction.gains:
-        lines += ["", "Expected rms with the first devices:"]
-        lines += columns(gain_rows(correction))
+        more += ["", "Expected rms with the first devices:"]
+        more += columns(gain_rows(correction), width)
     for sentence in sentences(correction):
-        lines += ["", *wrapped(sentence, "", width)]
-    return "\n".join(lines)
+        more += ["", *wrapped(sentence, "", width)]
+    if correction.settings:
+        count = MOST if most is None else max(min(most - len(lines) - len(more) - 3, MOST), 1)
+        lines += ["", *columns(setting_rows(correction, count), width)]
+        if len(correction.settings) > count:
+            lines += [f"and {len(correction.settings) - count} more (settings.csv)"]
+    return "\n".join([*lines, *more])
 
 
 def sentences(correction: Correction) -> list[str]:

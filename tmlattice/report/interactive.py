@@ -239,10 +239,12 @@ def readings(diagnosis: Diagnosis) -> Figure:
     monitors = diagnosis.ring.monitors
     first = slice(0, len(monitors))
     read = np.where(data.valid, data.readings, np.nan)
-    models = {diagnosis.ring.model: (design_readings(diagnosis), BEFORE)}
+    models = {diagnosis.starting_model: (design_readings(diagnosis), BEFORE)}
     if diagnosis.verdict != "distributed":
         models["with the findings"] = (view.after, AFTER)
-    left = np.nan_to_num(read - models[diagnosis.ring.model][0]) ** 2 * data.active[:, None, None]
+    left = (
+        np.nan_to_num(read - models[diagnosis.starting_model][0]) ** 2 * data.active[:, None, None]
+    )
     shot = int(left.sum(axis=(1, 2)).argmax())
     s, names = zip(*((monitor.s, monitor.name) for monitor in monitors), strict=True)
     traces = []
@@ -273,7 +275,7 @@ def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
         order = np.argsort(s)
         names = [part.monitors[i] for i in order]
         for model, colour, left in zip(
-            (diagnosis.ring.model, "with the findings"), (BEFORE, AFTER), part.left, strict=True
+            (diagnosis.starting_model, "with the findings"), (BEFORE, AFTER), part.left, strict=True
         ):
             traces.append(
                 _trace(s[order], np.maximum(left[order], 1e-2), model, colour, text=names,
@@ -326,7 +328,8 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
         group = find(effect).group
         hover = [f"{found.hypotheses[i][1]}\n{_amount(effect, found.amount[i])}" for i in own]
         traces.append(
-            _trace(s[own], found.statistic[own], group, COLOURS[group], mode="markers", size=4,
+            _trace(s[own], found.statistic[own], group.replace("monitors", "BPMs"),
+                   COLOURS[group], mode="markers", size=4,
                    hover=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>fall of chi² %{{y}}",
                    text=hover, legendgroup=group, showlegend=group not in shown)
         )  # fmt: skip
@@ -426,18 +429,18 @@ def gradients(diagnosis: Diagnosis) -> Figure:
 
 def beta_beat(diagnosis: Diagnosis) -> Figure:
     """Beta of the estimated ring relative to the design's, along the ring."""
-    from tmlattice.beam.chain import Chain
     from tmlattice.optics import twiss
 
-    before, after = (twiss(Chain.from_ring(r)) for r in (diagnosis.ring, diagnosis.corrected))
-    names = ["start", *(magnet.name for magnet in diagnosis.ring.magnets)]
+    design = twiss(diagnosis.ring)
+    (s, before), (_, after) = design.along(), twiss(diagnosis.corrected).along()
+    names = np.array([*design.name, "end"])[np.searchsorted(design.s, s - 1e-9)]
     traces = []
     for plane, colour in enumerate(("C0", "C3")):
-        beat = 100 * (after.beta[:, plane] / before.beta[:, plane] - 1)
+        beat = 100 * (after[:, plane] / before[:, plane] - 1)
         name = "xy"[plane]
-        traces.append(_trace(before.s, beat, name, colour, text=names,
+        traces.append(_trace(s, beat, name, colour, text=names,
                              hover=f"<br>s = %{{x:.2f}} m<br>{name}: %{{y:+.3f}} %"))  # fmt: skip
-    return _above_strip(diagnosis, traces, f"beta / {diagnosis.ring.model} - 1 [%]")
+    return _above_strip(diagnosis, traces, f"beta / {diagnosis.starting_model} - 1 [%]")
 
 
 def _above_strip(diagnosis: Diagnosis, traces: Iterable[Figure], title: str) -> Figure:

@@ -19,6 +19,7 @@ from tmlattice.report.tables import (
 from tmlattice.report.text import (
     CORRELATED,
     SUSPECTS,
+    WIDTH,
     advice,
     columns,
     correlation_rows,
@@ -33,8 +34,6 @@ from tmlattice.report.text import (
     verdict_sentence,
     wrapped,
 )
-
-WIDTH = 100
 
 MOST = 8
 """Tunes that are listed; the page has all."""
@@ -96,19 +95,16 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
         yield _Part(9, "correlations", lines)
     if more := next_text(diagnosis) or advice(diagnosis):
         yield _Part(1, "next", wrapped(more, "Next: ", width))
-    lines = _gap_table(diagnosis)
+    lines = _gap_table(diagnosis, width)
     for topic in ("gap", "remainder"):
         lines += wrapped(diagnosis.assessment.sentence(topic), "", width)
     yield _Part(1, "validation", lines)
     if small := small_rows(diagnosis):
-        lines = ["Distributed errors:"]
-        size = max(len(name) for name, _ in small)
-        for name, text in small:
-            lines += wrapped(text, f"   {name:<{size}}   ", width)
+        lines = ["Distributed errors:", *columns([("effect", "rms"), *small], width)]
         yield _Part(6, "distributed errors", lines)
     if diagnosis.steps:
         if optics := optics_rows(diagnosis):
-            yield _Part(5, "optics", columns(optics))
+            yield _Part(5, "optics", columns(optics, width))
         paragraph: list[str] = []
         for line in [*steps_text(diagnosis, width), ""]:
             if line:
@@ -119,21 +115,21 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
     if diagnosis.verdict == "none":
         rows = sensitivity_rows(diagnosis, [n for n, e in CATALOGUE.items() if e.headline])
         if rows:
-            seen = "Detection limits, at half of the places of each effect:"
-            yield _Part(2, "sensitivity", [seen, *columns(rows, "   ")])
+            head = ("effect", "detection limit, at half of its places")
+            yield _Part(2, "sensitivity", columns([head, *rows], width))
     if large := large_text(diagnosis):
         yield _Part(3, "notes", wrapped(f"{LARGE_TITLE}: {large}", "Note: ", width))
     for warning in diagnosis.warnings:
         yield _Part(8, "notes", wrapped(warning, "Note: ", width))
 
 
-def _gap_table(diagnosis: Diagnosis) -> list[str]:
+def _gap_table(diagnosis: Diagnosis, width: int) -> list[str]:
     before, after = tune_texts(diagnosis)
     rows = [*gap_rows(diagnosis), ("fractional tunes Qx, Qy", before, after)]
     noise = noise_text(diagnosis)
-    lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows)
+    lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows, width)
     numbers = number_rows(diagnosis)
     if numbers:
-        lines += ["", *columns(numbers[: MOST + 1])]
+        lines += ["", *columns(numbers[: MOST + 1], width)]
         lines += [f"and {len(numbers) - MOST - 1} more"] if len(numbers) > MOST + 1 else []
     return lines

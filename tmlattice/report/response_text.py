@@ -22,7 +22,7 @@ PULLS = 4
 def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
     """Head and rows of the table of steps: effect (in the first step the model), parameters,
     held-out rms in µm."""
-    head = ("step", "parameters", "in-plane", "with jump", "coupling", "with roll", "RF", "chi2")
+    head = ("step", "amounts", "in-plane", "jump", "coupling", "roll", "RF", "chi2")
     rows: list[tuple[str, ...]] = [
         (
             (model if step.effect == "design" else "") or step.effect,
@@ -44,6 +44,8 @@ def three_digits(metres: float) -> str:
     return f"{1e6 * metres:.3g}" if np.isfinite(metres) else ""
 
 
+OUT = "excluded"
+"""Of a hypothesis that does not improve held-out readings."""
 HYPOTHESIS = (
     "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "on top", "random",
     "so",
@@ -80,7 +82,7 @@ def largest(result: Diagnosis, effect: str) -> list[str]:
     return [
         f"{all_of([place.element for place in places], result.devices)} "
         f"{amount_text(effect, places[0].amount, sigma)} "
-        f"({100 * supports[places[0].element].share_from_data:.0f} % from the data)"
+        f"({100 * supports[places[0].element].share_from_data:.0f} %)"
         for places, sigma in rows[:SHOWN]
     ]
 
@@ -89,16 +91,18 @@ def undetermined(result: Diagnosis, effect: str) -> str:
     """Amounts of an effect that the data do not determine, with what they are degenerate with;
     empty if there are none."""
     supports = _supports_of(result, effect)
-    names = [
-        (all_of([own.element for own in places], result.devices), supports[places[0].element])
-        for places, _ in _numbers_of(result, effect)
-        if not supports[places[0].element].determined
+    by_reason: dict[str, list[str]] = {}
+    for places, _ in _numbers_of(result, effect):
+        if not (own := supports[places[0].element]).determined:
+            name = all_of([place.element for place in places], result.devices)
+            by_reason.setdefault(degenerate_text(effect, own), []).append(name)
+    said = [
+        f"{', '.join(names[:SHOWN])}{f' and {len(names) - SHOWN} more' * (len(names) > SHOWN)} "
+        f"({reason})"
+        for reason, names in by_reason.items()
     ]
-    if not names:
-        return ""
-    said = [f"{name} ({degenerate_text(effect, own)})" for name, own in names[:SHOWN]]
-    more = f"; and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return f"{NOT_DETERMINED}: {'; '.join(said)}{more}"
+    more = f"; and {len(said) - SHOWN} more" if len(said) > SHOWN else ""
+    return f"{NOT_DETERMINED}: {'; '.join(said[:SHOWN])}{more}" if said else ""
 
 
 NOT_DETERMINED = "not determined by the data"
@@ -125,7 +129,8 @@ def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
         said = f"{words(effect)}: {len(found)}"
         if amounts:
             rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
-            said += f", {len(amounts)} determined by the data, rms {rms}; largest:"
+            said += f", {len(amounts)} determined by the data, rms {rms}; "
+            said += "largest (share from the data):"
         parts = ["; ".join(largest(result, effect)), undetermined(result, effect)]
         rows.append((said, ". ".join(part for part in parts if part)))
     return rows
@@ -185,6 +190,7 @@ def common_factors_sentence(result: Diagnosis) -> str:
 
 INSTEAD = "Alternative common factors of the same gradients:"
 OUTLIERS = "Outliers, for which a fault other than a gradient error is likely:"
+MISSING = "Missing effects: held-out rms in µm, each alone, and on top of those that improve:"
 REJECTED = "Rejected, because they increase the held-out residual or their amount is implausible:"
 
 
@@ -262,11 +268,11 @@ def bad_monitors_text(result: Diagnosis) -> str:
 
 def steps_text(result: Diagnosis, width: int) -> list[str]:
     """The section of the plain text, as lines."""
-    lines = ["Held-out correctors, rms in µm (chi2 per reading):"]
-    lines += columns(step_rows(result.steps, result.ring.model), right=True)
+    lines = wrapped("Held-out correctors, rms in µm (chi2 per reading):", "", width)
+    lines += columns(step_rows(result.steps, result.starting_model), width, right=True)
     if result.rejected_steps:
-        lines += ["", REJECTED]
-        lines += columns(step_rows(result.rejected_steps), right=True)
+        lines += ["", *wrapped(REJECTED, "", width)]
+        lines += columns(step_rows(result.rejected_steps), width, right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.common_factors is not None:
         lines += ["", "Common factors of the gradients:"]
@@ -276,12 +282,12 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
         lines += wrapped(common_factors_sentence(result), "", width)
         instead = instead_texts(result)
         if instead:
-            lines += ["", INSTEAD]
+            lines += ["", *wrapped(INSTEAD, "", width)]
             for text in instead:
                 lines += wrapped(text, "   ", width)
         outliers = outlier_texts(result)
         if outliers:
-            lines += ["", OUTLIERS]
+            lines += ["", *wrapped(OUTLIERS, "", width)]
             for text in outliers:
                 lines += wrapped(text, "   ", width)
         for i, text in enumerate(inconsistency_texts(result)):
@@ -290,11 +296,11 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
         lines += ["", *wrapped(said, "", width), *wrapped(amounts, "   ", width)]
     lines += ["", *wrapped(left_sentence(result), "", width)]
     if result.hypotheses:
-        lines += [
-            "",
-            "Missing effects: held-out rms in µm, each alone, and on top of those that improve:",
-        ]
-        lines += columns(hypothesis_rows(result), right=True)
+        lines += ["", *wrapped(MISSING, "", width)]
+        head, *rows = hypothesis_rows(result)
+        lines += columns([head, *(row for row in rows if row[-1] != OUT)], width, right=True)
+        out = "; ".join(row[0] for row in rows if row[-1] == OUT)
+        lines += wrapped(f"{OUT.capitalize()}: {out}." if out else "", "", width)
     for said in result.degenerate:
         lines += wrapped(f"Not determined by the data: {said}.", "", width)
     return lines

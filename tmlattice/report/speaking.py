@@ -16,12 +16,14 @@ from tmlattice.files import output_folder, write_json
 from tmlattice.lattice import load_ring, save_ring
 from tmlattice.report.correction_texts import correction_text
 from tmlattice.report.page import correction_page, draw, page, pictures_in
-from tmlattice.report.plain import WIDTH, report_text
+from tmlattice.report.plain import report_text
+from tmlattice.report.text import WIDTH
 
 
-def report(diagnosis: Diagnosis, width: int = WIDTH) -> str:
-    """The report as plain text, as `tmlattice diagnose` prints it."""
-    return report_text(diagnosis, width)
+def report(diagnosis: Diagnosis, width: int = WIDTH, most: int | None = None) -> str:
+    """The report as plain text of so many columns, as `tmlattice diagnose` prints it; the most
+    important parts of it where only so many lines are wanted."""
+    return report_text(diagnosis, width, most)
 
 
 def save(diagnosis: Diagnosis, folder: str | PathLike[str]) -> Path:

@@ -18,7 +18,7 @@ from tmlattice.report.action_texts import SETTLED
 from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
 from tmlattice.report.text import times_usual
 
-TITLES = {"monitors": "Monitors", "correctors": "Correctors"}
+TITLES = {"monitors": "BPMs", "correctors": "Correctors"}
 """Titles by the group of an effect; all other elements are magnets."""
 
 Supported = tuple[Cause, float, Support]
@@ -129,7 +129,7 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
     tunes = pair(beams.design, 1, 5), pair(None if beams.found is None else beams.found.tunes, 1, 5)
     return [
-        ("stored beam on energy", diagnosis.ring.model, "estimated"),
+        ("stored beam on energy", diagnosis.starting_model, "estimated"),
         ("fractional tunes, x / y", *tunes),
         row("beta beating, rms [%]", "beta_beat_rms", 100, 2),
         row("beta beating, largest [%]", "beta_beat_max", 100, 2),
@@ -157,7 +157,7 @@ def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
                 for value in (number.read, number.before, number.after, number.error)
             )
             rows.append((name, f"{read} ± {error}", *models))
-    return [("tunes", "read", diagnosis.ring.model, "estimated"), *rows] if rows else []
+    return [("tunes", "read", diagnosis.starting_model, "estimated"), *rows] if rows else []
 
 
 LARGE = 3.0

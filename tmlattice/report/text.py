@@ -3,8 +3,10 @@
 The same sentences and rows are in the terminal (`plain.report_text`) and in the HTML page.
 """
 
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 
 import numpy as np
 
@@ -68,10 +70,10 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             times = times_usual(diagnosis, name)
             ratio = ", not determined by these readings"
             if name not in diagnosis.prior_errors:
-                ratio = ", as stated"
+                ratio = ", given, not estimated"
             elif times is not None:
                 ratio = f", {times:.2g} times the usual one"
-            rows.append((words(name), f"{amount_text(name, rms)} rms{ratio}"))
+            rows.append((words(name), f"{amount_text(name, rms)}{ratio}"))
     return rows
 
 
@@ -289,10 +291,8 @@ MOST = 6
 def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Head and rows of the residuals of fitted and held-out readings, before and after: rms in µm
     and chi-square per reading."""
-    model, gap = diagnosis.ring.model, diagnosis.heldout
-    if diagnosis.since_reference:
-        model = "reference"
-    elif gap is not None and gap.baseline:
+    model, gap = diagnosis.starting_model, diagnosis.heldout
+    if gap is not None and gap.baseline and not diagnosis.since_reference:
         model = f"{model} with distributed errors" if diagnosis.priors else "before"
     what = "correctors" if diagnosis.by_steps else "readings" if diagnosis.parts else "shots"
     rows = [(f"{what} of the fit", diagnosis.fit_before, diagnosis.fit_after)]
@@ -399,17 +399,51 @@ def correlation_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 
 # --- lines of text --------------------------------------------------------------------------------
-def columns(rows: Sequence[Sequence[str]], indent: str = "", *, right: bool = False) -> list[str]:
-    """Cells in aligned columns; all but the first aligned to the right, or all to the left."""
-    sizes = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        indent
-        + "   ".join(
-            cell.rjust(size) if right and i else cell.ljust(size)
-            for i, (cell, size) in enumerate(zip(row, sizes, strict=True))
-        ).rstrip()
-        for row in rows
+WIDTH = 100
+"""Columns of a report that is not for a terminal."""
+BOUND = re.compile(
+    r"(?<=\d) (?=(?:±|%|[mµ]?m|to)(?: |$))|(?<=±) |(?<=[%m]) (?=to )|(?<= to) (?=\d)"
+)
+"""Blanks of a cell that break no line: of a number, its error and its unit, and of an interval."""
+
+
+def columns(rows: Sequence[Sequence[str]], width: int, *, right: bool = False) -> list[str]:
+    """Cells in aligned columns of this width together; all but the first aligned to the right, or
+    all to the left. The widest columns are wrapped; where words leave no room for that, each row
+    is a list of its cells, each after its head, which the first row holds."""
+    rows = [[BOUND.sub("\u00a0", cell) for cell in row] for row in rows]
+    sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    least = [
+        max(len(word) for cell in column for word in cell.split(" "))
+        for column in zip(*rows, strict=True)
     ]
+    gaps = len(sizes) - 1
+    gap = next((gap for gap in (3, 2, 1) if sum(least) + gap * gaps <= width), 0)
+    if not gap:
+        head, *others = rows
+        return [
+            line
+            for name, *cells in others
+            for label, text in [("", name), *zip(head[1:], cells, strict=True)]
+            if text
+            for line in wrapped(f"{label}: {text}" if label else text, "  " * bool(label), width)
+        ]
+    while sum(sizes) + gap * gaps > width:
+        spare = [size > low and size for size, low in zip(sizes, least, strict=True)]
+        sizes[spare.index(max(spare))] -= 1
+    lines = []
+    for row in rows:
+        cells = [wrapped(cell, "", max(size, 1)) for cell, size in zip(row, sizes, strict=True)]
+        lines += [
+            (" " * gap)
+            .join(
+                text.rjust(size) if right and i else text.ljust(size)
+                for i, (text, size) in enumerate(zip(texts, sizes, strict=True))
+            )
+            .rstrip()
+            for texts in zip_longest(*cells, fillvalue="")
+        ]
+    return [line.replace("\u00a0", " ") for line in lines]
 
 
 def wrapped(text: str, label: str, width: int) -> list[str]:

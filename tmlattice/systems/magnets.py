@@ -268,7 +268,7 @@ def comparisons(done: MagnetStudy) -> list[Comparison]:
         x, y = turn.rms()
         rows.append(
             Comparison(f"third order in one turn from x = y = {1e3 * turn.launch[0]:g} mm: "
-                       "rms over monitors, x / y [µm]", None, f"{1e6 * x:.3f} / {1e6 * y:.3f}",
+                       "rms over BPMs, x / y [µm]", None, f"{1e6 * x:.3f} / {1e6 * y:.3f}",
                        "bodies and drifts in third order; bends' edges stay of second")
         )  # fmt: skip
     defect = max(float(np.abs(part).max()) for part in done.henon.symplectic_defect())

@@ -154,7 +154,7 @@ def _degenerate(state: State, there: Linear, posterior: Posterior) -> tuple[str,
     if scale.any() and kick.any():  # both are fitted
         both = float(scale @ kick / np.sqrt((scale @ scale) * (kick @ kick)))
         messages.append(
-            f"mean monitor gain against mean corrector scale: known to "
+            "mean BPM gain against mean corrector scale: known to "
             f"{100 * np.sqrt(scale @ scale):.2f} % by the RF step and the priors, correlation "
             f"{both:+.2f}"
         )

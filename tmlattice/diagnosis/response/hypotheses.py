@@ -239,7 +239,7 @@ def _nonlinear(state: State) -> Hypothesis:
     """Cubic BPMs with two-sided steps: x^3 / 4 of the whole change."""
     cubes = state.data.pick(state.at.read) ** 3 / 4 / MILLIMETRE**2
     rows = np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
-    return Hypothesis("nonlinear monitors (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
+    return Hypothesis("nonlinear BPMs (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
 
 
 def _gradients(state: State, name: str, effect: str, kind: str, most: float) -> Hypothesis | None:
@@ -274,7 +274,7 @@ def _monitor_position(state: State) -> Hypothesis:
     rows = np.zeros((len(state.data.at), *flat.shape))
     for i in range(len(rows)):
         rows[i, :, i] = flat[:, i]
-    return Hypothesis("monitors displaced in s", "m", "< 0.01 m", rows, most=0.01)
+    return Hypothesis("BPMs displaced in s", "m", "< 0.01 m", rows, most=0.01)
 
 
 def _bend_gradient(state: State) -> Hypothesis:
