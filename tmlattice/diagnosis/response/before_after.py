@@ -90,7 +90,7 @@ def diagnose_change(
         ring: the design.
         before, after: of the same machine; correctors and BPMs of only one of them are excluded.
         holdout: share of the correctors that validate the gap; amounts are fitted to all of them.
-        effects: only changes of these are sought.
+        effects: only errors and changes of these are sought; None: all.
         max_effects: most findings.
         false_alarm: probability of a finding in two measurements of an unchanged machine.
         assume: what is recorded wrongly everywhere in both, see `measurement.assume`.
@@ -120,7 +120,7 @@ def diagnose_change(
     before, first, swaps_before = all_right(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    steps = () if same else STEPS
+    steps = () if same else trials_of(effects, STEPS)
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
     orbit_kicks = fitted_orbit_kicks(fitted.at)
     messages += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]

@@ -241,23 +241,39 @@ def _needed(
     state: State, trials: Collection[Trial], most: int, progress: Callable[[str], Any]
 ) -> tuple[State, list[Trial], list[str]]:
     """The state with the needed families alone, `most` trials at most; the rejected trials; and
-    messages about implausible ones."""
+    messages about implausible ones.
+
+    The least needed one by the linearised evidence is tested first. Once one is removed, those that
+    were not tested are linearised again."""
     there = {family.name for family in state.families}
-    needed = [own for own in trials if there & {family.name for family in own.families}]
-    gone = [own for own in trials if own not in needed]
+    untested = [own for own in trials if there & {family.name for family in own.families}]
+    gone = [own for own in trials if own not in untested]
     doubts: list[str] = []
-    worth, without = _worth(state, needed, progress)
-    while worth and (min(worth.values()) <= 0 or len(worth) > most):
-        least = min(worth, key=lambda trial: worth[trial])
-        doubts += _doubts(state, least)
-        state = without[least] if least in without else _without(state, least)
+    worth: dict[Trial, float] = {}
+    removed = True
+    while untested:
+        if removed:
+            linear_worth, rejected = _quickly(state, untested, progress)
+            sure = [own for own in untested if linear_worth[own] > SURE and not rejected[own]]
+            worth |= {own: linear_worth[own] for own in sure}
+            untested = sorted(
+                (own for own in untested if own not in worth), key=lambda own: linear_worth[own]
+            )
+            if not untested:
+                break
+            whole = evidence_of(state, state.good, state.independent)
+        least = untested.pop(0)
+        progress(f"without {_title(least)}")
+        worth[least], without = _tested(state, least, linear_worth[least], whole)
+        removed = without is not None and worth[least] <= 0
+        if without is not None and removed:
+            doubts += _doubts(state, least)
+            gone.append(least)
+            del worth[least]
+            state = without
+    for least in sorted(worth, key=lambda own: worth[own])[: max(len(worth) - most, 0)]:
+        state = _without(state, least)
         gone.append(least)
-        del worth[least]
-        unsure = [trial for trial, own in worth.items() if own <= 0]
-        without = {}
-        if unsure:
-            again, without = _worth(state, unsure, progress)
-            worth |= again
     return state, gone, doubts
 
 
@@ -330,54 +346,39 @@ def _blocks(trial: Trial) -> list[int]:
     return [1] * (trial.across > 0) + [0] * (trial.own > 0)
 
 
-def _worth(
-    state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
-) -> tuple[dict[Trial, float], dict[Trial, State]]:
-    """Log evidence beyond `LEAST` of each trial (0 or less: not needed), and the states without it.
+def _tested(
+    state: State, trial: Trial, linear_worth: float, whole: Evidence
+) -> tuple[float, State | None]:
+    """Log evidence beyond `LEAST` of a trial (0 or less: not needed), and the state without it;
+    None if no beam is stored without it.
 
     Validation has a veto, because the evidence assumes independent readings, and model discrepancy
-    is not. Where validation and the linearised evidence both favour a family, the latter decides,
+    is not. Where it favours a family, any evidence suffices, that of the linearised fit too,
     because the costs of two separate fits agree only to a share of their size.
     """
-    worth, rejected = _quickly(state, trials, progress)
-    doubtful = [
-        trial for trial, unwanted in rejected.items()
-        if worth[trial] > -np.inf and (unwanted or not worth[trial] > SURE)
-    ]  # fmt: skip
-    states: dict[Trial, State] = {}
-    if not doubtful:
-        return worth, states
+    try:
+        without = _without(state, trial)
+    except TmlatticeError:  # no closed orbit without it
+        return np.inf, None
+    if linear_worth == -np.inf:
+        return linear_worth, without
+    good = state.good & without.good
     shares = state.independent
-    whole = evidence_of(state, state.good, shares)
+    with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
+    other = evidence_of(without, good, shares)
+    gained = with_it.log - other.log - LEAST
+    messages = lost(
+        inner(replace(without, good=good), _of_rf(other)),
+        inner(replace(state, good=good), _of_rf(with_it)),
+    )
+    log.info("without %s: evidence %+.1f, validation %+.3f +- %.3f", _title(trial), -gained,
+             *messages)  # fmt: skip
     unsure = ROUGH * np.count_nonzero(np.isfinite(state.data.orbits[state.fitted])) / 2
-    for trial in doubtful:
-        progress(f"without {_title(trial)}")
-        try:
-            without = states[trial] = _without(state, trial)
-        except TmlatticeError:  # no closed orbit without it
-            worth[trial] = np.inf
-            continue
-        good = state.good & without.good
-        with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
-        other = evidence_of(without, good, shares)
-        gained = with_it.log - other.log - LEAST
-        messages = lost(
-            inner(replace(without, good=good), _of_rf(other)),
-            inner(replace(state, good=good), _of_rf(with_it)),
-        )
-        log.info(
-            "without %s: evidence %+.1f, validation %+.3f +- %.3f",
-            _title(trial),
-            -gained,
-            *messages,
-        )
-        if not _asked(trial):
-            worth[trial] = gained
-        elif against(messages):
-            worth[trial] = min(gained, messages[0])
-        elif not (in_favour(messages) and worth[trial] > gained > -unsure):
-            worth[trial] = gained
-    return worth, states
+    if _asked(trial) and against(messages):
+        gained = min(gained, messages[0])
+    elif _asked(trial) and in_favour(messages) and gained > -unsure:
+        gained = max(gained, linear_worth) + LEAST
+    return gained, without
 
 
 def _doubts(state: State, trial: Trial) -> list[str]:
@@ -418,10 +419,8 @@ def _quickly(
     validated = inner(state, of_rf)
     for trial in trials:
         progress(f"is {_title(trial)} needed")
-        if not any(state.values[family.variable].any() for family in trial.families):
-            worth[trial], unwanted[trial] = -LEAST, False  # held at zero: nothing is lost without
-            continue
-        if _doubts(state, trial):
+        at_zero = not any(state.values[family.variable].any() for family in trial.families)
+        if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
             worth[trial], unwanted[trial] = -np.inf, False
             continue
         block = trial.families[0].block
