@@ -433,7 +433,8 @@ def beta_beat(diagnosis: Diagnosis) -> Figure:
 
     design = twiss(diagnosis.ring)
     (s, before), (_, after) = design.along(), twiss(diagnosis.corrected).along()
-    names = np.array([*design.name, "end"])[np.searchsorted(design.s, s - 1e-9)]
+    ends = [*design.name, "end"]
+    names = [ends[i] for i in np.searchsorted(design.s, s - 1e-9)]
     traces = []
     for plane, colour in enumerate(("C0", "C3")):
         beat = 100 * (after[:, plane] / before[:, plane] - 1)
