@@ -20,7 +20,8 @@ beating, dispersion, tunes, coupling. Compared with
 A line a case is written as it comes, with its study (lattice, kind, knobs); cases that FILE has
 already are not measured again.
 `--keep FOLDER` keeps measurements and diagnoses (the package's own pickles), for the next run to
-start from. `--summary FILE` prints the table of such a file.
+start from. `--summary FILE` prints the table of such a file. `--sigmas 0 1.5 2` corrects with each
+of these values of `solve.SIGMAS` too, and prints what never being worse costs.
 """
 
 import argparse
@@ -31,12 +32,14 @@ import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import at
 import numpy as np
+from scipy.stats import norm
 
 from tmlattice import diagnose, load_ring
-from tmlattice.correction import correct, default_knobs
+from tmlattice.correction import correct, default_knobs, solve
 from tmlattice.correction.estimate import estimate_of, estimate_with
 from tmlattice.correction.targets import ENERGY, Targets
 from tmlattice.effects import Cause, RingEffect, apply, background_rms, find
@@ -261,6 +264,11 @@ def case(ring, seed, options):
               "devices": len(own.settings), "now": own.before, "expected": own.after,
               "iterations": own.iterations,
               "at_limit": sum(s.at_limit for s in own.settings)}  # fmt: skip
+    if options.sigmas:
+        found["prices"] = {
+            f"{n:g}": price(estimate, knobs, n, lambda c: left(of_settings(c, made))["square"])
+            for n in options.sigmas
+        }
     truth = estimate_with(apply(ring, on_ring), ring, None)
     best = correct(truth, knobs=[replace(k, error=0.0) for k in knobs], targets=OPTICS)
     found["oracle"] = left(of_settings(best))
@@ -279,6 +287,26 @@ def case(ring, seed, options):
         found["loco"] = min((f for f in fits if f), key=lambda one: one["square"], default=None)
         found["loco_cuts"] = [f and f["square"] for f in fits]
     return found
+
+
+def price(estimate, knobs, sigmas, square):
+    """The square, whether nothing is set, and the chance to be worse, of a correction whose gain is
+    this many standard deviations above zero."""
+    with mock.patch.object(solve, "SIGMAS", sigmas):
+        found = correct(estimate, knobs=knobs, targets=OPTICS)
+    chance = 0.0 if found.refused else norm.sf(found.gain / found.gain_error)
+    return [square(found), bool(found.refused), float(chance)]
+
+
+def prices(rows):
+    """Print the table of `price` as Markdown."""
+    print("| standard deviations | median after | nothing set | worse than before "
+          "| expected by the posterior |\n" + "|---" * 5 + "|")  # fmt: skip
+    before = np.array([row["before"]["square"] for row in rows])
+    for sigmas in rows[0]["prices"]:
+        after, refused, chance = np.array([row["prices"][sigmas] for row in rows]).T
+        print(f"| {sigmas} | {np.median(after):.3g} | {refused.sum():.0f} "
+              f"| {np.sum(after > before)} | {chance.sum():.2g} |")  # fmt: skip
 
 
 def beat(one):
@@ -334,6 +362,7 @@ def main() -> None:
     arguments.add_argument("--knobs", default="supplies")
     arguments.add_argument("--correctors", default=None, help="patterns, as `load_ring` takes them")
     arguments.add_argument("--monitors", default=None)
+    arguments.add_argument("--sigmas", type=float, nargs="+", default=())
     arguments.add_argument("--out", type=Path)
     arguments.add_argument("--keep", type=Path, help="folder of diagnoses, for another correction")
     arguments.add_argument("--alone", action="store_true", help="without SVD and LOCO")
@@ -375,6 +404,8 @@ def main() -> None:
                 short = json.loads(json.dumps(row), parse_float=lambda n: float(f"{float(n):.4g}"))
                 file.write(json.dumps(short) + "\n")
     summary(rows)
+    if options.sigmas and rows:
+        prices(rows)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,24 @@
 """Machines whose first turn is lost, steered until the beam circulates; AT is the machine.
 
-`python benchmarks/threading_beam.py LATTICE [--cases 20] [--offset 3e-3] [--out FILE.jsonl]`
+`python benchmarks/threading_beam.py LATTICE [--machines 50] [--offset 2e-3] [--out FILE.jsonl]`
 
 Each machine has all usual errors of the catalogue, and quadrupoles displaced by `--offset` rms, m.
-Machines whose beam completes the first turn are not counted. Six shots are read as far as the beam
-gets, diagnosed, and corrected with the target `first_turn`; then again from the estimated ring,
-`--rounds` times at most.
-The oracle knows all errors. A beam circulates if it is launched on the axis and read on 20 turns.
+Machines whose beam completes the first turn are not counted. Six shots of two turns are read as far
+as the beam gets, diagnosed, and corrected with the target `first_turn`; then again from the
+estimated ring and its posterior, `--rounds` times at most. Where a diagnosis refuses its data,
+the machine is measured again, as a round.
+The oracle knows all errors of the ring. A beam circulates if it is launched on the axis and read on
+20 turns. Machines that FILE has already are not measured again.
 """
 
 import argparse
 import json
 import logging
+import subprocess
+import time
 import warnings
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,21 +31,25 @@ from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.shots import draw_background
 from tmlattice.machine.simulate import simulate
 
-TURNS = 20
+TURNS, SHOTS = 20, 6
 TARGET = ["first_turn"]
 
 
-def turns(ring, causes):
-    """Turns that a beam on the axis completes."""
-    readings = AtEngine(ring, causes).track(np.zeros((1, 6)), TURNS)[0]
+def turns(ring, causes, kicks):
+    """Turns that a beam on the axis completes with these kicks of the correctors."""
+    readings = AtEngine(ring, causes).track(np.zeros((1, 6)), TURNS, [settings(kicks)])[0]
     alive = np.isfinite(readings).all(axis=-1).ravel()
     return TURNS * float(np.mean(np.cumsum(~alive) == 0))
 
 
-def set_to(ring, correction):
-    """The ring with the new settings of its correctors."""
-    return apply(ring, [Cause(f"corrector_kick_{'xy'['h' not in s.knob.kind[0]]}", s.knob.name,
-                              s.new - s.knob.present) for s in correction.settings])  # fmt: skip
+def settings(kicks):
+    """Of a shot."""
+    return {name: {"kick": kick} for name, kick in kicks.items()}
+
+
+def changes(correction):
+    """Change of each corrector's kick, rad."""
+    return {s.knob.name: s.new - s.knob.present for s in correction.settings}
 
 
 def case(ring, seed, options):
@@ -48,23 +58,29 @@ def case(ring, seed, options):
     usual |= {f"quadrupole_offset_{plane}": options.offset for plane in "xy"}
     causes = draw_background(ring, usual, seed)
     on_ring = [c for c in causes if isinstance(find(c.effect), RingEffect)]
-    before = turns(ring, on_ring)
+    before = turns(ring, on_ring, {})
     if before >= 1:
         return None
-    best = correct(apply(ring, on_ring), goal=ring, targets=TARGET)
-    found = {"seed": seed, "before": before, "rounds": [],
-             "oracle": turns(set_to(ring, best), on_ring)}  # fmt: skip
-    now = model = ring  # with the kicks that were set; and with the errors that were estimated
-    for shift in range(options.rounds):
+    best = changes(correct(apply(ring, on_ring), goal=ring, targets=TARGET))
+    found = {"seed": seed, "before": round(before, 3), "rounds": [],
+             "oracle": turns(ring, on_ring, best)}  # fmt: skip
+    kicks, model, known = Counter(), ring, None
+    for number in range(options.rounds):
+        data = simulate(ring, causes, settings=[settings(kicks)] * SHOTS, shots=SHOTS, turns=2,
+                        seed=1000 * seed + number).measurement()  # fmt: skip
         try:
-            data = simulate(now, causes, seed=1000 * seed + shift).measurement()
-            estimate = estimate_of(diagnose(model, data))
-            own = correct(estimate, goal=ring, targets=TARGET)
-            now, model = set_to(now, own), set_to(estimate.ring, own)
+            estimate = estimate_of(diagnose(model, replace(data, settings=()), known=known))
+            own = changes(correct(estimate, targets=TARGET))
         except TmlatticeError as error:
-            found["stopped"] = str(error)
-            break
-        found["rounds"].append(turns(now, on_ring))
+            found.setdefault("refused", {})[number] = str(error)
+            continue  # and measure again
+        kicks.update(own)
+        model = apply(estimate.ring, [
+            Cause(f"corrector_kick_{'xy'['h' not in ring[name].kind[0]]}", name, kick)
+            for name, kick in own.items()
+        ])  # fmt: skip
+        known = estimate.linearised
+        found["rounds"].append(round(turns(ring, on_ring, kicks), 3))
         if found["rounds"][-1] >= TURNS:
             break
     return found
@@ -83,19 +99,32 @@ def summary(rows):
 def main() -> None:
     """Measure, and print the summary."""
     arguments = argparse.ArgumentParser()
-    arguments.add_argument("lattice")
-    arguments.add_argument("--cases", type=int, default=20)
-    arguments.add_argument("--offset", type=float, default=3e-3)
-    arguments.add_argument("--rounds", type=int, default=3)
+    arguments.add_argument("lattice", type=Path)
+    arguments.add_argument("--machines", type=int, default=50)
+    arguments.add_argument("--offset", type=float, default=2e-3)
+    arguments.add_argument("--rounds", type=int, default=8)
     arguments.add_argument("--out", type=Path)
     options = arguments.parse_args()
     warnings.simplefilter("ignore")
     logging.disable(logging.WARNING)
     ring, rows = load_ring(options.lattice), []
-    for seed in range(options.cases):
+    name = options.lattice.absolute()
+    study = {"ring": name.parent.name if name.stem == "lattice" else name.stem,
+             "offset": options.offset}  # fmt: skip
+    if options.out and options.out.is_file():
+        rows = [json.loads(line) for line in options.out.read_text().splitlines()]
+        rows = [row for row in rows if study.items() <= row.items()]
+    commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent,
+                            text=True, stdout=subprocess.PIPE, check=False).stdout  # fmt: skip
+    seed = max((row["seed"] for row in rows), default=-1)
+    while len(rows) < options.machines:
+        seed += 1
+        begun = time.process_time()
         row = case(ring, seed, options)
         if row is None:
             continue
+        row = {**study, **row, "seconds": round(time.process_time() - begun, 1),
+               "commit": commit.strip()}  # fmt: skip
         rows.append(row)
         print(row, flush=True)
         if options.out:

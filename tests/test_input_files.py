@@ -281,10 +281,10 @@ def superkekb(path):
     path.write_text("{" + ",\n".join(rows) + "}\n")
 
 
-def madng(path):
+def madng(path, kind="madng"):
     x, y = tables()
     data = TbtData([TransverseData(X=x, Y=y)], bunch_ids=[0], nturns=TURNS)
-    turn_by_turn.write(path, data, datatype="madng")
+    turn_by_turn.write(path, data, datatype=kind)
 
 
 def trackone(path):
@@ -296,6 +296,18 @@ def trackone(path):
             lines.append(f"#segment 2 {TURNS + 1} 1 1 {name}")
             lines.append(f" 1 {turn + 1} {x.loc[name, turn]} 0 {y.loc[name, turn]} 0 0 0 1 1")
     path.write_text("\n".join(lines) + "\n")
+
+
+def test_turns_that_were_never_written_are_refused(tmp_path):
+    path = tmp_path / "turns.h5"
+    madng(path, "doros")
+    assert read_turn_by_turn(path, "doros").readings.shape[1] == TURNS
+    with h5py.File(path, "r+") as file:
+        name = f"{tables()[0].index[0]}/horOscillationData"
+        del file[name]
+        file.create_dataset(name, (TURNS,), "f8")
+    with pytest.raises(MeasurementError, match="horOscillationData' was never written"):
+        read_turn_by_turn(path, "doros")
 
 
 @pytest.mark.parametrize("write", [superkekb, madng, trackone])

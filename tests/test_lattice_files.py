@@ -312,6 +312,7 @@ def test_own_json_keeps_every_map_to_the_bit(tmp_path, request, which, dimension
         ),
         (lambda c: c["sequence"].append("q?"), "'q\\?', which has no definition"),
         (lambda c: c.update(energy_gev=0), "energy_gev"),
+        (lambda c: c.update(changes={"qx::0": {"k1": 1.0}}), "'changes' has 'qx::0', which is no"),
     ],
 )
 def test_damaged_own_json_ends_in_one_sentence(tmp_path, small_ring, edit, message):

@@ -18,7 +18,7 @@ D = "d: drift, l=1e-9;\n"
 def read(folder, text, **options):
     """The ring, without a word of warning."""
     path = folder / "ring.madx"
-    path.write_text(BEAM + text)
+    path.write_bytes(text if isinstance(text, bytes) else (BEAM + text).encode())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return load_ring(path, **options)
@@ -120,3 +120,10 @@ def test_an_expression_in_brackets_is_no_list(tmp_path):
 def test_lines_may_go_on_as_in_mad_8(tmp_path):
     text = 'a: drift, l=1;\nb: drift, l=2;\nring: line=(a, &\n b, a);\ntitle, "a & b";\n'
     assert read(tmp_path, text).length == pytest.approx(4)
+
+
+@pytest.mark.parametrize("code", ["latin-1", "utf-16", "utf-8-sig"])
+@pytest.mark.parametrize("end", ["\r", "\r\n"])
+def test_texts_of_other_systems(tmp_path, code, end):
+    text = f"{BEAM}! d\xe9fini\na: drift, l=1; // two\nring: line=(2*a);\n".replace("\n", end)
+    assert read(tmp_path, text.encode(code)).length == pytest.approx(2)

@@ -237,6 +237,11 @@ def test_tables_that_say_too_little(madx, tmp_path):
     path.write_text("\n".join(lines[:8] + lines[20:22] + lines[8:20]) + "\n")
     with pytest.raises(LatticeError, match="elements that overlap"):
         load_ring(path)
+    path = table(madx, tmp_path)
+    *head, last = path.read_text().splitlines()
+    path.write_text("\n".join([*head, "nan".join(last.rsplit(last.split()[-1], 1))]) + "\n")
+    with pytest.raises(LatticeError, match=r"no number in the column \w+ of "):
+        load_ring(path)
     path.write_text("@ nothing\n")
     with pytest.raises(LatticeError, match="cannot be read as a table of MAD-X"):
         load_ring(path)

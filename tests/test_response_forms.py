@@ -10,10 +10,10 @@ from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
+from tmlattice.diagnosis.response.labels import reversed_ones
 from tmlattice.diagnosis.response.missing_effects import control, weigh
 from tmlattice.diagnosis.response.outlier_readings import without_gross
 from tmlattice.diagnosis.response.stepwise import fit_steps
-from tmlattice.diagnosis.response.unlike_model import reversed_ones
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data

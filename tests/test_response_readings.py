@@ -11,10 +11,6 @@ from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.set_aside import taken_back
 from tmlattice.diagnosis.response.stepwise import fit_steps
-from tmlattice.diagnosis.response.swaps import (
-    correctors_back,
-    monitors_back,
-)
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
@@ -113,6 +109,17 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
         assert error(found(moved).state) > 10 * error(told.state)
 
 
+def swapped(measured, what, pair):
+    """The measurement with the readings of two correctors, or of two monitors, exchanged."""
+    names = list(getattr(measured, what))
+    order = np.arange(len(names))
+    order[[names.index(own) for own in pair]] = [names.index(own) for own in reversed(pair)]
+    if what == "correctors":
+        return replace(measured, response=measured.response[order])
+    rf = replace(measured.rf, orbit=measured.rf.orbit[order])
+    return replace(measured, response=measured.response[:, order], rf=rf)
+
+
 EXCHANGED = {
     "neighbours": ("correctors", "v5", "v6"),
     "monitors": ("monitors", "end_1", "end_14"),
@@ -126,7 +133,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     measured = simulate_response(
         small_ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=3
     ).measured  # fmt: skip
-    wrong = (correctors_back if what == "correctors" else monitors_back)(measured, [tuple(pair)])
+    wrong = swapped(measured, what, pair)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient"])
     assert found.verdict == "localised"
     (one,) = found.findings

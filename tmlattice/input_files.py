@@ -23,6 +23,7 @@ from tmlattice.errors import TmlatticeError, plain
 
 MOST_BYTES = 1 << 30
 """Of a file of text."""
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 MOST_DIGITS = 300
 """Of a whole number: as a float it would be beyond all of them."""
 MOST_YAML, MOST_NODES, DEEPEST = 4 << 20, 100_000, 20
@@ -73,6 +74,15 @@ def content_of(path: Path, error: type[TmlatticeError]) -> bytes:
     except (OSError, ValueError) as problem:
         said = getattr(problem, "strerror", None) or problem
         raise error(f"cannot read '{path}': {said}") from problem
+
+
+def decoded(content: bytes) -> str:
+    """A text with its lines ended as Python's: UTF-8, else UTF-16 by its mark, else Latin-1."""
+    try:
+        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def zip_of(path: Path, error: type[TmlatticeError], wanted: str) -> BytesIO:
@@ -189,6 +199,15 @@ def _whole(digits: str) -> int:
     if len(digits) > MOST_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits; write it with an exponent")
     return int(digits)
+
+
+def number(text: str) -> float:
+    """A number of a table.
+
+    Raises:
+        ValueError: it is none; `1_000`, which Python takes for one, is none either.
+    """
+    return float(text.replace("_", "?"))
 
 
 def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam import aperture
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.assembly import Group, assembly, on_ring
 from tmlattice.beam.layers import LayerParts
@@ -252,7 +253,7 @@ class TrackedShots:
                 kernels.trajectories, len(shots), *layers.W, layers.curved, rf.exits, rf.values,
                 *part,
             )  # fmt: skip
-            states[shots], tangents[shots] = part
+            states[shots], tangents[shots] = part = _held(*part)
             R1, R2 = (np.tile(r, (self.turns, *(1,) * (r.ndim - 1))) for r in layers.R[1:])
             x = part[0][:, self.where]  # [shot, reading, n]
             own = np.broadcast_to(R1, (len(x), *R1.shape)).copy()
@@ -285,3 +286,15 @@ class TrackedShots:
         by_turn = slopes.reshape(self.shots, self.turns, -1, 2, self.dimension)
         turned = np.einsum("smij,stmjk->stmik", monitors, by_turn)
         return np.asarray(turned.reshape(slopes.shape))
+
+
+def _held(states: Array, tangents: Array) -> tuple[Array, Array]:
+    """Return states and tangents, [shot, step + 1, ...]; behind a loss those of its exit, since the
+    maps overflow there."""
+    outside = aperture.lost(states)
+    if not outside.any():
+        return states, tangents
+    last = np.where(outside.any(axis=1), outside.argmax(axis=1), states.shape[1])
+    kept = np.minimum(np.arange(states.shape[1]), last[:, None])
+    shot = np.arange(len(states))[:, None]
+    return states[shot, kept], tangents[shot, kept]

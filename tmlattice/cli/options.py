@@ -74,8 +74,10 @@ def _workers(text: str) -> dict[str, Any]:
 
 def named_number(text: str) -> tuple[str, float | None]:
     """NAME or NAME=NUMBER."""
-    name, _, number = text.partition("=")
-    return name.strip(), float(number) if number else None
+    from tmlattice.input_files import number
+
+    name, _, value = text.partition("=")
+    return name.strip(), number(value) if value else None
 
 
 NAMES = Word("NAME,NAME", _names, "give one name or more, separated by commas")

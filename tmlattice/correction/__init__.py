@@ -85,6 +85,7 @@ def correct(
         )
     else:
         compared = Targets(wanted, chosen)
+        estimate = estimate.storing()
     devices = chosen_knobs(knobs, estimate.settings, compared.names)
     progress("correction")
     problem = drawn(estimate, devices, compared, DRAWS, seed)

@@ -16,8 +16,11 @@ import numpy as np
 from tmlattice.correction.knobs import KINDS, Knob, knobs_of
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import MeasurementError, plain
-from tmlattice.input_files import text_of
+from tmlattice.input_files import number, text_of
 from tmlattice.lattice import Ring
+
+ROUNDING = 1e-6
+"""Of settings in a table, relative."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +65,22 @@ def read_settings(path: Path, ring: Ring) -> list[tuple[Knob, float]]:
     new: list[float] = []
     for row in csv.DictReader(text_of(path, MeasurementError).splitlines()):
         try:
-            new.append(float(row.pop("new")))
-            if not math.isfinite(new[-1]):
+            there, then = number(row["present"]), number(row.pop("new"))
+            change = number(row.get("change") or str(then - there))
+            if not (math.isfinite(then) and math.isfinite(there)):
                 raise ValueError
-            rows.append({**row, "knob": row.pop("device"), "present": float(row["present"])})
+            rows.append({**row, "knob": row.pop("device"), "present": there})
+            new.append(then)
         except (KeyError, TypeError, ValueError):
             raise MeasurementError(
                 f"{path}: a row has no device, present or new; give the settings.csv of a "
                 f"correction (found: {plain(str(row), 80)})"
             ) from None
+        if not abs(then - there - change) <= ROUNDING * max(abs(then), abs(there)):
+            raise MeasurementError(
+                f"{path}: the change of '{plain(str(rows[-1]['knob']), 40)}' is {change:.9g}, but "
+                f"its new setting less the present one is {then - there:.9g}; correct the row"
+            )
         for derived in ("device", "change", "gain"):
             rows[-1].pop(derived, None)
     if not rows:

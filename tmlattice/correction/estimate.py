@@ -4,7 +4,6 @@
 >>> estimate.draw(200, np.random.default_rng(0)).shape      # [draw, error]
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -41,6 +40,7 @@ class Estimate:
         calibrations: of correctors, kick over setting, by name.
         dispersion: measured beyond the ring's, m, [BPM, plane], or 0.
         energy, energy_error: of the stored beam relative to the ring's at its RF frequency.
+        found, mean: the ring without its distributed errors, and their means.
     """
 
     ring: Ring
@@ -52,6 +52,30 @@ class Estimate:
     dispersion: Array | float = field(default=0.0, repr=False)
     energy: float = 0.0
     energy_error: float = 0.0
+    found: Ring | None = field(default=None, repr=False)
+    mean: tuple[Cause, ...] = field(default=(), repr=False)
+
+    @property
+    def linearised(self) -> DistributedErrors | None:
+        """Return the posterior about `ring`, with which its next measurement is diagnosed."""
+        if self.known is None:
+            return None
+        amounts = self.known.amounts.copy()
+        amounts[self.kept] = 0.0
+        return replace(self.known, amounts=amounts)
+
+    def storing(self) -> "Estimate":
+        """Return the estimate whose ring stores a beam: with the posterior mean, which is
+        linearised, or a half of it, a quarter, ...; unchanged if it stores none."""
+        for share in SHARES:
+            own = [replace(cause, amount=share * cause.amount) for cause in self.mean]
+            ring = self.ring if share == 1 or self.found is None else apply(self.found, own)
+            try:
+                StoredBeam(ResponseModel(ring))
+            except UnstableRingError:
+                continue
+            return replace(self, ring=ring)
+        return self
 
     def with_beam(
         self, dispersion: Dispersion, energy: float = 0.0, energy_error: float = 0.0
@@ -95,8 +119,7 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
         return Estimate(ring, settings)
     kept = [i for i, (name, _) in enumerate(known.hypotheses) if _of_ring(name)]
     kept = [i for i in kept if known.rms[i] > 0]
-    mean = [Cause(*known.hypotheses[i], float(known.amounts[i])) for i in kept]
-    mean = [cause for cause in mean if cause.amount]
+    mean = [Cause(*known.hypotheses[i], float(known.amounts[i])) for i in kept if known.amounts[i]]
     every = [*known.causes]
     every += [Cause(*h, a) for h, a in zip(known.hypotheses, known.amounts.tolist(), strict=True)]
     scales: dict[str, float] = {}
@@ -104,26 +127,15 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
         if cause.effect == "corrector_calibration" and cause.element is not None:
             scales[cause.element] = scales.get(cause.element, 1.0) * (1 + cause.amount)
     return Estimate(
-        _with_mean(ring, mean) if mean else ring,
+        apply(ring, mean),
         settings,
         tuple(known.hypotheses[i] for i in kept),
         known,
         np.array(kept, dtype=np.int64),
         scales,
+        found=ring,
+        mean=tuple(mean),
     )
-
-
-def _with_mean(ring: Ring, mean: Sequence[Cause]) -> Ring:
-    """The ring with a linearised posterior mean; with a half of it, a quarter, ..., where it stores
-    a beam only then."""
-    for share in SHARES:
-        found = apply(ring, [replace(cause, amount=share * cause.amount) for cause in mean])
-        try:
-            StoredBeam(ResponseModel(found))
-        except UnstableRingError:
-            continue
-        return found
-    return apply(ring, mean)  # a beam that is not stored anyway, as of first turns
 
 
 def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:

@@ -5,7 +5,7 @@ stays near the axis on both, it is closed.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +40,6 @@ class Trajectory:
         there = paths.states[0, self._model.where][:, [0, 2]]  # by maps that always have a value
         beam = np.where(np.isfinite(beam), beam, there)
         self._alive = np.cumsum(~(np.abs(beam) < LOST).all(axis=1)) == 0
-        if not self._alive.all():  # the maps behind have overflown
-            behind = int(self._model.where[int(np.argmin(self._alive))]) + 1
-            states, tangents = paths.states.copy(), paths.tangents.copy()
-            states[:, behind:], tangents[:, behind:] = 0.0, np.eye(states.shape[-1])
-            slopes = np.where(self._alive[:, None, None], paths.beam_launch, 0.0)
-            paths = replace(paths, states=states, tangents=tangents, beam_launch=slopes)
         self._paths = paths
         self.values = np.where(self._alive[:, None], np.nan_to_num(beam), LOST)
 
@@ -76,6 +70,16 @@ class Threading(Weighted):
         self.tolerance = {THREADING: tolerance or TARGETS[THREADING].tolerance}
         places = np.array([monitor.s for monitor in goal.monitors])
         self.s = np.concatenate([places + turn * goal.length for turn in range(TURNS)])
+
+    def determined(self, undetermined: Array) -> "Threading":
+        """Return the target whose readings count the less, the less the data determine them.
+
+        Args:
+            undetermined: standard deviation of each, m, [reading, plane].
+        """
+        found = copy(self)
+        found.undetermined = undetermined
+        return found
 
     def begin(self, ring: Ring, energy: float) -> Trajectory:
         """Return the trajectory of a ring; the injected beam's energy is the nominal one."""

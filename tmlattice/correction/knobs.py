@@ -19,7 +19,7 @@ import numpy as np
 from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError, plain, unknown_choice
-from tmlattice.input_files import text_of, yaml_of
+from tmlattice.input_files import number, text_of, yaml_of
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import magnets, supplied_alike
 
@@ -181,11 +181,13 @@ def check_distinct(where: str, knobs: Iterable[Knob]) -> None:
     names: set[str] = set()
     owners: dict[tuple[str | None, str], str] = {}
     for knob in knobs:
-        if knob.name in names:
-            raise MeasurementError(f"{where}: the knob '{plain(knob.name, 40)}' occurs twice")
-        names.add(knob.name)
+        if knob.name.casefold() in names:
+            raise MeasurementError(
+                f"{where}: the knob '{plain(knob.name, 40)}' occurs twice (case does not matter)"
+            )
+        names.add(knob.name.casefold())
         for member in knob.members:
-            key = KINDS[knob.kind].effect, member
+            key = KINDS[knob.kind].effect, member.casefold()
             if key in owners:
                 both = " and ".join(f"'{plain(n, 40)}'" for n in (owners[key], knob.name))
                 raise MeasurementError(
@@ -350,10 +352,10 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
     curve = given.pop("curve", ())
     unit = str(given.pop("unit", known.unit))
     try:
-        numbers: dict[str, Any] = {key: float(value) for key, value in given.items()}
+        numbers: dict[str, Any] = {key: number(str(value)) for key, value in given.items()}
         points = curve.split() if isinstance(curve, str) else list(curve)
         pairs = [p.split(":") if isinstance(p, str) else p for p in points]
-        read = tuple(sorted((float(x), float(y)) for x, y in pairs))
+        read = tuple(sorted((number(str(x)), number(str(y))) for x, y in pairs))
     except (TypeError, ValueError):
         raise MeasurementError(
             f"{where}: a value is not a number; a curve is 'setting:strength setting:strength'"

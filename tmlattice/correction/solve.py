@@ -29,7 +29,7 @@ from scipy.linalg import solve, solve_triangular
 from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.first_turn import Threading
 from tmlattice.correction.knobs import KINDS, Knob
-from tmlattice.correction.targets import Targets
+from tmlattice.correction.targets import THREADING, Targets
 from tmlattice.effects import apply
 from tmlattice.errors import UnstableRingError
 
@@ -426,8 +426,12 @@ def drawn(
         if knob.kind in ("hcorrector", "vcorrector") and knob.members else knob
         for knob in knobs
     ]  # fmt: skip
-    return Problem(
+    found = Problem(
         estimate, tuple(scaled), targets, estimate.draw(count, random),
         random.standard_normal((count, len(knobs))),
         estimate.energy_error * random.standard_normal(count),
     )  # fmt: skip
+    if isinstance(targets, Threading):
+        open_ = found.begin.open[THREADING].std(axis=0)
+        found = replace(found, targets=targets.determined(open_))
+    return found

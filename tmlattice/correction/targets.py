@@ -175,14 +175,16 @@ class Weighted:
     names: tuple[str, ...]
     tolerance: dict[str, float]
     s: Array
+    undetermined: Array | float = 0.0
 
     def rows(self, parts: Mapping[str, Array]) -> Array:
         """Return errors or changes of the wanted targets in units of their tolerances, so that the
         square of all rows is the sum of mean squares, [..., row]."""
         own = []
         for name in self.names:
-            part = parts[name].reshape(*parts[name].shape[:-2], -1)
-            own.append(part / (self.tolerance[name] * np.sqrt(part.shape[-1])))
+            part = parts[name] / np.hypot(self.tolerance[name], self.undetermined)
+            part = part.reshape(*part.shape[:-2], -1)
+            own.append(part / np.sqrt(part.shape[-1]))
         return np.concatenate(own, axis=-1)
 
 

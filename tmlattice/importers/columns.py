@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import MeasurementError
-from tmlattice.input_files import content_of
+from tmlattice.input_files import content_of, decoded, number
 from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement.rows import not_csv
 
@@ -33,7 +33,7 @@ _POSITION = re.compile(r"(?:^|[^a-z])(?:x|y|hor\w*|ver\w*)(?:[^a-z]|$)", re.IGNO
 """Of names of readings: a plane as a word."""
 
 SHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
-_ARCHIVE, _OLD_SHEET, _UTF_16 = b"PK\x03\x04", b"\xd0\xcf\x11\xe0", (b"\xff\xfe", b"\xfe\xff")
+_ARCHIVE, _OLD_SHEET = b"PK\x03\x04", b"\xd0\xcf\x11\xe0"
 
 
 def text_of(path: Path) -> str:
@@ -45,12 +45,10 @@ def text_of(path: Path) -> str:
     content = content_of(path, MeasurementError)
     if path.suffix.lower() in SHEETS or content.startswith((_ARCHIVE, _OLD_SHEET)):
         raise MeasurementError(f"'{path}' is a spreadsheet, which is not read; save it as CSV")
-    try:
-        return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
-    except UnicodeDecodeError:
-        if b"\0" in content:
-            raise MeasurementError(f"'{path}' is no text; save the table as CSV") from None
-        return content.decode("latin-1")
+    text = decoded(content)
+    if "\0" in text:
+        raise MeasurementError(f"'{path}' is no text; save the table as CSV")
+    return text
 
 
 @dataclass(frozen=True)
@@ -194,15 +192,6 @@ def _csv(path: Path) -> list[Column]:
     if separator != ",":
         rows = [(i, [_DECIMAL.sub(r"\1.\2", field) for field in row]) for i, row in rows]
     return [Column(*named(name), [row[i] for _, row in rows]) for i, name in enumerate(header)]
-
-
-def number(text: str) -> float:
-    """A number of a table.
-
-    Raises:
-        ValueError: it is none; `1_000`, which Python takes for one, is none either.
-    """
-    return float(text.replace("_", "?"))
 
 
 def _is_number(text: str) -> bool:

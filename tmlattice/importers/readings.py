@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, unknown_name
-from tmlattice.importers.columns import Column, number
+from tmlattice.importers.columns import Column
 from tmlattice.importers.imported import (
     Imported,
     counted,
@@ -23,6 +23,7 @@ from tmlattice.importers.imported import (
     first_turns_or_stored,
 )
 from tmlattice.importers.stated import Stated
+from tmlattice.input_files import number
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.arrays import METRES

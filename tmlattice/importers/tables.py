@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
-from tmlattice.importers.columns import SDDS, Column, number
+from tmlattice.importers.columns import SDDS, Column
 from tmlattice.importers.imported import (
     LIGHT,
     Imported,
@@ -24,6 +24,7 @@ from tmlattice.importers.imported import (
 )
 from tmlattice.importers.middle_layer import RADIANS
 from tmlattice.importers.stated import Stated
+from tmlattice.input_files import number
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse, read_turn_by_turn
 from tmlattice.measurement.arrays import METRES, Unit

@@ -12,7 +12,7 @@ as the square of the errors, whatever the number of readings. `DistributedProble
 signatures, since its search whitens rows by them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -90,6 +90,17 @@ class DistributedErrors:
         return cls(
             tuple(hypotheses), np.zeros(len(scale)), scale, np.zeros((0, len(scale))), np.zeros(0)
         )
+
+    def extended(self, hypotheses: Iterable[Hypothesis]) -> "DistributedErrors":
+        """Return the distribution with errors of its effects at places that it lacks."""
+        there, rms = set(self.hypotheses), sizes_of(self)
+        more = [h for h in hypotheses if h[0] in rms and h not in there]
+        new = DistributedErrors.usual(more, rms)
+        return replace(
+            self, hypotheses=(*self.hypotheses, *more),
+            amounts=np.append(self.amounts, new.amounts), rms=np.append(self.rms, new.rms),
+            seen=np.pad(self.seen, ((0, 0), (0, len(more)))),
+        )  # fmt: skip
 
     def correlated(self, x: Array) -> Array:
         """Correlated errors in units of the rms, from independent ones of size 1, [error, ...]."""
@@ -381,14 +392,15 @@ def fit_distributed_errors(
         if linearised_at is not None:
             break
         there = fit_nuisances(among, causes, point.nuisances)
-        assert there.projection is not None
+        if there.projection is None:
+            raise UnstableRingError(f"{there.lost} with distributed errors")
         assert point.projection is not None
         nuisances = there.nuisances
         amounts = among.estimate(there.projection.out(there.residual))
         change = ((amounts - stored) @ slopes).reshape(inner.valid.shape)
         clean = point.projection.out(point.residual - inner.as_rows(change))
         expected = float(clean @ clean)
-    fitted = FittedErrors(among, problem, _sizes(known))
+    fitted = FittedErrors(among, problem, sizes_of(known))
     if learn:
         fitted = _scaled(fitted, point, causes, noisy, weigh)
     return _with_nuisances(fitted, fit_nuisances(fitted.problem, causes, point.nuisances).nuisances)
@@ -436,12 +448,13 @@ def _scaled(
     opened = (belongs, found.covariance)
     return FittedErrors(
         replace(problem, inner=inner, known=known, spread=spread, open=opened), plain,
-        _sizes(known), dict(zip(names, found.error.tolist(), strict=True)),
+        sizes_of(known), dict(zip(names, found.error.tolist(), strict=True)),
         found.log_evidence, found.log_marginal, outlier_evidence,
     )  # fmt: skip
 
 
-def _sizes(known: DistributedErrors) -> dict[str, float]:
+def sizes_of(known: DistributedErrors) -> dict[str, float]:
+    """Return the prior standard deviation of each effect."""
     return {name: rms for (name, _), rms in zip(known.hypotheses, known.rms.tolist(), strict=True)}
 
 
@@ -572,7 +585,7 @@ class Posterior:
     @property
     def sizes(self) -> dict[str, float]:
         """Estimated rms by effect."""
-        return _sizes(self.before)
+        return sizes_of(self.before)
 
     @cached_property
     def known(self) -> DistributedErrors:

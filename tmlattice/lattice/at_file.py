@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, plain
-from tmlattice.input_files import content_of
+from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.at_child import Tracker, check_methods
 from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
@@ -110,7 +110,7 @@ def _list_of_m(path: Path) -> str:
     Raises:
         LatticeError: the function does anything else, which would have to be run.
     """
-    lines = content_of(path, LatticeError).decode("utf-8-sig", "replace").splitlines()
+    lines = decoded(content_of(path, LatticeError)).splitlines()
     bare = "\n".join(re.sub(r"^((?:[^'%]|'[^']*')*)%.*", r"\1", line) for line in lines)
     bare = re.sub(r"\.\.\.[^\n]*\n", " ", f"{bare}\n")
     match = re.fullmatch(

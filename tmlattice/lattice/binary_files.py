@@ -236,7 +236,7 @@ class _Budget:
 
         Raises:
             RefusedError: elements that are no numbers or texts, no elements at all, elements that
-                stand elsewhere, or too many of them.
+                stand elsewhere or were never written, or too many of them.
         """
         import h5py
 
@@ -260,17 +260,17 @@ class _Budget:
                 f"{self.size / 1e6:.3g} MB ('{name}' has the shape {item.shape}); at most "
                 f"{self.most / 1e6:.0f} MB are read"
             )
+        if (unwritten := _unwritten(item)) and not _is_nan(item.fillvalue):
+            raise RefusedError(
+                f"{unwritten} of '{name}' was never written: such numbers would be read as "
+                f"{item.fillvalue}; save it whole, or with NaN as the fill value"
+            )
 
     def read(self, item: Any, name: str, references: bool = False) -> Any:
         """A data set, `checked`."""
         import h5py
 
         self.checked(item, name, references)
-        if (unwritten := _unwritten(item)) and not _is_nan(item.fillvalue):
-            raise RefusedError(
-                f"{unwritten} of '{name}' was never written: such numbers would be read as "
-                f"{item.fillvalue}; save it whole, or with NaN as the fill value"
-            )
         value = item[()]
         return _texts(value, name) if h5py.check_string_dtype(item.dtype) else value
 

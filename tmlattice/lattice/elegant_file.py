@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import LatticeError, plain
-from tmlattice.input_files import content_of
+from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.lines import DEEPEST, Items, chosen, inner_names, items_of, laid_out
 from tmlattice.lattice.madx_language import split
 from tmlattice.lattice.parts import Part, Report, ring_of_parts
@@ -337,7 +337,7 @@ class _Reader:
             raise LatticeError(f"it includes '{path}', which is no file")
         if self._files > MOST_FILES or depth > DEEPEST or path.stat().st_size > MOST_BYTES:
             raise LatticeError(f"it includes '{path}': too many files, or too large ones")
-        text = content_of(path, LatticeError).decode("utf-8", errors="replace")
+        text = decoded(content_of(path, LatticeError))
         lines = text.lstrip("\ufeff").splitlines()
         for text, number, after in _statements(lines):
             self.rpn.work(10)

@@ -6,7 +6,6 @@ reading, as everywhere. A matrix is stored by its nonzero entries (`"12"` is row
 """
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import numpy as np
 from tmlattice.errors import LatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.input_files import check_shape, json_of
-from tmlattice.lattice.alike import Supplies
 from tmlattice.lattice.places import place_elements
 from tmlattice.lattice.ring import ELECTRON_GEV, NO_ERRORS, Element, Errors, Ring, number_names
 from tmlattice.lattice.source import blank, made
@@ -153,21 +151,18 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
     energy = float(content["energy_gev"]) if energy is None else energy
     mass = float(content.get("mass_gev", ELECTRON_GEV))
     model = content.get("model", "design")
-    ring = Ring(name, elements, energy, content.get("changes", {}), mass, model=model)
-    return replace(ring, known_supplies=_supplies(path, ring, content.get("supplies")))
-
-
-def _supplies(path: Path, ring: Ring, stated: Mapping[str, list[str]] | None) -> Supplies | None:
-    if stated is None:
-        return None
-    known = {element.name for element in ring.elements}
-    for supply, names in stated.items():
+    changes, supplies = content.get("changes", {}), content.get("supplies")
+    known = {element.name for element in elements}
+    named = {f"the supply '{supply}'": names for supply, names in (supplies or {}).items()}
+    for where, names in {"'changes'": changes, **named}.items():
         if strange := [name for name in names if name not in known]:
             raise LatticeError(
-                f"'{path}': the supply '{supply}' has '{strange[0]}', which is no element; take it "
-                "out"
+                f"'{path}': {where} has '{strange[0]}', which is no element; take it out"
             )
-    return {supply: tuple(names) for supply, names in stated.items()}
+    ring = Ring(name, elements, energy, changes, mass, model=model)
+    return ring if supplies is None else replace(
+        ring, known_supplies={supply: tuple(names) for supply, names in supplies.items()}
+    )  # fmt: skip
 
 
 def _content(path: Path) -> Any:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
-from tmlattice.input_files import content_of
+from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_out, with_gaps
 from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.madx_language import (
@@ -26,6 +26,7 @@ from tmlattice.lattice.madx_language import (
     Evaluate,
     Given,
     Statement,
+    Undetermined,
     attributes,
     compiled,
     holds,
@@ -64,6 +65,7 @@ NO_STATEMENT = frozenset({
     "shrink", "sxfwrite", "delete", "tabstring", "setbeta", "nlens", "fill_knob", "threader",
     "set", "error", "beta0", "coption", "deselect", "distribution", "etable", "getdisp", "getkick",
     "getorbit", "renamefile", "rviewer", "save_state", "sddsin", "sddsout", "select_ptc_normal",
+    "saveline", "real", "int",
 })  # fmt: skip
 """Statements that leave the ring as it is, as do all that begin with PTC_."""
 NOT_RUN = {
@@ -404,8 +406,7 @@ class _Reader:
             raise LatticeError(f"it calls '{path}': too many files, or too large ones")
         self._files.append(path)
         try:
-            content = content_of(path, LatticeError)
-            self._read_text(content.decode("utf-8-sig", errors="replace"))
+            self._read_text(decoded(content_of(path, LatticeError)))
         except _Stop as stop:
             if stop.everything:
                 raise
@@ -470,7 +471,10 @@ class _Reader:
         if name in self._constants:
             return  # MAD-X keeps them
         evaluate = compiled(unquoted(given.text.strip()))
-        value = evaluate if given.deferred else evaluate(self)
+        try:
+            value = evaluate if given.deferred else evaluate(self)
+        except Undetermined as error:  # of no consequence where nothing asks for it
+            value = _raising(error)
         self.variables[name] = math.trunc(value) if whole and not callable(value) else value
 
     def _block(self, text: str, word: str) -> None:
@@ -512,6 +516,9 @@ class _Reader:
             if word in NO_STATEMENT or word in ("beam", "select", "call", "use", *REFUSED):
                 return self._command(rest)
             raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
+        if word == name:
+            self.warnings.append(f"'{name}: {name}' leaves the element as it is, as in MAD-X")
+            return None
         parent = self.elements.get(word)
         own = dict(parent.values) if parent else {}
         keyword = parent.keyword if parent else word
@@ -652,11 +659,10 @@ class _Reader:
         if match is None or match[1].lower() not in self.macros:
             raise LatticeError(f"no macro '{plain(text, 60)}' is defined")
         names, body = self.macros[match[1].lower()]
-        given = [item.strip() for item in split(match[2] or "")]
-        for name, value in zip(names, given, strict=False):
-            if value.startswith("$"):
-                number = self.variable(value[1:].lower())
-                value = str(int(number)) if number == int(number) else repr(number)  # noqa: PLW2901
+        given = re.sub(
+            r"\$([\w.]+)", lambda m: str(int(self.variable(m[1].lower()))), match[2] or ""
+        )
+        for name, value in zip(names, split(given), strict=False):
             # wherever it stands, within words too, as MAD-X does
             body = re.sub(re.escape(name), value.replace("\\", r"\\"), body, flags=re.IGNORECASE)
         self._depth += 1
@@ -1064,6 +1070,13 @@ def _occurrence(text: str) -> tuple[str, int]:
 
 def _constant(value: float) -> Evaluate:
     return lambda names: value
+
+
+def _raising(error: LatticeError) -> Evaluate:
+    def value(_: Any) -> float:
+        raise error
+
+    return value
 
 
 def _bare(word: str) -> str:

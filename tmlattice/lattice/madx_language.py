@@ -69,6 +69,10 @@ class Names(Protocol):
 Evaluate = Callable[[Names], float]
 
 
+class Undetermined(LatticeError):
+    """What the file alone does not determine: a result of MAD-X, or a random number."""
+
+
 def compiled(text: str) -> Evaluate:
     """An expression, to be evaluated with the names of a file.
 
@@ -192,9 +196,9 @@ class _Parser:
         def value(names: Names) -> float:  # what nothing asks for may be anything
             names.work()
             if word in RANDOM:
-                raise LatticeError(f"{word.upper()}() is random; write its value")
+                raise Undetermined(f"{word.upper()}() is random; write its value")
             if word == "table":
-                raise LatticeError("TABLE() reads a result of MAD-X; write its value")
+                raise Undetermined("TABLE() reads a result of MAD-X; write its value")
             if word not in FUNCTIONS:
                 raise LatticeError(f"no function {word.upper()}() is known")
             function = FUNCTIONS[word]
@@ -246,7 +250,7 @@ def statements(text: str) -> Iterator[Statement]:
     depth = at = 0
 
     def statement() -> Iterator[Statement]:
-        bare = " ".join("".join(buffer).split())
+        bare = re.sub(r":\s+=", ":=", " ".join("".join(buffer).split()))
         buffer.clear()
         if bare:
             yield Statement(bare, begin)

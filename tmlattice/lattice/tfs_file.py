@@ -27,6 +27,11 @@ NUMBERS = (
     "freq", "lrad", "ks", "ksi",
 )  # fmt: skip
 ORDERS = range(7)
+STRENGTHS = {"knl": "K{}L", "ksl": "K{}SL"}
+_NUMERIC = frozenset({
+    "S", "L", *(key.upper() for key in NUMBERS),
+    *(column.format(n) for column in STRENGTHS.values() for n in ORDERS),
+})  # fmt: skip
 
 Row = dict[str, Any]
 
@@ -138,9 +143,15 @@ NEEDED_BY = {
 
 
 def _check_columns(path: Path, rows: list[Row], columns: frozenset[str]) -> None:
-    """Raises a LatticeError where an element's fields are in none of the columns."""
+    """Raises a LatticeError where an element's fields are in none of the columns, or no number."""
     for row in rows:
         keyword = str(row["KEYWORD"]).upper()
+        for column in _NUMERIC & columns:
+            if not math.isfinite(row[column]):
+                raise LatticeError(
+                    f"'{path}' has no number in the column {column} of "
+                    f"'{plain(str(row['NAME']), 60)}'; write the table again"
+                )
         needed = NEEDED_BY.get(keyword, ())
         if needed and not columns & set(needed):
             raise LatticeError(
@@ -177,7 +188,7 @@ def _with_drifts(
     if not rows or not fits:
         raise LatticeError(
             f"'{path}' has elements that overlap, whether S is at their exits or in their middle; "
-            "give a table of all elements in their order"
+            "give a table of each element once, in their order and without SELECT, FLAG=INTERPOLATE"
         )
     listed = any(str(row["KEYWORD"]).upper() == "DRIFT" for row in rows)
     begins = [*zip((str(row["NAME"]) for row in rows), starts[fits[0]], strict=True)]
@@ -202,7 +213,7 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
     own: dict[str, Any] = {"l": length}
     for attribute in NUMBERS:
         value = row.get(attribute.upper())
-        if value is not None and math.isfinite(float(value)):
+        if value is not None:
             own[attribute] = float(value)
     if keyword in ("matrix", "dipedge"):
         raise LatticeError(
@@ -222,8 +233,7 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
         own.pop("angle", None)
     if keyword == "solenoid" and not own.get("ks") and length:
         own["ks"] = own.get("ksi", 0.0) / length
-    strengths = {"knl": "K{}L", "ksl": "K{}SL"}
-    for attribute, column in strengths.items():
+    for attribute, column in STRENGTHS.items():
         values = [float(row.get(column.format(n)) or 0.0) for n in ORDERS]
         if keyword == "sbend" and attribute == "knl":
             field, values[0] = values[0], 0.0

@@ -253,7 +253,7 @@ class Search:
 
     def verdict(self) -> Verdict | None:
         """Return the best assumption, if any improves the data far."""
-        found = self.improving()
+        found = [own for own in self.improving() if own.after < own.before]
         if not found:
             return None
         order = list(ASSUMPTIONS)

@@ -277,8 +277,8 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     if result.common_factors is not None:
         lines += ["", "Common factors of the gradients:"]
         for name, amount, count, square, makes in common_factor_rows(result):
-            head = f"{name}: {amount}, {count} magnets, chi2 {square}; {makes}"
-            lines += wrapped(head, "   ", width)
+            factor = f"{name}: {amount}, {count} magnets, chi2 {square}; {makes}"
+            lines += wrapped(factor, "   ", width)
         lines += wrapped(common_factors_sentence(result), "", width)
         instead = instead_texts(result)
         if instead:
@@ -292,8 +292,8 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
                 lines += wrapped(text, "   ", width)
         for i, text in enumerate(inconsistency_texts(result)):
             lines += wrapped(text, "   ", width) if i else ["", *wrapped(text, "", width)]
-    for said, amounts in error_rows(result):
-        lines += ["", *wrapped(said, "", width), *wrapped(amounts, "   ", width)]
+    for family, amounts in error_rows(result):
+        lines += ["", *wrapped(family, "", width), *wrapped(amounts, "   ", width)]
     lines += ["", *wrapped(left_sentence(result), "", width)]
     if result.hypotheses:
         lines += ["", *wrapped(MISSING, "", width)]

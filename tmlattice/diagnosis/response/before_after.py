@@ -35,14 +35,13 @@ from tmlattice.diagnosis.findings import (
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.changed_supplies import MOST, REPRODUCED, changed_supplies
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
-from tmlattice.diagnosis.response.label_findings import label_findings
+from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.stepwise import Step, StepwiseFit, fit_steps, one_by_one
-from tmlattice.diagnosis.response.swaps_since import all_right, since
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Diagnosis
@@ -90,7 +89,7 @@ def diagnose_change(
         ring: the design.
         before, after: of the same machine; correctors and BPMs of only one of them are excluded.
         holdout: share of the correctors that validate the gap; amounts are fitted to all of them.
-        effects: only changes of these are sought.
+        effects: only errors and changes of these are sought; None: all.
         max_effects: most findings.
         false_alarm: probability of a finding in two measurements of an unchanged machine.
         assume: what is recorded wrongly everywhere in both, see `measurement.assume`.
@@ -117,10 +116,10 @@ def diagnose_change(
     if same:
         trials = []
         messages.append("the two measurements are the same, to the last digit")
-    before, first, swaps_before = all_right(partial(response_data, ring), before, holdout)
+    before, first, swaps_before = without_swaps(partial(response_data, ring), before, holdout)
     progress("the reference")
     rng = np.random.default_rng(seed)
-    steps = () if same else STEPS
+    steps = () if same else trials_of(effects, STEPS)
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
     orbit_kicks = fitted_orbit_kicks(fitted.at)
     messages += [f"of the reference: {own}" for own in (*more, *_of_the_ring(fitted))]
@@ -129,9 +128,12 @@ def diagnose_change(
     def change(measured: OrbitResponse) -> ResponseData:
         return response_change(first, errors, response_data(ring, measured), orbit_kicks)
 
-    _, data, swaps_after = all_right(change, second.measured, holdout)
+    _, data, swaps_after = without_swaps(change, second.measured, holdout)
     there = data.ring
-    pairs = label_findings(there, since(swaps_before, swaps_after, messages), other="did")
+    swapped, on_both = since(swaps_before, swaps_after)
+    messages += [f"on both days {own}" for own in label_messages(on_both)]
+    of_labels = (label.finding(there, other="did") for label in swapped)
+    pairs = [own for own in of_labels if own is not None]
     split = split_columns(data, holdout, rng)
     judgement = Judgement(false_alarm=false_alarm)
     options = {

@@ -23,6 +23,10 @@ Flags = NDArray[np.bool_]
 GROSS = 20.0
 """Ratio of a residual to the typical ones of its corrector and of its BPM above which a reading is
 rejected: no error of a ring has this effect on a single reading."""
+MANY_OF_STEP = 0.1
+"""Share of a step's readings above which, if more than one, its outliers are no single readings."""
+GAINS = "monitor_gain"
+"""The family of BPM gains."""
 OUT = 5.0
 """Ratio of a residual to the typical one of its column above which a reading is an outlier."""
 LEAST = 6
@@ -71,6 +75,28 @@ def gross(data: ResponseData, left: Array) -> Flags:
         usual = np.fmax(np.fmax(column, monitor), data.noise[:, read])
         wrong[rows, :, read] = np.nan_to_num(own) > GROSS * _MAD * usual
     return wrong
+
+
+def single_outliers(state: State) -> Flags:
+    """Return the gross outliers of a fit, [column, monitor, 2]: none of steps with many of them,
+    which are outliers themselves, and none without BPM gains, because unknown gains look alike."""
+    data, read = state.data, state.at.read
+    if not state.allows(GAINS):
+        return np.zeros(data.orbits.shape, dtype=bool)
+    # given each column's own kick, because held-out columns are not fitted; it minimises the
+    # absolute deviations, which is robust against outliers
+    model, orbits = data.pick(read), data.pick(data.orbits)
+    kick = np.ones(len(model))
+    for c, (u, d) in enumerate(zip(model, orbits, strict=True)):
+        use = np.isfinite(d) & state.good & (u != 0)
+        ratio, size = (d[use] / u[use]), np.abs(u[use])
+        order = np.argsort(ratio)
+        half = np.searchsorted(np.cumsum(size[order]), size.sum() / 2)
+        kick[c] = ratio[order][half] if use.any() else 1.0
+    alone = gross(data, data.orbits - kick[:, None, None] * read)
+    count = np.isfinite(data.orbits).sum(axis=(1, 2))
+    alone[alone.sum(axis=(1, 2)) > np.maximum(MANY_OF_STEP * count, 1)] = False
+    return alone
 
 
 def told_gross(data: ResponseData, wrong: Flags, what: str) -> list[str]:

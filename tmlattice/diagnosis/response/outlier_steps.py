@@ -1,137 +1,110 @@
-"""Outlier steps and outlier readings of a fit: they are neither fitted nor used for validation.
+"""Outlier steps of a response, and the label of each: what is wrong with that step.
 
->>> readings, steps = outlier_steps(state)
->>> readings.and_more(steps).messages
+A step is an outlier if its residual, given its own kick, is many times the typical one. A table
+compares the hypotheses, each by the mean square that it leaves at readings which it does not fit:
+
+| label | orbit that the step has besides its own | weight |
+|---|---|---|
+| swapped | that of another corrector, instead of its own | 1 |
+| misplaced | a position jump at the corrector | 1 |
+| spurious kick | that of a kick at any other place | 2 |
+| inconsistent | no single orbit | |
+
+A kick at a distance d downstream is the same kick in the lattice's place and a jump of -d times the
+kick. A spurious kick is that of a supply that jumps between the two readings of a step. A step is
+inconsistent if some BPMs were read before the orbit settled. That needs no ring: given two of three
+neighbouring BPMs, the reading of the third follows, wherever else the beam is kicked: n1 x1 + n2 x2
++ n3 x3 = 0, with n normal to their sensitivities to the coordinates of a launch. A kick violates
+that at one triple; an inconsistent step at half of them.
+
+A step with a label has no information on the ring. It is neither fitted nor used for validation.
+
+>>> labels = outlier_steps(state)
+>>> state = without_readings(state, rejected(state, labels))
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.response.inconsistent_steps import inconsistent
-from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
-from tmlattice.diagnosis.response.spurious_kicks import SpuriousKick, left_in_plane, spurious_kicks
-from tmlattice.diagnosis.response.state import State, bend, jump
-from tmlattice.diagnosis.response.swaps import swaps
-from tmlattice.observe.response_data import ResponseData
+from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.response.labels import SHARE, Label, swapped_correctors
+from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-MANY = 0.1
-"""Share of a step's readings above which, if more than one, its outliers are no single readings."""
-GAINS = "monitor_gain"
-"""The family of BPM gains."""
+TIMES = 5.0
+"""Least ratio of an outlier to the typical one."""
+MOST = 0.25
+"""Largest share of outliers: more of them are model discrepancy."""
+ANYWHERE = 2.0
+"""Weight of the residual given a kick, whose place is free."""
+LEAST = 0.05
+"""Displacement of a corrector, m, that the shape of any field explains."""
+ENOUGH, COLUMNS = 10, 5
+"""Fewest readings of a column, and columns of a plane."""
+BLIND = 0.2
+"""Gain below which a BPM does not read the beam."""
+SPARED = 0.1
+"""Largest share of readings that are omitted because they are between two places of a corrector."""
+MARGIN, SAME = 1.5, 1e-6
+"""Margin beyond the estimated place, as a share of the distance, that counts as between; and the
+distance, m, below which elements have one place."""
+GAINS, ROLLS = "monitor_gain", "corrector_roll"
+"""Families without which residuals look like kicks, and rolled correctors like spurious kicks."""
+_MAD = 1.4826  # of a Gaussian
 
 
-@dataclass(frozen=True)
-class OutlierSteps:
-    """Rejected readings.
-
-    Attributes:
-        unread: which readings are rejected, [column, monitor, plane that is read].
-        messages: about them.
-    """
-
-    unread: Flags
-    messages: tuple[str, ...] = ()
-
-    def and_more(self, *others: "OutlierSteps") -> "OutlierSteps":
-        """Return these together with others."""
-        unread, messages = self.unread, self.messages
-        for own in others:
-            unread, messages = unread | own.unread, (*messages, *own.messages)
-        return OutlierSteps(unread, messages)
-
-
-def outlier_steps(state: State) -> tuple[OutlierSteps, OutlierSteps]:
-    """Return outlier readings; and inconsistent steps together with those of spurious kicks.
-
-    No step is rejected if too few columns would remain for the fit and its validation.
+def outlying(sizes: Array, of: Array, least: float) -> Flags:
+    """Return the outliers: absolutely, and as a share of what they belong to, because a larger step
+    has a larger residual; none if they are many.
 
     Args:
-        state: with all families. Without BPM gains nothing is rejected, because unknown gains look
-            like inconsistencies and like kicks.
+        sizes: NaN is never an outlier, [column].
+        of: rms orbit of each column, [column].
+        least: typical size at least.
     """
-    data, split = state.data, state.split
-    nothing = np.zeros(data.orbits.shape, dtype=bool)
-    if not state.allows(GAINS):
-        return OutlierSteps(nothing), OutlierSteps(nothing)
-    # if the lattice is far from the ring, a column may have started with a wrong calibration, and
-    # with the third order of its kick
-    state = bend(jump(state, beyond=1.0))
-    alone = gross(data, _beside_own_kick(state))
-    read = np.isfinite(data.orbits).sum(axis=(1, 2))
-    many = np.maximum(MANY * read, 1)
-    alone[alone.sum(axis=(1, 2)) > many] = False  # the step is the outlier
-    state = beside(state, alone)
-    broken = inconsistent(state)
-    alone[broken] = False  # rejected with their step
-    single = OutlierSteps(alone, tuple(told_gross(data, alone, "the fit")))
-    names = data.measured.correctors
-    swapped = {name for pair in swaps(state) for name in pair}  # corrected, not rejected
-    others = [
-        own
-        for own in spurious_kicks(state)
-        if not broken[own.column] and names[own.column] not in swapped
-    ]
-    unread = np.zeros((len(data.plane), 2), dtype=bool) | broken[:, None]
-    for own in others:
-        unread[own.column, own.plane] = True
-        if own.plane == data.plane[own.column]:  # its own kick is unknown
-            unread[own.column] = True
-    unread[left_in_plane(state, [own.column for own in others])] = True
-    gone = unread.all(axis=1)
+    known = np.isfinite(sizes)
+    if known.sum() < COLUMNS:
+        return np.zeros(len(sizes), dtype=bool)
+    share = np.where(known, sizes, 0.0) / of
+    out = np.nan_to_num(sizes) > TIMES * max(float(np.median(sizes[known])), least)
+    out &= share > TIMES * float(np.median(share[known]))
+    return out if out.sum() <= MOST * known.sum() else np.zeros_like(out)
+
+
+def outlier_steps(state: State) -> list[Label]:
+    """Return the labels of outlier steps, held-out ones included, one of each step at most; none if
+    too few columns would remain for the fit and its validation.
+
+    Args:
+        state: with all families. Without BPM gains, misplaced correctors alone are labelled.
+    """
+    found: dict[int, Label] = {}
+    for kicked, read in ((0, 0), (1, 1), (0, 1), (1, 0)):
+        for label in _labels(state, kicked, read):
+            found.setdefault(label.columns[0], label)
+    gone = rejected(state, list(found.values())).any(axis=(1, 2))
+    split = state.split
     if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
-        return single, OutlierSteps(nothing)
-    whole = np.broadcast_to(unread[:, None], nothing.shape)
-    return single, OutlierSteps(whole, (*_torn(data, broken), *_kicked(state, others)))
-
-
-def _beside_own_kick(state: State) -> Array:
-    """Residuals given each column's own kick, because held-out columns are not fitted, m, [column,
-    monitor, 2]. The kick minimises the absolute deviations, which is robust against outliers."""
-    data, read = state.data, state.at.read
-    model, orbits = data.pick(read), data.pick(data.orbits)
-    kick = np.ones(len(model))
-    for c, (u, d) in enumerate(zip(model, orbits, strict=True)):
-        use = np.isfinite(d) & state.good & (u != 0)
-        ratio, size = (d[use] / u[use]), np.abs(u[use])
-        order = np.argsort(ratio)
-        half = np.searchsorted(np.cumsum(size[order]), size.sum() / 2)
-        kick[c] = ratio[order][half] if use.any() else 1.0
-    return np.asarray(data.orbits - kick[:, None, None] * read)
-
-
-def _torn(data: ResponseData, columns: Flags) -> list[str]:
-    names = [data.measured.correctors[c] for c in np.flatnonzero(columns)]
-    if not names:
         return []
-    return [
-        "inconsistent steps, at which neighbouring BPMs contradict one another as if some had been "
-        f"read before the orbit settled, rejected: {', '.join(names)}; measure these correctors "
-        "again, and wait longer after each step"
-    ]
+    return list(found.values())
 
 
-def _kicked(state: State, others: list[SpuriousKick]) -> list[str]:
-    if not others:
-        return []
-    names, layers = state.data.measured.correctors, state.at.model.maps.layers
-    kicks = ", ".join(
-        f"{names[own.column]} ({1e6 * own.amount:+.2g} µrad in {'xy'[own.plane]}, as behind "
-        f"{layers[own.layer]})"
-        for own in others
-    )
-    return [
-        "spurious kicks during the steps of correctors (their positions are known up to half "
-        f"betatron oscillations): {kicks}; these readings are rejected; look for a power supply "
-        "that jumps, and measure these correctors again"
-    ]
+def rejected(state: State, labels: Sequence[Label]) -> Flags:
+    """Return the readings of labelled steps, [column, monitor, plane that is read]."""
+    out = np.zeros(state.data.orbits.shape, dtype=bool)
+    for label in labels:
+        out[list(label.columns)] = True
+    return out
 
 
-def beside(state: State, flags: Flags) -> State:
+def without_readings(state: State, flags: Flags) -> State:
     """Return the state without some readings, [column, monitor, 2]. Columns without readings are
     neither fitted nor used for validation, and their own numbers are zero."""
     if not flags.any():
@@ -147,3 +120,188 @@ def beside(state: State, flags: Flags) -> State:
         if family.per == "column":
             values[family.variable] = np.where(gone, 0.0, values[family.variable])
     return replace(state, data=data, split=split).moved(values)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One column in one plane that is read, with what its own kick leaves.
+
+    Attributes:
+        state, column, plane: of the fit; the plane is that of the readings.
+        seen: valid BPMs.
+        own: pattern of its kick, or of its roll in the other plane, m, [reading].
+        left: the residual given the kick by its own plane, m, [reading].
+        kick: that kick, rad.
+    """
+
+    state: State
+    column: int
+    plane: int
+    seen: Indices
+    own: Array
+    left: Array
+    kick: float
+
+    @property
+    def rms(self) -> float:
+        """The rms residual given its own amplitude, m."""
+        return float(np.sqrt(self.missed()))
+
+    def missed(self, *more: Array, among: Flags | None = None, half: bool = False) -> float:
+        """The mean square residual of some readings given its own amplitude, and those of more
+        patterns; if `half`, these are by every second reading, and the residual is that of the
+        others."""
+        odd = np.arange(len(self.left)) % 2 == 1
+        among = np.ones(len(odd), dtype=bool) if among is None else among
+        near, far = (among & ~odd, among & odd) if half else (among, among)
+        patterns = np.column_stack([self.own, *more])
+        return rms_of([amplitudes(patterns, self.left, near, far)[1]]) ** 2
+
+    @cached_property
+    def jump(self) -> Array:
+        """Readings by a position jump of the corrector, [reading]."""
+        at = self.state.at
+        return np.asarray(at.seen(at.jumps[self.column])[self.seen, self.plane])
+
+    @cached_property
+    def clear(self) -> Flags:
+        """Readings except those of BPMs between the corrector's place and its estimated place, on
+        the other side of the kick. Elsewhere a kick at any place is a kick here and a jump."""
+        data = self.state.data
+        every = np.ones(len(self.left), dtype=bool)
+        by, missed = self._displaced(every)
+        by, _ = self._displaced(missed <= np.quantile(missed, 1 - SPARED))
+        way = np.array([data.ring[data.measured.monitors[m]].s for m in self.seen])
+        way -= data.ring[data.measured.correctors[self.column]].s
+        beyond = (np.sign(by) * way + SAME) % data.ring.length - SAME
+        between = beyond <= MARGIN * abs(by)
+        return ~between if between.sum() <= max(SPARED * len(every), 1) else every
+
+    def _displaced(self, among: Flags) -> tuple[float, Array]:
+        patterns = np.column_stack([self.own, self.jump])
+        every = np.ones(len(self.left), dtype=bool)
+        (kick, jump), missed = amplitudes(patterns, self.left, among, every)
+        whole = self.kick + kick * self.state.data.kicks[self.column]
+        return -jump / whole if whole else 0.0, np.abs(missed)
+
+    @cached_property
+    def by(self) -> float:
+        """Distance downstream at which its kick explains most, m."""
+        return self._displaced(self.clear)[0]
+
+    @property
+    def broken(self) -> float:
+        """The violation of the typical triple of neighbouring BPMs, per reading, m; NaN with too
+        few readings."""
+        data, at = self.state.data, self.state.at
+        gain = at.errors.monitors[self.seen, self.plane, self.plane]
+        reads = np.abs(gain) > BLIND
+        if reads.sum() < ENOUGH:
+            return float("nan")
+        left, seen = self.left[reads] / gain[reads], self.seen[reads]
+        first = 2 * self.plane
+        own = at.model.reading_slopes[data.at[seen], self.plane, first : first + 2].T
+        a, b, c = (own[:, i : own.shape[1] - 2 + i] for i in range(3))
+        normal = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)])
+        size = np.sqrt((normal**2).sum(axis=0))
+        triples = (normal * np.stack([left[:-2], left[1:-1], left[2:]])).sum(axis=0)
+        return _MAD * float(np.median(np.abs(triples[size > 0] / size[size > 0])))
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.asarray(a[0] * b[1] - a[1] * b[0])
+
+
+def _steps(state: State, kicked: int, read: int) -> list[_Step]:
+    data, at = state.data, state.at
+    patterns = at.seen(at.beam if kicked == read else at.across)[..., read]
+    found = []
+    for c in np.flatnonzero(data.plane[:-1] == kicked).tolist():
+        own, orbit = at.read[c, :, kicked], data.orbits[c, :, kicked]
+        near = np.isfinite(orbit) & state.good
+        size = float(own[near] @ own[near])
+        kick = float(own[near] @ orbit[near]) / size if size else 1.0
+        left = data.orbits[c, :, read] - kick * at.read[c, :, read]
+        seen = np.flatnonzero(np.isfinite(left) & state.good)
+        if len(seen) >= ENOUGH and patterns[c, seen].any():
+            stepped = kick * (1 + at.errors.calibration[c]) * data.kicks[c]
+            found.append(_Step(state, c, read, seen, patterns[c, seen], left[seen], stepped))
+    return found
+
+
+def _labels(state: State, kicked: int, read: int) -> Iterator[Label]:
+    """Labels of the steps in a plane by their readings in a plane."""
+    steps = _steps(state, kicked, read)
+    data, names, gains = state.data, state.data.measured.correctors, state.allows(GAINS)
+    if not steps or (kicked != read and not (gains and state.allows(ROLLS))):
+        return
+    noise = float(np.median(data.noise[:, read]))
+    orbits = np.array([np.sqrt(np.nanmean(data.orbits[s.column] ** 2)) for s in steps])
+    odd = outlying(np.array([s.rms for s in steps]), orbits, noise)
+    if kicked == read and gains:
+        broken = outlying(np.array([s.broken for s in steps]), orbits, noise)
+        for column in (steps[i].column for i in np.flatnonzero(broken)):
+            yield Label("inconsistent", (names[column],), (column,))
+    if not odd.any():
+        return
+    pairs, usual = list[Label](), np.inf
+    if kicked == read:
+        pairs = swapped_correctors(state, {names[steps[i].column] for i in np.flatnonzero(odd)})
+        usual = max(TIMES * _MAD * float(np.median([abs(s.by) for s in steps])), LEAST)
+    kicks = _kicks(state, read) if gains else np.zeros((0, data.shape[1]))
+    for step in (steps[i] for i in np.flatnonzero(odd)):
+        least, label = SHARE * step.missed(half=True), None
+        for left, own in _table(step, pairs, usual, kicks):
+            if left < least:
+                least, label = left, own
+        if label is not None:
+            yield label
+
+
+def _kicks(state: State, read: int) -> Array:
+    """Readings in a plane by a kick behind each layer, m/rad, [layer, monitor]."""
+    model, at = state.at.model, state.data.at
+    layers, slopes = np.arange(len(model.maps.layers)), model.reading_slopes[at, read]
+    kicks = orbits_of_kicks(model, layers, model.maps.at[at], slopes, read)
+    return np.asarray(kicks.T * state.at.errors.monitors[:, read, read])
+
+
+def _table(
+    step: _Step, pairs: Sequence[Label], usual: float, kicks: Array
+) -> Iterator[tuple[float, Label]]:
+    """Hypotheses of an outlier step: weighted mean square residual at the other readings, label.
+
+    Args:
+        step: the step.
+        pairs: swapped correctors.
+        usual: displacement of a corrector that is no error, m.
+        kicks: readings by a kick behind each layer, m/rad, [layer, monitor].
+    """
+    yield from ((0.0, pair) for pair in pairs if step.column in pair.columns)
+    data, at = step.state.data, step.state.at
+    name = data.measured.correctors[step.column]
+    if abs(step.by) > usual:
+        before, after = step.missed(among=step.clear), step.missed(step.jump, among=step.clear)
+        noise = data.noise_of(0)[step.column, step.seen[step.clear]]
+        gain = (before - after) * float(np.sum(noise**-2.0))
+        words = (
+            f"{abs(step.by):.2g} m {'down' if step.by > 0 else 'up'}stream "
+            f"({1e6 * np.sqrt(before):.2g} µm rms residual in the lattice's place, "
+            f"{1e6 * np.sqrt(after):.2g} there)"
+        )
+        label = Label("misplaced", (name,), (step.column,), words, gain)
+        yield step.missed(step.jump, among=step.clear, half=True), label
+    if len(kicks):
+        near = np.arange(len(step.left)) % 2 == 0
+        own, patterns = step.own[near], kicks[:, step.seen]
+        own = own / max(float(np.sqrt(own @ own)), 1e-300)
+        across = patterns[:, near] - np.outer(patterns[:, near] @ own, own)
+        squares = np.maximum((across**2).sum(axis=1), 1e-300)
+        score = across @ step.left[near]
+        layer = int(np.argmax(score**2 / squares))
+        words = (
+            f"{1e6 * score[layer] / squares[layer]:+.2g} µrad in {'xy'[step.plane]}, as behind "
+            f"{at.model.maps.layers[layer]}"
+        )
+        label = Label("spurious kick", (name,), (step.column,), words)
+        yield ANYWHERE * step.missed(patterns[layer], half=True), label

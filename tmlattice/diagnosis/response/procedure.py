@@ -38,20 +38,25 @@ from tmlattice.diagnosis.response.detected_faults import detected_faults, given_
 from tmlattice.diagnosis.response.first_guess import FAR, strange
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.inconsistencies import inconsistencies
-from tmlattice.diagnosis.response.label_findings import label_findings
-from tmlattice.diagnosis.response.misplaced import Misplaced, misplaced
+from tmlattice.diagnosis.response.labels import (
+    Label,
+    corrected,
+    label_messages,
+    new,
+    rejected_channels,
+    reversed_ones,
+    swapped_planes,
+    swaps,
+)
 from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.outlier_readings import outlier_readings, without_gross
-from tmlattice.diagnosis.response.outlier_steps import beside
 from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
-from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_chi2, fit_steps
-from tmlattice.diagnosis.response.swaps import Swaps, labels_corrected, planes_back, swapped_planes
-from tmlattice.diagnosis.response.unlike_model import (
-    ODD,
-    RejectedChannels,
-    reversed_ones,
-    unlike_model,
+from tmlattice.diagnosis.response.stepwise import (
+    StepwiseFit,
+    all_families,
+    fit_chi2,
+    needed_families,
 )
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import outliers
@@ -118,11 +123,11 @@ def diagnose_response(
     estimated = measured.noise is None
     measured = corrected_data(ring, measured, assume)
     trials, data = trials_of(effects), response_data(ring, measured)
-    messages = [*data_checks(ring, measured), *assumed_of(measured, data)]
+    notes = [*data_checks(ring, measured), *assumed_of(measured, data)]
     measured = replace(data.measured, noise=data.noise) if estimated else measured
     measured, gross = without_gross(measured, data)
     if gross:
-        messages, data = messages + gross, response_data(ring, measured)
+        notes, data = notes + gross, response_data(ring, measured)
     split = split_columns(data, holdout, np.random.default_rng(seed))
     judgement = Judgement(false_alarm=false_alarm)
     sparse = sparse_fit(data, split, effects, max_effects, judgement, seed, progress)
@@ -132,10 +137,11 @@ def diagnose_response(
         sparse = None if worse else sparse
     rejected: tuple[tuple[str, str | None], ...] = ()
     if sparse is None:
-        fit, measured, unlike, swaps = whole
-        messages += unlike if measured.response.size <= LARGE else [*unlike, TOO_LARGE]
-        rejected = tuple(swaps.rejected)
-        fit, findings = _faults(fit, swaps, effects, max_effects, judgement, progress)
+        fit, measured, labels = whole
+        notes += [*label_messages(own for own in labels if own not in fit.labels), *fit.messages]
+        notes += [] if measured.response.size <= LARGE else [TOO_LARGE]
+        rejected = tuple((own.elements[0], own.plane) for own in labels if "rejected" in own.kind)
+        fit, findings = _faults(fit, labels, effects, max_effects, judgement, progress)
         found, supports, degenerate, correlated, covariance = fitted_causes(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
@@ -155,7 +161,7 @@ def diagnose_response(
         verdict=verdict,
         findings=with_consequences(ring, findings, causes),
         warnings=(
-            *messages, *(reversed_ones(fit.state) if sparse is None else sparse.messages),
+            *notes, *(reversed_ones(fit.state) if sparse is None else sparse.messages),
             *_warnings(fit),
         ),
         degenerate=degenerate,
@@ -178,55 +184,42 @@ def _families(
     most: int,
     seed: int,
     progress: Callable[[str], Any],
-) -> tuple[StepwiseFit, OrbitResponse, list[str], Swaps]:
-    """The hierarchical fit without rejected channels, its measurement, messages, and swaps."""
-    messages: list[str] = []
-    known = Swaps([], {}, {}, [])
-    fit: StepwiseFit | None = None
+) -> tuple[StepwiseFit, OrbitResponse, list[Label]]:
+    """The hierarchical fit of the corrected measurement, that measurement, and all labels.
+
+    Swaps are corrected, and rejected channels are removed, by the design, by the fit of all
+    families, and by that of the needed ones, until there are no new ones."""
+    known: list[Label] = []
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
-        state = begin(data, split) if fit is None else fit.state
-        unlike = unlike_model(state)
-        others = set() if fit is None else _anothers(state)
-        far = fit is None and _far(state, unlike)
-        right = None if far else labels_corrected(state, measured, known, unlike, others)
-        if right is not None:
-            measured, fit = right[0], None
-            messages.append(right[1])
-            continue
-        crossed = [name for name in swapped_planes(state) if name not in known.planes]
-        if crossed:
-            known.planes.extend(crossed)
-            measured, fit = planes_back(measured, crossed), None
-            continue
-        if unlike.any:
-            messages += unlike.messages
-            known.rejected.extend([*unlike.monitors, *((name, None) for name in unlike.correctors)])
-            measured = unlike.without(measured)
-            data = response_data(ring, measured)
-            split = split_columns(data, holdout, np.random.default_rng(seed))
-        elif fit is not None:
-            return fit, measured, [*messages, *fit.messages], known
-        fit = fit_steps(data, split, trials, most, progress)
+        found = _wrong(begin(data, split), known, of_design=True)
+        if not found:
+            started = all_families(data, split, trials, progress)
+            swapped = [own for own in started.labels if own.kind == "swapped correctors"]
+            found = [*new(swapped, known), *_wrong(started.state, known)]
+            if not found:
+                fit = needed_families(started, most, progress)
+                found = _wrong(fit.state, known)
+            if not found:
+                return fit, measured, [*known, *started.labels]
+        known += found
+        measured = corrected(measured, found)
 
 
-def _far(state: State, unlike: RejectedChannels) -> bool:
-    """Whether the design is far from the ring: swapped columns then match by chance, and the ring
-    is fitted before swaps are sought."""
-    gone = {name for name, _ in unlike.monitors}
-    good = state.good & ~np.isin(state.data.measured.monitors, list(gone))
-    return strange(replace(state, good=good), TYPICAL) > FAR
-
-
-def _anothers(state: State) -> set[str]:
-    """Correctors that may be swapped: misplaced ones, and those with large residuals."""
-    return {*(own.name for own in misplaced(state)), *unlike_model(state, ODD).correctors}
+def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> list[Label]:
+    """New swaps by a state; if there are none, rejected channels. If the design is far from the
+    ring, columns match by chance, and the ring is fitted before swaps are sought."""
+    gone = rejected_channels(state)
+    names = [own.elements[0] for own in gone if own.kind == "rejected monitor"]
+    good = state.good & ~np.isin(state.data.measured.monitors, names)
+    far = of_design and strange(replace(state, good=good), TYPICAL) > FAR
+    return new([*([] if far else swaps(state, gone)), *swapped_planes(state)], known) or gone
 
 
 def _faults(
     fit: StepwiseFit,
-    swaps: Swaps,
+    labels: Sequence[Label],
     effects: Sequence[str] | None,
     most: int,
     judgement: Judgement,
@@ -235,26 +228,19 @@ def _faults(
     """The fit given detected single faults, and the findings."""
     state = fit.state
     ring = state.data.ring
-    found = [swap_of(state, name, judgement) for name in swaps.planes
-             if effects is None or "monitor_swap" in effects]  # fmt: skip
-    far = misplaced(state)
+    planes = () if effects is not None and "monitor_swap" not in effects else labels
+    found = [swap_of(state, own.elements[0], judgement) for own in planes
+             if own.kind == "swapped planes"]  # fmt: skip
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
-        sound = _without(state, far)
         alone = detected_faults(
-            sound.data, sound.split, sound, hypotheses, most, judgement, progress
+            state.data, state.split, state, hypotheses, most, judgement, progress
         )
         fit = given_faults(fit, alone.state.apart) if alone.faults else fit
         found += [fault.finding(ring, judgement) for fault in alone.faults]
-    found = [*strongest_first(found)[:most], *label_findings(ring, swaps, far)]
+    of_labels = (own.finding(ring) for own in labels)
+    found = [*strongest_first(found)[:most], *(own for own in of_labels if own is not None)]
     return fit, strongest_first(found)
-
-
-def _without(state: State, far: Sequence[Misplaced]) -> State:
-    """The state without the steps of misplaced correctors, no evidence of single faults."""
-    gone = np.zeros(state.data.orbits.shape, dtype=bool)
-    gone[[own.column for own in far]] = True
-    return beside(state, gone)
 
 
 def as_diagnosis(

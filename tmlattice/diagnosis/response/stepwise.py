@@ -20,9 +20,10 @@ from tmlattice.diagnosis.assessment import Block, combined_p_value
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
+from tmlattice.diagnosis.response.labels import Label, label_messages
 from tmlattice.diagnosis.response.linear import Linear, linear
-from tmlattice.diagnosis.response.outlier_readings import robust
-from tmlattice.diagnosis.response.outlier_steps import beside, outlier_steps
+from tmlattice.diagnosis.response.outlier_readings import robust, single_outliers, told_gross
+from tmlattice.diagnosis.response.outlier_steps import outlier_steps, rejected, without_readings
 from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others
 from tmlattice.diagnosis.response.rounds import Evidence, evidence_of, linear_evidence, settle
@@ -135,6 +136,7 @@ class StepwiseFit:
         rejected_steps: did not improve the fit.
         heldout: validation scores of the design and of the result.
         messages: about rejected readings, implausible families and beam jitter.
+        labels: of rejected steps.
     """
 
     design: State
@@ -143,6 +145,7 @@ class StepwiseFit:
     rejected_steps: tuple[Step, ...]
     heldout: tuple[Score, Score]
     messages: tuple[str, ...] = ()
+    labels: tuple[Label, ...] = ()
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -164,51 +167,102 @@ def fit_steps(
 ) -> StepwiseFit:
     """Return the fit of all families that are needed, to all correctors except the held-out ones.
 
+    Args:
+        data, split, trials, progress: see `all_families`.
+        most: most accepted steps.
+    """
+    return needed_families(all_families(data, split, trials, progress), most, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class AllFamilies:
+    """The fit of all families, before the unneeded ones are removed.
+
+    Attributes:
+        design, state: before and after, without rejected readings.
+        stages: the state after each trial was added, with these readings.
+        rejected: readings, [column, monitor, plane that is read].
+        labels: of outlier steps.
+        messages: about rejected readings.
+        doubts: about implausible families.
+    """
+
+    design: State
+    state: State
+    stages: dict[Trial, State]
+    rejected: Flags
+    labels: tuple[Label, ...]
+    messages: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+
+def all_families(
+    data: ResponseData,
+    split: Split,
+    trials: Sequence[Trial] = STEPS,
+    progress: Callable[[str], Any] = lambda stage: None,
+) -> AllFamilies:
+    """Return the fit of all families, without outliers.
+
     Families need one another: BPM gains improve nothing before the gradients, for example. So all
     are fitted together, and each is tested by the loss without it, with the others fitted again.
 
     Args:
         data, split: the data, and the validation split.
         trials: families, in the order in which they are added.
-        most: most accepted steps.
         progress: called with each step's name.
     """
     design = begin(data, split)
     stages, state = _in_turn(design, trials, progress)
-    readings, steps_gone = outlier_steps(state)
-    if readings.messages:  # outliers have biased the families, and the residuals of steps
-        stages, state = _in_turn(beside(design, readings.unread), trials, progress)
-        more, steps_gone = outlier_steps(state)
-        readings = readings.and_more(more)
-    odd = readings.and_more(steps_gone)
+    single, labels = _outliers(state)
+    if single.any():  # they have biased the families, and the residuals of steps
+        stages, state = _in_turn(without_readings(design, single), trials, progress)
+        more, labels = _outliers(state)
+        single = single | more
     progress("all together")
-    state, doubts = _together(beside(state, odd.unread), stages)
+    state, doubts = _together(without_readings(state, single | rejected(state, labels)), stages)
     log.info("effective sample size per reading: %s", state.independent)
-    odd = odd.and_more(*outlier_steps(state))  # typical residuals are smaller now
-    state, design = beside(state, odd.unread), beside(design, odd.unread)
-    state, moving = _beside_jitter(state, progress)
+    more, later = _outliers(state)  # typical residuals are smaller now
+    single, labels = single | more, [*labels, *later]
+    odd = single | rejected(state, labels)
+    return AllFamilies(
+        without_readings(design, odd), without_readings(state, odd), stages, odd, tuple(labels),
+        (*told_gross(data, single, "the fit"), *label_messages(labels)), tuple(doubts),
+    )  # fmt: skip
+
+
+def needed_families(
+    started: AllFamilies, most: int, progress: Callable[[str], Any] = lambda stage: None
+) -> StepwiseFit:
+    """Return the fit of the families that are needed.
+
+    Args:
+        started: the fit of all families.
+        most: most accepted steps.
+        progress: called with each step's name.
+    """
+    design, labels = started.design, started.labels
+    state, moving = _beside_jitter(started.state, progress)
     split = state.split
     before = score(design, split.held)
     steps = {
         trial: Step.scored(
-            _title(trial), sum(family.count(data) for family in trial.families),
-            score(beside(own, odd.unread), split.held),
+            _title(trial), sum(family.count(state.data) for family in trial.families),
+            score(without_readings(own, started.rejected), split.held),
         )
-        for trial, own in stages.items()
+        for trial, own in started.stages.items()
     }  # fmt: skip
-    stages.clear()
+    started.stages.clear()  # of many readings, they are large
     state, gone, others = _needed(state, steps, most, progress)
-    rejected_steps, doubts = (
-        [replace(steps.pop(own), kept=False) for own in gone],
-        [*doubts, *others],
-    )
+    rejected_steps = [replace(steps.pop(own), kept=False) for own in gone]
+    notes = [*started.messages, *started.doubts, *others]
     validated = inner(state)
     enough = int(np.sum(validated.columns[:, 0, 1] > 0)) >= ENOUGH
     worse = -lost(inner(replace(design, jitter=state.jitter)), validated)[0]
     nothing = StepwiseFit(
         design, design, (Step.scored("design", 0, before),),
         (*rejected_steps, *(replace(step, kept=False) for step in steps.values())),
-        (before, before), (*odd.messages, *doubts),
+        (before, before), tuple(notes), labels,
     )  # fmt: skip
     if enough and worse > SPOILT:  # together they worsen the validation
         return nothing
@@ -220,7 +274,7 @@ def fit_steps(
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(robust(state)))
     for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since
-        doubts += _doubts(state, trial)
+        notes += _doubts(state, trial)
         state = _without(state, trial)
         rejected_steps.append(replace(steps.pop(trial), kept=False))
     then = replace(design, good=state.good, exploring=False)
@@ -233,31 +287,59 @@ def fit_steps(
     after = score(state, split.held)
     kept = [Step.scored("design", 0, before), *steps.values()]
     kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
-    messages = (*odd.messages, *doubts, *(() if moving is None else (moving.sentence,)))
-    return StepwiseFit(design, state, tuple(kept), tuple(rejected_steps), (before, after), messages)
+    notes += [] if moving is None else [moving.sentence]
+    return StepwiseFit(
+        design, state, tuple(kept), tuple(rejected_steps), (before, after), tuple(notes), labels
+    )
+
+
+def _outliers(state: State) -> tuple[Flags, list[Label]]:
+    """Single outlier readings, [column, monitor, 2], and the labels of outlier steps."""
+    # if the lattice is far from the ring, a column may have started with a wrong calibration, and
+    # with the third order of its kick
+    state = bend(jump(state, beyond=1.0))
+    single = single_outliers(state)
+    labels = outlier_steps(without_readings(state, single))
+    return single & ~rejected(state, labels), labels
 
 
 def _needed(
     state: State, trials: Collection[Trial], most: int, progress: Callable[[str], Any]
 ) -> tuple[State, list[Trial], list[str]]:
     """The state with the needed families alone, `most` trials at most; the rejected trials; and
-    messages about implausible ones."""
+    messages about implausible ones.
+
+    The least needed one by the linearised evidence is tested first. Once one is removed, those that
+    were not tested are linearised again."""
     there = {family.name for family in state.families}
-    needed = [own for own in trials if there & {family.name for family in own.families}]
-    gone = [own for own in trials if own not in needed]
+    untested = [own for own in trials if there & {family.name for family in own.families}]
+    gone = [own for own in trials if own not in untested]
     doubts: list[str] = []
-    worth, without = _worth(state, needed, progress)
-    while worth and (min(worth.values()) <= 0 or len(worth) > most):
-        least = min(worth, key=lambda trial: worth[trial])
-        doubts += _doubts(state, least)
-        state = without[least] if least in without else _without(state, least)
+    worth: dict[Trial, float] = {}
+    removed = True
+    while untested:
+        if removed:
+            linear_worth, rejected = _quickly(state, untested, progress)
+            sure = [own for own in untested if linear_worth[own] > SURE and not rejected[own]]
+            worth |= {own: linear_worth[own] for own in sure}
+            untested = sorted(
+                (own for own in untested if own not in worth), key=lambda own: linear_worth[own]
+            )
+            if not untested:
+                break
+            whole = evidence_of(state, state.good, state.independent)
+        least = untested.pop(0)
+        progress(f"without {_title(least)}")
+        worth[least], without = _tested(state, least, linear_worth[least], whole)
+        removed = without is not None and worth[least] <= 0
+        if without is not None and removed:
+            doubts += _doubts(state, least)
+            gone.append(least)
+            del worth[least]
+            state = without
+    for least in sorted(worth, key=lambda own: worth[own])[: max(len(worth) - most, 0)]:
+        state = _without(state, least)
         gone.append(least)
-        del worth[least]
-        unsure = [trial for trial, own in worth.items() if own <= 0]
-        without = {}
-        if unsure:
-            again, without = _worth(state, unsure, progress)
-            worth |= again
     return state, gone, doubts
 
 
@@ -330,54 +412,39 @@ def _blocks(trial: Trial) -> list[int]:
     return [1] * (trial.across > 0) + [0] * (trial.own > 0)
 
 
-def _worth(
-    state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
-) -> tuple[dict[Trial, float], dict[Trial, State]]:
-    """Log evidence beyond `LEAST` of each trial (0 or less: not needed), and the states without it.
+def _tested(
+    state: State, trial: Trial, linear_worth: float, whole: Evidence
+) -> tuple[float, State | None]:
+    """Log evidence beyond `LEAST` of a trial (0 or less: not needed), and the state without it;
+    None if no beam is stored without it.
 
     Validation has a veto, because the evidence assumes independent readings, and model discrepancy
-    is not. Where validation and the linearised evidence both favour a family, the latter decides,
+    is not. Where it favours a family, any evidence suffices, that of the linearised fit too,
     because the costs of two separate fits agree only to a share of their size.
     """
-    worth, rejected = _quickly(state, trials, progress)
-    doubtful = [
-        trial for trial, unwanted in rejected.items()
-        if worth[trial] > -np.inf and (unwanted or not worth[trial] > SURE)
-    ]  # fmt: skip
-    states: dict[Trial, State] = {}
-    if not doubtful:
-        return worth, states
+    try:
+        without = _without(state, trial)
+    except TmlatticeError:  # no closed orbit without it
+        return np.inf, None
+    if linear_worth == -np.inf:
+        return linear_worth, without
+    good = state.good & without.good
     shares = state.independent
-    whole = evidence_of(state, state.good, shares)
+    with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
+    other = evidence_of(without, good, shares)
+    gained = with_it.log - other.log - LEAST
+    messages = lost(
+        inner(replace(without, good=good), _of_rf(other)),
+        inner(replace(state, good=good), _of_rf(with_it)),
+    )
+    log.info("without %s: evidence %+.1f, validation %+.3f +- %.3f", _title(trial), -gained,
+             *messages)  # fmt: skip
     unsure = ROUGH * np.count_nonzero(np.isfinite(state.data.orbits[state.fitted])) / 2
-    for trial in doubtful:
-        progress(f"without {_title(trial)}")
-        try:
-            without = states[trial] = _without(state, trial)
-        except TmlatticeError:  # no closed orbit without it
-            worth[trial] = np.inf
-            continue
-        good = state.good & without.good
-        with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
-        other = evidence_of(without, good, shares)
-        gained = with_it.log - other.log - LEAST
-        messages = lost(
-            inner(replace(without, good=good), _of_rf(other)),
-            inner(replace(state, good=good), _of_rf(with_it)),
-        )
-        log.info(
-            "without %s: evidence %+.1f, validation %+.3f +- %.3f",
-            _title(trial),
-            -gained,
-            *messages,
-        )
-        if not _asked(trial):
-            worth[trial] = gained
-        elif against(messages):
-            worth[trial] = min(gained, messages[0])
-        elif not (in_favour(messages) and worth[trial] > gained > -unsure):
-            worth[trial] = gained
-    return worth, states
+    if _asked(trial) and against(messages):
+        gained = min(gained, messages[0])
+    elif _asked(trial) and in_favour(messages) and gained > -unsure:
+        gained = max(gained, linear_worth) + LEAST
+    return gained, without
 
 
 def _doubts(state: State, trial: Trial) -> list[str]:
@@ -418,10 +485,8 @@ def _quickly(
     validated = inner(state, of_rf)
     for trial in trials:
         progress(f"is {_title(trial)} needed")
-        if not any(state.values[family.variable].any() for family in trial.families):
-            worth[trial], unwanted[trial] = -LEAST, False  # held at zero: nothing is lost without
-            continue
-        if _doubts(state, trial):
+        at_zero = not any(state.values[family.variable].any() for family in trial.families)
+        if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
             worth[trial], unwanted[trial] = -np.inf, False
             continue
         block = trial.families[0].block
