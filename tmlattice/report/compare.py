@@ -119,8 +119,7 @@ class Differences(Speaks):
         if not self.rows:
             return "\n".join([*lines, f"The two {self.kind} do not differ."])
         table = [("quantity", "element", "first", "second", "difference", "unit", "sigmas")]
-        count = SHOWN if most is None else max(most - len(lines) - 5, 1)
-        for row in self.rows[:count]:
+        for row in self.rows[:SHOWN]:
             error = f" ± {row.sigma:.2g}" if row.sigma > 0 else ""
             if row.quantity == ORBIT and error:
                 error = f" (noise {row.sigma:.2g})"
@@ -129,9 +128,13 @@ class Differences(Speaks):
                 _text(row.difference) + error if math.isfinite(row.difference) else "",
                 row.unit, f"{row.pull:.1f}" if math.isfinite(row.pull) else "",
             ))  # fmt: skip
-        lines += [f"first: {self.names[0]}, second: {self.names[1]}", "", *columns(table, width)]
-        if len(self.rows) > count:
-            lines.append(f"and {len(self.rows) - count} more rows (--json has all)")
+        lines += [*wrapped(f"first: {self.names[0]}, second: {self.names[1]}", "", width), ""]
+        shown = columns(table, width)
+        while most is not None and len(table) > 2 and len(lines) + len(shown) >= most:
+            shown = columns(table := table[:-1], width)
+        lines += shown
+        if left := len(self.rows) - len(table) + 1:
+            lines.append(f"and {left} more rows (--json has all)")
         return "\n".join(lines)
 
 

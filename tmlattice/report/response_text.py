@@ -297,8 +297,8 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     lines += ["", *wrapped(left_sentence(result), "", width)]
     if result.hypotheses:
         lines += ["", *wrapped(MISSING, "", width)]
-        head, *rows = hypothesis_rows(result)
-        lines += columns([head, *(row for row in rows if row[-1] != OUT)], width, right=True)
+        rows = hypothesis_rows(result)
+        lines += columns([row for row in rows if row[-1] != OUT], width, right=True)
         out = "; ".join(row[0] for row in rows if row[-1] == OUT)
         lines += wrapped(f"{OUT.capitalize()}: {out}." if out else "", "", width)
     for said in result.degenerate:

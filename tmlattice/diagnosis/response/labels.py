@@ -1,4 +1,4 @@
-"""Labels of a response: channels that are not what the table of names says, and their correction.
+"""Labels of a response: channels that are not those of the table of names, and their correction.
 
 Two cables, or two rows of a table of names, may be swapped; a corrector may be elsewhere than in
 the lattice; a channel may read noise, or another step than the one that was asked for. A label is
@@ -314,7 +314,7 @@ def without_swaps(
 
 
 def new(labels: Iterable[Label], known: Iterable[Label]) -> list[Label]:
-    """Return the labels of pairs that are not known."""
+    """Return the labels of pairs that are unknown."""
     before = {label.elements for label in known}
     return [label for label in labels if label.elements not in before]
 
