@@ -190,8 +190,8 @@ class _Search:
         return None
 
     def leaders(self) -> list[tuple[Hypothesis, float, Array]]:
-        """Candidates: the most probable by the linear model, one of each action and of each place
-        that the readings tell apart, with amount and information of each block."""
+        """Candidates: the most probable by the linear model, one of each action, with amount and
+        information of each block."""
         ring = self.state.data.ring
         seen = self.seen(self.state)
         if not seen.suspects:
@@ -205,14 +205,11 @@ class _Search:
         order = [int(h) for h in np.argsort(-evidence) if evidence[h] > max(least, -np.inf)]
         found: dict[str, tuple[Hypothesis, float, Array]] = {}
         have = [one.cause for one in self.state.apart]
-        tried: list[float] = []
         for h in order:
-            cause, statistic = seen.suspects[h].cause, float(own.statistic[h])
+            cause = seen.suspects[h].cause
             same = recommended_action(ring, Cause(*cause, float(own.amount[h])))
-            if cause in have or len(found) == self.tries or np.isclose(statistic, tried).any():
-                continue
-            tried.append(statistic)
-            found.setdefault(same, (cause, float(own.amount[h]), own.information[:, h]))
+            if cause not in have and len(found) < self.tries:
+                found.setdefault(same, (cause, float(own.amount[h]), own.information[:, h]))
         return list(found.values())
 
     def put(self, state: State, cause: Hypothesis, information: Array) -> State | None:
