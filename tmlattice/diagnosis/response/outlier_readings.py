@@ -8,6 +8,7 @@ five times its noise; gross outliers are rejected.
 import warnings
 from collections import Counter
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,6 @@ GROSS = 20.0
 rejected: no error of a ring has this effect on a single reading."""
 MANY_OF_STEP = 0.1
 """Share of a step's readings above which, if more than one, its outliers are no single readings."""
-GAINS = "monitor_gain"
-"""The family of BPM gains."""
 OUT = 5.0
 """Ratio of a residual to the typical one of its column above which a reading is an outlier."""
 LEAST = 6
@@ -49,7 +48,7 @@ def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitRes
         measured: the response.
         data: the same response on the ring.
     """
-    wrong = gross(data, data.orbits - Predicted(data, Errors.none(data)).read)
+    wrong = gross(data, Predicted(data, Errors.none(data)).read)
     if not wrong.any():
         return measured, []
     response = data.measured.response.copy()
@@ -57,46 +56,35 @@ def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitRes
     return replace(data.measured, response=response), told_gross(data, wrong, "the design")
 
 
-def gross(data: ResponseData, left: Array) -> Flags:
-    """Return the gross outliers among the correctors' readings, [column, monitor, 2].
+def gross(data: ResponseData, read: Array) -> Flags:
+    """Return the gross outliers among the correctors' readings, [column, monitor, 2]; none of steps
+    with many of them, which are outliers themselves.
 
     Args:
         data: the response.
-        left: residuals, m, NaN where nothing was read, [column, monitor, 2].
+        read: by the model, m, [column, monitor, 2]. Each column has a kick of its own, because
+            held-out ones are not fitted. It minimises the absolute deviations, which is robust
+            against outliers.
     """
-    gap, plane = np.abs(left[:-1]), data.plane[:-1]
-    wrong = np.zeros(left.shape, dtype=bool)
-    for kicked, read in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        rows = np.flatnonzero(plane == kicked)
-        own = gap[rows, :, read]
+    model, orbits, wrong = data.pick(read), data.pick(data.orbits), np.zeros(read.shape, dtype=bool)
+    gap = np.abs(data.orbits)
+    for c, (u, d) in enumerate(zip(model, orbits, strict=True)):
+        use = np.isfinite(d) & (u != 0)
+        ratio, size = d[use] / u[use], np.abs(u[use])
+        order = np.argsort(ratio)
+        half = np.searchsorted(np.cumsum(size[order]), size.sum() / 2)
+        gap[c] = np.abs(data.orbits[c] - (ratio[order][half] if use.any() else 1.0) * read[c])
+    for kicked, plane in product((0, 1), (0, 1)):
+        rows = np.flatnonzero(data.plane[:-1] == kicked)
+        own = gap[rows, :, plane]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # no readings
             column, monitor = (np.nanmedian(own, axis=k, keepdims=True) for k in (1, 0))
-        usual = np.fmax(np.fmax(column, monitor), data.noise[:, read])
-        wrong[rows, :, read] = np.nan_to_num(own) > GROSS * _MAD * usual
-    return wrong
-
-
-def single_outliers(state: State) -> Flags:
-    """Return the gross outliers of a fit, [column, monitor, 2]: none of steps with many of them,
-    which are outliers themselves, and none without BPM gains, because unknown gains look alike."""
-    data, read = state.data, state.at.read
-    if not state.allows(GAINS):
-        return np.zeros(data.orbits.shape, dtype=bool)
-    # given each column's own kick, because held-out columns are not fitted; it minimises the
-    # absolute deviations, which is robust against outliers
-    model, orbits = data.pick(read), data.pick(data.orbits)
-    kick = np.ones(len(model))
-    for c, (u, d) in enumerate(zip(model, orbits, strict=True)):
-        use = np.isfinite(d) & state.good & (u != 0)
-        ratio, size = (d[use] / u[use]), np.abs(u[use])
-        order = np.argsort(ratio)
-        half = np.searchsorted(np.cumsum(size[order]), size.sum() / 2)
-        kick[c] = ratio[order][half] if use.any() else 1.0
-    alone = gross(data, data.orbits - kick[:, None, None] * read)
+        usual = np.fmax(np.fmax(column, monitor), data.noise[:, plane])
+        wrong[rows, :, plane] = np.nan_to_num(own) > GROSS * _MAD * usual
     count = np.isfinite(data.orbits).sum(axis=(1, 2))
-    alone[alone.sum(axis=(1, 2)) > np.maximum(MANY_OF_STEP * count, 1)] = False
-    return alone
+    wrong[wrong.sum(axis=(1, 2)) > np.maximum(MANY_OF_STEP * count, 1)] = False
+    return wrong
 
 
 def told_gross(data: ResponseData, wrong: Flags, what: str) -> list[str]:

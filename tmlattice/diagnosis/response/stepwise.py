@@ -22,7 +22,7 @@ from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
 from tmlattice.diagnosis.response.labels import Label, label_messages
 from tmlattice.diagnosis.response.linear import Linear, linear
-from tmlattice.diagnosis.response.outlier_readings import robust, single_outliers, told_gross
+from tmlattice.diagnosis.response.outlier_readings import gross, robust, told_gross
 from tmlattice.diagnosis.response.outlier_steps import outlier_steps, rejected, without_readings
 from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.rf_by_others import rf_by_others
@@ -298,7 +298,7 @@ def _outliers(state: State) -> tuple[Flags, list[Label]]:
     # if the lattice is far from the ring, a column may have started with a wrong calibration, and
     # with the third order of its kick
     state = bend(jump(state, beyond=1.0))
-    single = single_outliers(state)
+    single = gross(state.data, state.at.read)
     labels = outlier_steps(without_readings(state, single))
     return single & ~rejected(state, labels), labels
 
@@ -419,7 +419,7 @@ def _tested(
     None if no beam is stored without it.
 
     Validation has a veto, because the evidence assumes independent readings, and model discrepancy
-    is not. Where it favours a family, any evidence suffices, that of the linearised fit too,
+    is not. Where validation and the linearised evidence both favour a family, the latter decides,
     because the costs of two separate fits agree only to a share of their size.
     """
     try:
@@ -442,8 +442,8 @@ def _tested(
     unsure = ROUGH * np.count_nonzero(np.isfinite(state.data.orbits[state.fitted])) / 2
     if _asked(trial) and against(messages):
         gained = min(gained, messages[0])
-    elif _asked(trial) and in_favour(messages) and gained > -unsure:
-        gained = max(gained, linear_worth) + LEAST
+    elif _asked(trial) and in_favour(messages) and linear_worth > gained > -unsure:
+        gained = linear_worth
     return gained, without
 
 
