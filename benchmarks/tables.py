@@ -77,6 +77,22 @@ def of_corrections(machines):
         ]  # fmt: skip
 
 
+def of_threading(machines):
+    """Beams that `threading_beam.py` brings round, by ring."""
+    yield ["ring", "quadrupoles displaced, rms", "machines", "first turn before, median",
+           "oracle", "tmlattice", "rounds, median (most)"]  # fmt: skip
+    for ring, offset in sorted({(one["ring"], one["offset"]) for one in machines}):
+        own = [one for one in machines if (one["ring"], one["offset"]) == (ring, offset)]
+        rounds = [len(one["rounds"]) + len(one.get("refused", ()))
+                  for one in own if 20 in one["rounds"]]  # fmt: skip
+        yield [
+            ring, f"{1e3 * offset:g} mm", str(len(own)),
+            f"{100 * np.median([one['before'] for one in own]):.0f} %",
+            str(sum(one["oracle"] == 20 for one in own)), str(len(rounds)),
+            f"{np.median(rounds):g} ({max(rounds)})",
+        ]  # fmt: skip
+
+
 def of_score(scored):
     """Rates of `tmlattice dev challenge score --json`, by signal to noise and method."""
     yield ["single faults (tier A)", *BLIND.values()]
@@ -158,6 +174,7 @@ SOURCES = {
     "stated_errors.jsonl": of_stated_errors,
     "gpu_raw.json": of_gpu,
     "correct_studies.jsonl": of_corrections,
+    "threading.jsonl": of_threading,
     "blind_score.json": of_score,
 }
 

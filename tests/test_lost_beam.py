@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
+from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
@@ -210,3 +211,14 @@ def test_turns_of_a_stored_beam_that_was_lost(small_ring):
     found = {c.name: c for c in signals.monitors(small_ring, names, frozen[0])}
     assert found["frozen BPMs"].status == "note"
     assert names[5] in found["frozen BPMs"].sentence
+
+
+def test_the_model_behind_a_lost_beam_stays_finite(small_ring):
+    """Maps of second order overflow on the third turn; what was read before still has slopes."""
+    launches = np.array([[0.3, 0.05, 0.3, 0.0, 0.0]])
+    model = Model(small_ring, [{}], 3)
+    paths = model.paths(launches)
+    assert np.isnan(paths.beam[0, -1]).all()
+    assert np.isfinite(paths.launch).all()
+    found = model.signatures(paths, [("quadrupole_gradient", "QF::1")], launches)
+    assert np.isfinite(found).all()

@@ -141,8 +141,9 @@ def diagnose(
     from tmlattice.correction.result import FILES
 
     with outputs(out, json_file, FILES) as (folder, write):
-        from tmlattice.correction.applied import applied, read_settings
+        from tmlattice.correction.applied import applied
         from tmlattice.correction.applied import sentence as of_device
+        from tmlattice.correction.knobs import read_settings
         from tmlattice.effects import background_rms, names
 
         if effects is not None:
@@ -223,6 +224,12 @@ def diagnose(
     _print(result, correction, out, json_file, written)
     for own in calibrations:
         console().print(of_device(own), soft_wrap=True)
+    if calibrations:
+        console().print(
+            "\nTo correct what is left, diagnose the measurement without --reference and with "
+            f"--lattice-out, and run `tmlattice correct` with --knobs {settings_file}.",
+            soft_wrap=True,
+        )
     if reading:
         _print_weights(ring, reading)
 

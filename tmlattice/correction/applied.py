@@ -4,23 +4,15 @@
 ...     print(own.device, own.ratio, own.ratio_error)
 """
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from tmlattice.correction.knobs import KINDS, Knob, knobs_of
+from tmlattice.correction.knobs import KINDS, Knob
 from tmlattice.diagnosis import Diagnosis
-from tmlattice.errors import MeasurementError, plain
-from tmlattice.input_files import number, text_of
-from tmlattice.lattice import Ring
-
-ROUNDING = 1e-6
-"""Of settings in a table, relative."""
+from tmlattice.errors import MeasurementError
 
 
 @dataclass(frozen=True)
@@ -48,44 +40,6 @@ class Applied:
     def ratio_error(self) -> float:
         """Its standard deviation."""
         return abs(self.error / self.asked)
-
-
-def read_settings(path: Path, ring: Ring) -> list[tuple[Knob, float]]:
-    """Return devices and their new settings, from the settings.csv of a correction.
-
-    Args:
-        path: of the table.
-        ring: whose strengths are the present settings.
-
-    Raises:
-        MeasurementError, UnknownNameError: a table that cannot be read, or a device that the ring
-            does not have.
-    """
-    rows: list[dict[str, Any]] = []
-    new: list[float] = []
-    for row in csv.DictReader(text_of(path, MeasurementError).splitlines()):
-        try:
-            there, then = number(row["present"]), number(row.pop("new"))
-            change = number(row.get("change") or str(then - there))
-            if not (math.isfinite(then) and math.isfinite(there)):
-                raise ValueError
-            rows.append({**row, "knob": row.pop("device"), "present": there})
-            new.append(then)
-        except (KeyError, TypeError, ValueError):
-            raise MeasurementError(
-                f"{path}: a row has no device, present or new; give the settings.csv of a "
-                f"correction (found: {plain(str(row), 80)})"
-            ) from None
-        if not abs(then - there - change) <= ROUNDING * max(abs(then), abs(there)):
-            raise MeasurementError(
-                f"{path}: the change of '{plain(str(rows[-1]['knob']), 40)}' is {change:.9g}, but "
-                f"its new setting less the present one is {then - there:.9g}; correct the row"
-            )
-        for derived in ("device", "change", "gain"):
-            rows[-1].pop(derived, None)
-    if not rows:
-        raise MeasurementError(f"{path}: it contains no setting")
-    return list(zip(knobs_of(rows, path, ring), new, strict=True))
 
 
 def applied(diagnosis: Diagnosis, settings: Sequence[tuple[Knob, float]]) -> list[Applied]:

@@ -278,6 +278,8 @@ def _correctors(ring: Ring) -> list[Knob]:
 
 
 # --- tables ---------------------------------------------------------------------------------------
+ROUNDING = 1e-6
+"""Of settings in a table, relative."""
 COLUMNS = (
     "knob", "kind", "members", "unit", "present", "low", "high", "step", "error", "curve",
 )  # fmt: skip
@@ -287,7 +289,7 @@ COLUMNS = (
 
 def read_knobs(path: Path, ring: Ring) -> list[Knob]:
     """Knobs of a table: .csv with the header `COLUMNS`, or .yaml with a list of such mappings; see
-    `knobs_of`.
+    `knobs_of`. Of the settings.csv of a correction, its new settings are the present ones.
 
     Raises:
         MeasurementError: a table that cannot be read, with the knob.
@@ -296,8 +298,52 @@ def read_knobs(path: Path, ring: Ring) -> list[Knob]:
     if path.suffix.lower() in (".yaml", ".yml"):
         rows = yaml_of(path, MeasurementError)
     else:
-        rows = list(csv.DictReader(text_of(path, MeasurementError).splitlines()))
+        rows = _table(path)
+        if rows and {"device", "new"} <= rows[0].keys():
+            return [replace(knob, present=new) for knob, new in read_settings(path, ring)]
     return knobs_of(rows, path, ring)
+
+
+def _table(path: Path) -> list[dict[str, Any]]:
+    return list(csv.DictReader(text_of(path, MeasurementError).splitlines()))
+
+
+def read_settings(path: Path, ring: Ring) -> list[tuple[Knob, float]]:
+    """Return devices and their new settings, from the settings.csv of a correction.
+
+    Args:
+        path: of the table.
+        ring: whose strengths are the present settings.
+
+    Raises:
+        MeasurementError, UnknownNameError: a table that cannot be read, or a device that the ring
+            does not have.
+    """
+    rows: list[dict[str, Any]] = []
+    new: list[float] = []
+    for row in _table(path):
+        try:
+            there, then = number(str(row["present"])), number(str(row.pop("new")))
+            change = number(row.get("change") or str(then - there))
+            if not (math.isfinite(then) and math.isfinite(there)):
+                raise ValueError
+            rows.append({**row, "knob": row.pop("device"), "present": there})
+            new.append(then)
+        except (KeyError, TypeError, ValueError):
+            raise MeasurementError(
+                f"{path}: a row has no device, present or new; give the settings.csv of a "
+                f"correction (found: {plain(str(row), 80)})"
+            ) from None
+        if not abs(then - there - change) <= ROUNDING * max(abs(then), abs(there)):
+            raise MeasurementError(
+                f"{path}: the change of '{plain(str(rows[-1]['knob']), 40)}' is {change:.9g}, but "
+                f"its new setting less the present one is {then - there:.9g}; correct the row"
+            )
+        for derived in ("device", "change", "gain"):
+            rows[-1].pop(derived, None)
+    if not rows:
+        raise MeasurementError(f"{path}: it contains no setting")
+    return list(zip(knobs_of(rows, path, ring), new, strict=True))
 
 
 def knobs_of(rows: Any, path: Path, ring: Ring) -> list[Knob]:

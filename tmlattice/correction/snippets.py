@@ -39,7 +39,7 @@ def snippet(ring: Ring, changes: Sequence[tuple[Knob, float]], code: str) -> str
         if not knob.members:
             lines.append(f"{comment} {plain(knob.name)}: relative change {amount:.9g}")
             continue
-        new = [_new(ring[member], knob, amount) for member in knob.members]
+        new = [_new(ring, ring[member], knob, amount) for member in knob.members]
         families: dict[str, list[New]] = {}
         for one in new:
             families.setdefault(one.element.family, []).append(one)
@@ -55,12 +55,17 @@ def snippet(ring: Ring, changes: Sequence[tuple[Knob, float]], code: str) -> str
     return "".join(f"{line}\n" for line in lines)
 
 
-def _new(element: Element, knob: Knob, amount: float) -> New:
+def _new(ring: Ring, element: Element, knob: Knob, amount: float) -> New:
     kind = KINDS[knob.kind]
+    own = knob.unit == kind.unit and not knob.curve  # its setting is the lattice's strength
     if kind.relative:
-        return New(element, kind.strength, getattr(element, kind.strength) * (1 + amount))
+        design = getattr(element, kind.strength)
+        first = getattr(ring[knob.members[0]], kind.strength)
+        ratio = knob.setting(amount) / first if own and first else 1 + amount
+        return New(element, kind.strength, design * ratio)
     if kind.strength == "kick":
-        return New(element, "kick", element.angle + amount)
+        kick = knob.setting(amount) if own else element.angle + amount / knob.scale
+        return New(element, "kick", kick)
     length = element.length or 1.0
     turned = math.sin(2 * element.tilt)
     if element.kind == "quadrupole" and abs(turned) > 0.5:
