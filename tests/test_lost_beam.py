@@ -41,6 +41,16 @@ def the_fault_alone(result):
     assert finding.amount == pytest.approx(FAULT.amount, abs=4 * finding.amount_sigma + 1e-3)
 
 
+def test_shots_that_are_lost_at_different_places(small_ring, data):
+    """Two zeros at the end of one shot are no readings where another shot ends in many."""
+    readings = data.readings.copy()
+    for shot, after in enumerate((10, 14, 18, 22, 26, len(data.monitors) - 2)):
+        readings[shot, :, after:] = 0.0
+    lost = beam_lost(replace(data, readings=readings))
+    assert lost.first.tolist() == [10, 14, 18, 22, 26, len(data.monitors) - 2]
+    assert not (lost.without.readings == 0).any()
+
+
 OWN = np.random.default_rng(0).normal(0, 1e-3, (35 - LOST, 2))
 """Constants, each BPM's."""
 
