@@ -99,7 +99,7 @@ def _planes(data: Data) -> Data:
     """
     values = [own[np.isfinite(own)] for own in np.moveaxis(data.readings, 3, 0)]
     constant = [len(own) > 1 and not np.ptp(own) for own in values]
-    if _exact(data) or sum(constant) != 1 or not all(len(own) for own in values):
+    if exact(data) or sum(constant) != 1 or not all(len(own) for own in values):
         return data
     return replace(data, readings=np.where(constant, np.nan, data.readings))
 
@@ -112,12 +112,12 @@ def _turns(data: Data) -> Data:
     read = there.any(axis=(2, 3)) & (there.any(axis=3).sum(axis=2) >= FEWEST)
     constant = read & ((high == low) | ~there.any(axis=2)).all(axis=2)
     constant &= (read & ~constant).any(axis=1, keepdims=True)
-    if _exact(data) or not constant.any():
+    if exact(data) or not constant.any():
         return data
     return replace(data, readings=np.where(constant[..., None, None], np.nan, data.readings))
 
 
-def _exact(data: Data) -> bool:
+def exact(data: Data) -> bool:
     """Whether readings have no noise, and so may repeat."""
     return data.noise is not None and not np.nan_to_num(data.noise, nan=1.0).all()
 
