@@ -253,7 +253,7 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     lost = beam_lost(data)
     data = lost.without
     flat = data.readings.reshape(-1, len(data.monitors), 2)
-    reached = ~signals.not_reached(np.isnan(flat).all(axis=2))
+    reached = ~signals.not_reached(np.asarray(np.isnan(flat).all(axis=2)))
     flat = flat[:, reached]
     names = [name for name, there in zip(data.monitors, reached, strict=True) if there]
     again = len(flat) > 1 and np.array_equal(flat, np.broadcast_to(flat[:1], flat.shape), True)
