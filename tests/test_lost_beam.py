@@ -42,6 +42,28 @@ def the_fault_alone(result):
     assert finding.amount == pytest.approx(FAULT.amount, abs=4 * finding.amount_sigma + 1e-3)
 
 
+def test_shots_that_are_lost_at_different_places(small_ring, data):
+    """Two zeros at the end of one shot are no readings where another shot ends in many."""
+    readings = data.readings.copy()
+    for shot, after in enumerate((10, 14, 18, 22, 26, len(data.monitors) - 2)):
+        readings[shot, :, after:] = 0.0
+    lost = beam_lost(replace(data, readings=readings))
+    assert lost.first.tolist() == [10, 14, 18, 22, 26, len(data.monitors) - 2]
+    assert not (lost.without.readings == 0).any()
+    the_fault_alone(diagnose(small_ring, replace(data, readings=readings)))  # no BPM is dead
+
+
+def test_one_shot_or_one_plane_that_stands_for_all_is_refused(small_ring, data):
+    """Also where no launch is stated: noise is another in each shot."""
+    for readings, words in (
+        (np.repeat(data.readings[:1], 6, axis=0), "one reading was copied over the others"),
+        (np.repeat(data.readings[..., :1], 2, axis=3), "x and y are the same to the last digit"),
+    ):
+        unknown = {"launches": np.zeros((6, 5)), "launch_sigma": np.full((6, 5), np.inf)}
+        found = check_data(small_ring, replace(data, readings=readings, **unknown))
+        assert any(c.status == "wrong" and words in c.sentence for c in found.checks)
+
+
 OWN = np.random.default_rng(0).normal(0, 1e-3, (35 - LOST, 2))
 """Constants, each BPM's."""
 

@@ -220,6 +220,34 @@ def test_a_machine_file_may_state_that_devices_are_in_beam_order(small_ring, dat
         bring_in([path], Options(ring=small_ring, stated=Stated(in_order=True)))
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: [*rows, ["mean", *rows[1][1:]], ["RMS", *rows[1][1:]]], "rows that sum up"),
+        (lambda rows: [[*row, f"{rows[0][1]}_err" if k == 0 else "9"]
+                       for k, row in enumerate(rows)], "more words than a BPM's own"),
+        (lambda rows: [[rows[0][0], *row[1:]] if k == 0 else [row[0], *(
+            v.replace("e-", "D-") for v in row[1:])] for k, row in enumerate(rows)], "unknown"),
+    ],
+    ids=["sums", "errors", "Fortran"],
+)  # fmt: skip
+def test_more_than_the_readings(small_ring, data, tmp_path, change, words):
+    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m} {p}")
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    path.write_text("\n".join(",".join(row) for row in change(rows)) + "\n")
+    brought = same(bring_in([path], Options(ring=small_ring, unit="mm")), data)
+    assert any(words in sentence for sentence in brought.assumed)
+
+
+def test_turns_that_are_counted_from_another_number(small_ring, data, tmp_path):
+    path = wide(tmp_path / "a.csv", data.select(shots=[0]), lambda m, p: f"{m} {p} [mm]")
+    head, row = path.read_text().splitlines()
+    path.write_text(f"Turn #{head[4:]}\n17{row[1:]}\n18{row[1:]}\n")
+    readings = bring_in([path], Options(ring=small_ring)).measurement.readings
+    assert readings.shape[:2] == (1, 2)
+    np.testing.assert_allclose(readings[0, 0], data.readings[0, 0], atol=1e-12)
+
+
 def test_a_channel_of_a_bpm_that_is_not_there(small_ring, data, tmp_path):
     path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m} {p}")
     with pytest.raises(UnknownNameError, match="no monitor 'end_99'; did you mean"):
@@ -237,6 +265,7 @@ def test_a_channel_of_a_bpm_that_is_not_there(small_ring, data, tmp_path):
         ("shot,end_1 x\n0,1,2\n", "line 2: 3 fields where the header has 2"),
         ("monitor,s\nend_1,0.1\n", "names without readings"),
         ("", "empty"),
+        ("time,monitor,x [mm]\n0.1,end_1,0.1\n0.2,end_2,0.1\n", "each row is a shot of its own"),
     ],
 )
 def test_a_table_that_says_too_little_is_a_sentence(small_ring, tmp_path, text, words):

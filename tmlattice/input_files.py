@@ -21,6 +21,9 @@ from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 from tmlattice.errors import TmlatticeError, plain
 
+_FORTRAN = re.compile(r"(?<=[\d.])d(?=[+-]?\d)", re.IGNORECASE)
+"""An exponent as Fortran writes it."""
+
 MOST_BYTES = 1 << 30
 """Of a file of text."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
@@ -202,12 +205,12 @@ def _whole(digits: str) -> int:
 
 
 def number(text: str) -> float:
-    """A number of a table.
+    """A number of a table, also one with an exponent of Fortran, such as `1.5D-3`.
 
     Raises:
         ValueError: it is none; `1_000`, which Python takes for one, is none either.
     """
-    return float(text.replace("_", "?"))
+    return float(_FORTRAN.sub("e", text.replace("_", "?")))
 
 
 def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:

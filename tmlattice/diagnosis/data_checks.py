@@ -40,7 +40,7 @@ from tmlattice.measurement import (
     TurnByTurn,
 )
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of, with_read
-from tmlattice.measurement.lost_beam import beam_lost
+from tmlattice.measurement.lost_beam import beam_lost, exact
 from tmlattice.measurement.monitors import LARGEST_READING, Names
 from tmlattice.measurement.stored_files import KINDS as STORED
 from tmlattice.observe.compared import ANOTHER, Compared, OfResponse, compared
@@ -252,11 +252,13 @@ def _options(names: Iterable[str]) -> str:
 def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> list[Check]:
     lost = beam_lost(data)
     data = lost.without
-    read = np.asarray(np.isfinite(data.readings).any(axis=(0, 1, 3)))
-    reached = ~signals.not_reached(~read)
-    flat = data.readings.reshape(-1, len(data.monitors), 2)[:, reached]
+    flat = data.readings.reshape(-1, len(data.monitors), 2)
+    reached = ~signals.not_reached(np.asarray(np.isnan(flat).all(axis=2)))
+    flat = flat[:, reached]
     names = [name for name, there in zip(data.monitors, reached, strict=True) if there]
+    again = len(flat) > 1 and np.array_equal(flat, np.broadcast_to(flat[:1], flat.shape), True)
     moved = bool(np.ptp(data.launches, axis=0).any()) or any(data.settings)
+    moved |= again and not exact(data)  # noise is another in each reading
     checks = [
         *signals.monitors(ring, names, flat, moved), *signals.first_turns(ring, data, lost)
     ]  # fmt: skip

@@ -190,7 +190,7 @@ def _dead_monitors(
     readings, valid = readings[own], valid[own]
     silent, frozen, half, messages = [], [], [], []
     order = [m for m, name in enumerate(model.maps.monitors) if name.casefold() in listed]
-    behind = signals.not_reached(np.asarray(~valid[:, order].any(axis=(0, 2))))
+    behind = signals.not_reached(np.asarray(~valid[:, order].any(axis=2)))
     reached = {m for m, lost in zip(order, behind, strict=True) if not lost}
     for m, name in enumerate(model.maps.monitors):
         there = valid[:, m]

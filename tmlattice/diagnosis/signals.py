@@ -130,10 +130,11 @@ def some(names: Sequence[str]) -> str:
 
 
 def not_reached(silent: Flags) -> Flags:
-    """Which of the silent BPMs [monitor], in beam order, follow a lost beam: a run of the last
-    ones."""
-    run = np.cumprod(silent[::-1])[::-1].astype(bool)
-    return np.asarray(run & (run.sum() >= CUT))
+    """Which BPMs [monitor] follow a lost beam: the last ones that are silent [reading, monitor] in
+    all readings, where a run of the last ones is in most; in beam order."""
+    runs = np.cumprod(silent[~silent.all(axis=1), ::-1], axis=1)[:, ::-1].astype(bool)
+    lost = len(runs) > 0 and np.median(runs.sum(axis=1)) >= CUT
+    return np.asarray(runs.all(axis=0) & lost)
 
 
 def too_large(values: Array) -> Flags:
@@ -179,6 +180,10 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
             "beam reads that; leave them out (NaN, or an empty field)"
         )
         checks.append(note("large readings", text))
+    pairs = values[there.all(axis=2)]
+    if len(pairs) > 1 and pairs.any() and (pairs[:, 0] == pairs[:, 1]).all():
+        text = "x and y are the same to the last digit: one is a copy; give what was read in both"
+        return [*checks, wrong("planes", text)]
     checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own

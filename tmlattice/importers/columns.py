@@ -25,7 +25,7 @@ _BRACKETS = re.compile(r"^\s*(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 _TAIL = re.compile(r"^\s*(?P<name>.*?)[\s_/,]+(?P<unit>mm|um|µm|nm)\s*$", re.IGNORECASE)
 _COMMENT = "#%!@$"
 """What lines begin with that hold no readings: of scripts, MATLAB, MAD-X and its tables."""
-_DECIMAL = re.compile(r"^([+-]?\d*),(\d+)")
+_DECIMAL = re.compile(r"^([+-]?\d*),(\d+)(?![\d.,])")
 """A number with a decimal comma."""
 _UNITS = {"mm", "um", "µm", "nm", "m", "", "-"}
 
@@ -286,7 +286,10 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
     most = max(set(lengths), key=lengths.count)
     for name, _, values in flat:
         if len(values) != most and _POSITION.search(name):
-            raise MeasurementError(f"'{path}': '{name}' has {len(values)} rows, others {most}")
+            raise MeasurementError(
+                f"'{path}': '{name}' has {len(values)} rows, others {most}; turns of a machine's "
+                "own kind are read by `tmlattice import --turns KIND`"
+            )
     names = [Column(name, "", list_) for name, list_ in texts.items() if len(list_) == most]
     kept = [column for column in flat if len(column[2]) == most]
     return [*names, *(Column(name, unit, list(map(str, v.tolist()))) for name, unit, v in kept)]

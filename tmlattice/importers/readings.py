@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.errors import MeasurementError, unknown_name
+from tmlattice.errors import MeasurementError, plain, unknown_name
 from tmlattice.importers.columns import Column
 from tmlattice.importers.imported import (
     Imported,
@@ -55,6 +55,7 @@ _MISSING = frozenset({
 FILLED = 3
 """Times that one number is read, at least, which is larger by as much than all that differ, from
 which it stands for no reading."""
+SUMMARIES = frozenset({"mean", "average", "avg", "median", "rms", "std", "stdev", "min", "max"})
 _PREFIX = {"milli": "m", "micro": "u", "nano": "n"}
 _TOKEN = re.compile(r"[A-Za-z0-9]+")
 
@@ -94,6 +95,7 @@ def bring_readings(
         UnknownNameError: `stated` names a monitor that the ring does not have.
     """
     stated = stated or Stated()
+    columns, summaries = _without_summaries(columns)
     found = _long(path, columns, stated) or _wide(path, columns, stated)
     shots, turns, places, values, units = found
     position = np.array([place.plane != SUM for place in places])
@@ -105,6 +107,8 @@ def bring_readings(
     monitor = finder.all(path, devices)
     for place in places:
         monitor.setdefault(place.device, finder.find(place.device))
+    besides = _besides(places, monitor)
+    monitor |= dict.fromkeys(besides)
     scale = np.ones(len(values))
     fill = _fill(values[position])
     scale[position], of_unit, guessed = _scale(
@@ -121,8 +125,8 @@ def bring_readings(
         where = order[shot], turn, at, place.plane
         if taken[where]:
             raise MeasurementError(
-                f"{path}: BPM '{names[at]}' stands twice in one shot; give a column 'shot' or "
-                "'turn' that separates them"
+                f"{path}: BPM '{names[at]}' stands twice in one shot, again as "
+                f"'{place.device}'; leave one out, or separate them by a column 'shot' or 'turn'"
             )
         taken[where] = True
         both[where] = value * factor
@@ -132,7 +136,7 @@ def bring_readings(
     before = np.isfinite(readings).any(axis=3)
     readings[silent] = np.nan
     said_of_large = _without_large(path, readings, names)
-    left = [device for device in devices if monitor.get(device) is None]
+    left = [d for d in devices if monitor.get(d) is None and d not in besides]
     read = np.flatnonzero(taken[..., :SUM].any(axis=(0, 1, 3)))
     noise = None if stated.noise is None else np.full((len(read), 2), stated.noise)
     hints = (None, None) if ring is None else (ring.name, ring.energy)
@@ -158,10 +162,38 @@ def bring_readings(
     sums = about_sums(both[..., SUM], silent, before, names)
     said = [
         of_unit, beam, of_noise, *finder.said, *sums, *missing, *said_of_large,
-        *_unused(columns, stated),
+        *_unused(columns, stated), *summaries,
+        *([f"names with more words than a BPM's own, left out: {counted(besides)}"]
+          if besides else []),
     ]  # fmt: skip
     doubts = (f"not BPMs of the lattice, left out: {counted(left)}",) if left else ()
     return Imported(data, ring, tuple(said), doubts, guessed)
+
+
+def _without_summaries(columns: Sequence[Column]) -> tuple[Sequence[Column], list[str]]:
+    """The columns without rows of a mean or an rms, and a sentence about those."""
+    words = {(row, v) for c in columns for row, v in enumerate(c.values) if v.lower() in SUMMARIES}
+    if not words:
+        return columns, []
+    rows = {row for row, _ in words}
+    kept = [replace(c, values=[v for k, v in enumerate(c.values) if k not in rows])
+            for c in columns]  # fmt: skip
+    return kept, [f"rows that sum up others, left out: {counted(sorted({v for _, v in words}))}"]
+
+
+def _besides(places: Sequence[Place], monitor: dict[str, int | None]) -> list[str]:
+    """Devices that add words to the name of one that is read: `bpm_7_error` next to `bpm_7`."""
+    of: dict[tuple[int | None, int], list[str]] = {}
+    for place in dict.fromkeys(places):
+        of.setdefault((monitor[place.device], place.plane), []).append(place.device)
+    found = []
+    for (at, _), devices in of.items():
+        words = {device: set(_TOKEN.findall(device)) for device in devices}
+        own = min(devices, key=lambda device: len(words[device]))
+        more = [device for device in devices if device != own]
+        if at is not None and all(words[own] < words[device] for device in more):
+            found += more
+    return list(dict.fromkeys(found))
 
 
 def _without_large(path: str, readings: Array, names: Sequence[str]) -> list[str]:
@@ -212,7 +244,7 @@ def _unused(columns: Sequence[Column], stated: Stated) -> list[str]:
     }
     names = [
         c.name for c in columns
-        if c.name and c.name.casefold().replace(" ", "_") not in known
+        if c.name and _word(c.name) not in known
         and _plane(c.name) is None and place_of(c.name, stated) is None
     ]  # fmt: skip
     return [f"columns that are not read: {counted(names)}"] if names else []
@@ -231,6 +263,11 @@ def _long(path: str, columns: Sequence[Column], stated: Stated) -> Found | None:
     plane = _called(columns, "plane", PLANES, stated)
     shots = _labels(columns, "shot", SHOTS, stated) or ["0"] * len(names.values)
     turns = _turns(path, columns, stated) or [0] * len(names.values)
+    if len(set(shots)) == len(shots) > 1 and len(set(names.values)) > 1:
+        raise MeasurementError(
+            f"{path}: each row is a shot of its own, as '{plain(shots[0], 40)}'; give a column "
+            "'shot' that is the same for readings of one shot"
+        )
     parts: list[tuple[list[Place | None], Column]] = []
     if value is not None and plane is not None:
         planes = [_plane(text) for text in plane.values]
@@ -331,6 +368,11 @@ def _is_number(text: str) -> bool:
     return True
 
 
+def _word(name: str) -> str:
+    """A column's name without what stands between its words: `Turn #` is `turn`."""
+    return "_".join(re.findall(r"[^\W_]+", name.casefold()))
+
+
 def _called(
     columns: Sequence[Column], key: str, usual: Sequence[str], stated: Stated
 ) -> Column | None:
@@ -338,7 +380,7 @@ def _called(
     wanted = [stated.columns[key].casefold()] if key in stated.columns else usual
     for name in wanted:
         for column in columns:
-            if column.name.casefold().replace(" ", "_") == name.replace(" ", "_"):
+            if _word(column.name) == _word(name):
                 return column
     if key in stated.columns:
         raise unknown_name("column", stated.columns[key], [column.name for column in columns])
@@ -359,7 +401,8 @@ def _turns(path: str, columns: Sequence[Column], stated: Stated) -> list[int] | 
     numbers = [_number(path, i, column.name, text) for i, text in enumerate(column.values)]
     if not all(number == int(number) and 0 <= number < 1e6 for number in numbers):
         raise MeasurementError(f"{path}: turns are whole numbers from 0 in column '{column.name}'")
-    return [int(number) for number in numbers]
+    first = int(min(numbers))  # counted from 1, or from a trigger
+    return [int(number) - first for number in numbers]
 
 
 def _plane(text: str) -> int | None:

@@ -58,8 +58,9 @@ def beam_lost(data: Data) -> LostBeam[Data]:
     """Where the signals of each shot end in a constant.
 
     No signal is a run of the last BPMs of a shot that read the same, to the last digit in both
-    planes; or of which each reads the same in all shots. A run that begins at the first BPM of all
-    shots is none.
+    planes; or of which each reads the same in all shots. The constant of one shot is no signal at
+    the end of the others either, be it of one BPM. A run that begins at the first BPM of all shots
+    is none.
 
     Args:
         data: first turns, or turns of a stored beam; monitors in beam order.
@@ -74,6 +75,12 @@ def beam_lost(data: Data) -> LostBeam[Data]:
         first[shot] = _constant_from(flat[shot], there[shot])
     if not first.any():
         first[:] = count
+    lost = np.flatnonzero(first < count)
+    for constant in np.unique(flat[lost, first[lost]], axis=0):
+        same = ((flat == constant) | ~there).all(axis=2)
+        start = count - np.logical_and.accumulate(same[:, ::-1], axis=1).sum(axis=1)
+        read = (there.any(axis=2) & (np.arange(count) >= start[:, None])).any(axis=1)
+        first = np.where(read, np.minimum(first, start), first)
     first = np.minimum(first, _frozen_from(flat, there))
     after = np.arange(count) >= first[:, None]
     if not (after[..., None] & there).any():
@@ -92,7 +99,7 @@ def _planes(data: Data) -> Data:
     """
     values = [own[np.isfinite(own)] for own in np.moveaxis(data.readings, 3, 0)]
     constant = [len(own) > 1 and not np.ptp(own) for own in values]
-    if _exact(data) or sum(constant) != 1 or not all(len(own) for own in values):
+    if exact(data) or sum(constant) != 1 or not all(len(own) for own in values):
         return data
     return replace(data, readings=np.where(constant, np.nan, data.readings))
 
@@ -105,12 +112,12 @@ def _turns(data: Data) -> Data:
     read = there.any(axis=(2, 3)) & (there.any(axis=3).sum(axis=2) >= FEWEST)
     constant = read & ((high == low) | ~there.any(axis=2)).all(axis=2)
     constant &= (read & ~constant).any(axis=1, keepdims=True)
-    if _exact(data) or not constant.any():
+    if exact(data) or not constant.any():
         return data
     return replace(data, readings=np.where(constant[..., None, None], np.nan, data.readings))
 
 
-def _exact(data: Data) -> bool:
+def exact(data: Data) -> bool:
     """Whether readings have no noise, and so may repeat."""
     return data.noise is not None and not np.nan_to_num(data.noise, nan=1.0).all()
 
