@@ -88,8 +88,9 @@ def select(
         if explained(sparse) or len(start.residual) * len(seen) > MAX_ELEMENTS:
             return Selection(sparse)
     search.progress("distributed errors")
-    there = known is not None and len(known.rms)
-    prior = known.extended(seen) if there else DistributedErrors.usual(seen, sizes)
+    prior = DistributedErrors.usual(seen, sizes)
+    if known is not None and len(known.rms):
+        prior = known.extended(seen)
     amounts: Array | None = None
     if reference is not None and reference.distributed is not None:
         there = reference.distributed.problem
