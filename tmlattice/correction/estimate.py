@@ -67,9 +67,11 @@ class Estimate:
     def storing(self) -> "Estimate":
         """Return the estimate whose ring stores a beam: with the posterior mean, which is
         linearised, or a half of it, a quarter, ...; unchanged if it stores none."""
+        if self.found is None:
+            return self
         for share in SHARES:
             own = [replace(cause, amount=share * cause.amount) for cause in self.mean]
-            ring = self.ring if share == 1 or self.found is None else apply(self.found, own)
+            ring = self.ring if share == 1 else apply(self.found, own)
             try:
                 StoredBeam(ResponseModel(ring))
             except UnstableRingError:
