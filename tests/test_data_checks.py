@@ -152,15 +152,20 @@ def test_an_orbit_that_is_millimetres_off_is_no_global_error(small_ring, seed):
 
 
 @pytest.mark.parametrize("size", [2e-5, 1e-3])
-def test_readings_behind_a_loss_that_are_noise(small_ring, size):
+@pytest.mark.parametrize("ends", [[16] * 6, [10, 12, 14, 16, 16, 16], [12, 14, 16], [16]])
+def test_readings_behind_a_loss_that_are_noise(small_ring, size, ends):
+    """In all shots, or in some, at one place or at several."""
     data = simulate(small_ring, background={"all": None}, shots=6, seed=1).measurement()
-    readings, read = data.readings.copy(), 16
-    noise = np.random.default_rng(0).standard_normal(readings[:, :, read:].shape)
-    readings[:, :, read:] = size * noise
-    (check,) = told(check_data(small_ring, replace(data, readings=readings)))
-    first = [monitor.name for monitor in small_ring.monitors].index(check.sentence.split()[1])
+    readings, rng = data.readings.copy(), np.random.default_rng(0)
+    for shot, read in enumerate(ends):
+        readings[shot, :, read:] = size * rng.standard_normal(readings[shot, :, read:].shape)
+    (check,) = check_data(small_ring, replace(data, readings=readings)).reported
+    names = [monitor.name for monitor in small_ring.monitors]
+    first = next(names.index(word) for word in check.sentence.split() if word in names)
     assert check.name == "lost beam"
-    assert abs(first - read) <= 4
+    assert abs(first - ends[0]) <= (8 if len(ends) == 1 else 4)  # sections have eight readings
+    assert check.status == "wrong" or len(ends) == 1
+    assert ("in any shot" in check.sentence) == (ends == [16] * 6)
 
 
 def test_a_reading_that_no_beam_gives(small_ring, healthy):

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
@@ -300,24 +301,41 @@ def _lattice(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
 
 
 def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -> list[Check]:
-    """The check for readings behind a lost beam: the last sections of all shots follow nothing."""
-    shares = found.shares(passes)
-    read = np.flatnonzero(np.isfinite(shares))
-    if len(passes.readings) < 2 or not len(read) or passes.turn.any():
+    """The check for readings behind a lost beam: the last sections of all shots, or of some, follow
+    nothing."""
+    if passes.turn.any():
         return []
+    together, *each = (_follows_nothing(own) for own in found.shares(passes))
+    # noise alone leaves less than a half of one section by chance, of two hardly
+    lost = [own for own in each if len(own) and own[0] >= NOTHING_FROM]
+    which = f"at least {len(lost)} of {len(each)} shots"
+    if len(each) > 1 and len(together) and not any(own[0] < together[0] for own in lost):
+        lost, which = [together], "any shot"
+    if not lost:
+        return []
+    sections, behind = sum(len(own) for own in lost), np.sort([own[0] for own in lost])
+    ends = [ring[checked.data.monitors[found.owner[section, 0]]] for section in behind[[0, -1]]]
+    where = " and ".join(f"{end.name} (s = {end.s:.2f} m)" for end in dict.fromkeys(ends))
+    make = wrong if sections >= SURE else note
+    return [make(
+        "lost beam",
+        f"from {'a place between ' if len(set(ends)) > 1 else ''}{where} on the readings follow no "
+        f"trajectory in {which}, and before they do: the beam was lost, or these BPMs have other "
+        "names; leave their readings out, or correct the names",
+    )]  # fmt: skip
+
+
+def _follows_nothing(shares: NDArray[np.float64]) -> NDArray[np.intp]:
+    """The last sections that follow no trajectory, by their shares [section]; none, if those before
+    do not either."""
+    read = np.flatnonzero(np.isfinite(shares))
+    if not len(read):
+        return read
     strange = np.cumsum(np.log(np.maximum(shares[read], 1e-9) / HALF)[::-1])[::-1]
     behind = read[strange.argmax() :]
     left = float(np.sqrt(np.mean(shares[behind] ** 2)))
-    if not (NOTHING_FROM <= len(behind) < len(read) and left > NO_BEAM):
-        return []
-    first = ring[checked.data.monitors[found.owner[behind[0], 0]]]
-    make = wrong if len(behind) >= SURE else note
-    return [make(
-        "lost beam",
-        f"from {first.name} (s = {first.s:.2f} m) on the readings follow no trajectory in any "
-        "shot, and before they do: the beam was lost, or these BPMs have other names; leave their "
-        "readings out, or correct the names",
-    )]  # fmt: skip
+    lost = NOTHING_FROM <= len(behind) < len(read) and left > NO_BEAM
+    return behind if lost else read[:0]
 
 
 def _launches(checked: OfTurns) -> Check:

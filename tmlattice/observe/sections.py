@@ -176,11 +176,14 @@ class SectionFits:
         return float(np.median(shares, axis=1).min())
 
     def shares(self, passes: Passes) -> Array:
-        """The same of each section, from all passes together, [section]; NaN if undetermined."""
+        """The same of each section, of all passes together and of each alone,
+        [1 + pass, section]; NaN if undetermined."""
         enough = self.freedom > 3
-        part, whole = (np.where(enough, own, 0.0).sum(axis=1) for own in self._squares(passes))
-        own = np.sqrt(part / np.maximum(whole, 1e-60)).min(axis=0)
-        return np.where(enough.any(axis=0), own, np.nan)
+        part, whole = (np.where(enough, own, 0.0) for own in self._squares(passes))
+        together = (part.sum(axis=1) / np.maximum(whole.sum(axis=1), 1e-60)).min(axis=0)
+        each = part.min(axis=0) / np.maximum(whole[0], 1e-60)
+        own = np.sqrt(np.vstack([together, each]))
+        return np.where(np.vstack([enough.any(axis=0), enough]), own, np.nan)
 
     def _squares(self, passes: Passes) -> tuple[Array, Array]:
         """Mean squares of the residuals and of the readings [2, pass, section], m^2: as read; and
