@@ -184,7 +184,7 @@ def test_hdf5_states_its_sizes_and_reaches_no_other_file(tmp_path, monkeypatch, 
     with h5py.File("a.h5", "r+") as file:
         del file["bpm2 x"]
         for i in range(6):
-            file.create_dataset(f"bpm{i} y", (200_000,), "f8")
+            file.create_dataset(f"bpm{i} y", (200_000,), "f8", fillvalue=np.nan)
     with pytest.raises(TmlatticeError, match="its data sets state"):
         read_columns(Path("a.h5"))
 

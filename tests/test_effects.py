@@ -274,7 +274,7 @@ def test_energy_spread_is_a_gaussian_average():
         (Cause("quadrupole_gradient", None, 0.1), EffectError, "needs an element"),
         (Cause("quadrupole_gradient", "qskew_nw_1", 0.1), EffectError, "k1 not 0"),
         (Cause("energy_offset", "qd::12", 0.1), EffectError, "leave 'qd::12' out"),
-        (Cause("monitor_gain_x", "qd::12", 0.1), EffectError, "monitors"),
+        (Cause("monitor_gain_x", "qd::12", 0.1), EffectError, "BPMs"),
         (Cause("quadrupole_gradient", "qd::12", float("nan")), EffectError, "give a number"),
         (Cause("monitor_swap", "bpm_a4_3", 0.3), EffectError, "there or not"),
     ],

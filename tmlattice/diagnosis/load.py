@@ -19,7 +19,7 @@ from tmlattice.diagnosis.records import decoded
 from tmlattice.diagnosis.response.common_factors import CommonFactors
 from tmlattice.diagnosis.response.inconsistencies import Inconsistency
 from tmlattice.diagnosis.response.missing_effects import Weighed
-from tmlattice.diagnosis.response.stepwise import Step
+from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.support import Correlation, Support
 from tmlattice.diagnosis.suspects import Suspect

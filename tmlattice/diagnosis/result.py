@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from tmlattice.diagnosis.response.common_factors import CommonFactors
     from tmlattice.diagnosis.response.inconsistencies import Inconsistency
     from tmlattice.diagnosis.response.missing_effects import Weighed
-    from tmlattice.diagnosis.response.stepwise import Step
+    from tmlattice.diagnosis.response.validation import Step
     from tmlattice.diagnosis.suspects import Suspect
 
 VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
@@ -261,7 +261,7 @@ class Diagnosis(Speaks):
     supports: tuple[Support, ...] = ()
     covariance: NDArray[np.float64] | None = field(default=None, repr=False)
 
-    report = Method("tmlattice.report.speaking", "report", "The report as text.")
+    report = Method("tmlattice.report.plain", "report_text", "The report as plain text.")
     save = Method(
         "tmlattice.report.speaking",
         "save",

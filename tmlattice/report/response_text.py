@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from tmlattice.diagnosis.response.common_factors import Reason
-from tmlattice.diagnosis.response.stepwise import Step
+from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import numbers

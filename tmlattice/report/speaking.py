@@ -1,4 +1,4 @@
-"""Report and files of a diagnosis: `diagnosis.report()`, `diagnosis.save(folder)`."""
+"""Files of a diagnosis and of a correction: `diagnosis.save(folder)`."""
 
 from contextlib import suppress
 from os import PathLike
@@ -17,13 +17,6 @@ from tmlattice.lattice import load_ring, save_ring
 from tmlattice.report.correction_texts import correction_text
 from tmlattice.report.page import correction_page, draw, page, pictures_in
 from tmlattice.report.plain import report_text
-from tmlattice.report.text import WIDTH
-
-
-def report(diagnosis: Diagnosis, width: int = WIDTH, most: int | None = None) -> str:
-    """The report as plain text of so many columns, as `tmlattice diagnose` prints it; the most
-    important parts of it where only so many lines are wanted."""
-    return report_text(diagnosis, width, most)
 
 
 def save(diagnosis: Diagnosis, folder: str | PathLike[str]) -> Path:

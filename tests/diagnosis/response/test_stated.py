@@ -49,7 +49,7 @@ def test_what_is_not_determined_is_printed_as_that_and_not_as_a_value(found):
     assert "not determined by the data: " in text
     assert f"{FAULTY.element} (degenerate with " in text
     assert f"{FAULTY.element} +" not in text
-    assert "% from the data)" in text
+    assert "(share from the data): " in text
     magnets = next(table for table in error_tables(found) if table.title == "Magnets")
     assert magnets.head[2:5] == ("quadrupole gradient [%]", "error", "from the data [%]")
     (row,) = (row for row in magnets.rows if row[0] == FAULTY.element)

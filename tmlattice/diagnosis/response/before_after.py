@@ -41,9 +41,9 @@ from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, tri
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
-from tmlattice.diagnosis.response.stepwise import Step, StepwiseFit, fit_steps, one_by_one
+from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
-from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.response.validation import Step, score
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import FREE
 from tmlattice.effects import CATALOGUE, RingEffect, find, modelled

@@ -27,9 +27,9 @@ from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, small_errors
 from tmlattice.diagnosis.response.state import Apart, State, allow, bend
 from tmlattice.diagnosis.response.stated import doubt
-from tmlattice.diagnosis.response.stepwise import ROUGH, Step, StepwiseFit, fit_chi2
+from tmlattice.diagnosis.response.stepwise import ROUGH, StepwiseFit, fit_chi2
 from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspects_of
-from tmlattice.diagnosis.response.validation import Chi2, score
+from tmlattice.diagnosis.response.validation import Chi2, Step, score
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.alternatives import linear_evidence

@@ -15,9 +15,9 @@ from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
-from tmlattice.diagnosis.response.stepwise import Step, StepwiseFit
+from tmlattice.diagnosis.response.stepwise import StepwiseFit
 from tmlattice.diagnosis.response.undetermined import Blur, Undetermined
-from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.response.validation import Step, score
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect

@@ -6,7 +6,7 @@ scored on the other half. The outer validation set (`score`) selects nothing. Th
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,45 @@ class Score:
     position: float
     roll: float
     chi2: tuple[Chi2, Chi2, Chi2]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The scores with the families accepted so far.
+
+    Attributes:
+        effect: the families of the step; the first is "design".
+        parameters: their number.
+        heldout_rms_in_plane, heldout_rms_coupling: of held-out correctors, m.
+        heldout_rms_position: in-plane, with a position jump of each held-out corrector, m.
+        heldout_rms_roll: coupling, with a roll of each held-out corrector, by the BPMs that
+            determine its kick, m; NaN before rolls are fitted.
+        heldout_chi2_per_dof: in-plane, by the readings' noise.
+        dispersion_rms: residual of the RF's orbit in x at BPMs that are not fitted, m.
+        kept: whether it was accepted; the scores of a rejected step are its own.
+    """
+
+    effect: str
+    parameters: int
+    heldout_rms_in_plane: float
+    heldout_rms_coupling: float
+    heldout_chi2_per_dof: float
+    dispersion_rms: float
+    heldout_rms_position: float = float("nan")
+    heldout_rms_roll: float = float("nan")
+    kept: bool = True
+
+    @classmethod
+    def scored(cls, effect: str, parameters: int, s: Score) -> "Step":
+        """Return a step with its validation scores."""
+        return cls(
+            effect, parameters, s.in_plane, s.coupling, s.chi2_per_dof, s.dispersion, s.position,
+            s.roll,
+        )  # fmt: skip
+
+    def as_json(self) -> dict[str, Any]:
+        """The entry in the file of the diagnosis."""
+        return {name: value for name, value in vars(self).items() if name != "kept"}
 
 
 class _Missed(NamedTuple):
