@@ -4,6 +4,7 @@
 >>> estimate.draw(200, np.random.default_rng(0)).shape      # [draw, error]
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -40,7 +41,7 @@ class Estimate:
         calibrations: of correctors, kick over setting, by name.
         dispersion: measured beyond the ring's, m, [BPM, plane], or 0.
         energy, energy_error: of the stored beam relative to the ring's at its RF frequency.
-        found, mean: the ring without its distributed errors, and their means.
+        found: the ring without its distributed errors.
     """
 
     ring: Ring
@@ -53,7 +54,6 @@ class Estimate:
     energy: float = 0.0
     energy_error: float = 0.0
     found: Ring | None = field(default=None, repr=False)
-    mean: tuple[Cause, ...] = field(default=(), repr=False)
 
     @property
     def linearised(self) -> DistributedErrors | None:
@@ -67,11 +67,10 @@ class Estimate:
     def storing(self) -> "Estimate":
         """Return the estimate whose ring stores a beam: with the posterior mean, which is
         linearised, or a half of it, a quarter, ...; unchanged if it stores none."""
-        if self.found is None:
+        if self.found is None or self.known is None:
             return self
         for share in SHARES:
-            own = [replace(cause, amount=share * cause.amount) for cause in self.mean]
-            ring = self.ring if share == 1 else apply(self.found, own)
+            ring = _with_mean(self.found, self.known, self.kept, share)
             try:
                 StoredBeam(ResponseModel(ring))
             except UnstableRingError:
@@ -121,7 +120,6 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
         return Estimate(ring, settings)
     kept = [i for i, (name, _) in enumerate(known.hypotheses) if _of_ring(name)]
     kept = [i for i in kept if known.rms[i] > 0]
-    mean = [Cause(*known.hypotheses[i], float(known.amounts[i])) for i in kept if known.amounts[i]]
     every = [*known.causes]
     every += [Cause(*h, a) for h, a in zip(known.hypotheses, known.amounts.tolist(), strict=True)]
     scales: dict[str, float] = {}
@@ -129,15 +127,22 @@ def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -
         if cause.effect == "corrector_calibration" and cause.element is not None:
             scales[cause.element] = scales.get(cause.element, 1.0) * (1 + cause.amount)
     return Estimate(
-        apply(ring, mean),
+        _with_mean(ring, known, kept),
         settings,
         tuple(known.hypotheses[i] for i in kept),
         known,
         np.array(kept, dtype=np.int64),
         scales,
         found=ring,
-        mean=tuple(mean),
     )
+
+
+def _with_mean(
+    ring: Ring, known: DistributedErrors, kept: Iterable[int], share: float = 1.0
+) -> Ring:
+    """The ring with a share of the mean of its distributed errors."""
+    mean = ((known.hypotheses[i], share * float(known.amounts[i])) for i in kept)
+    return apply(ring, [Cause(*place, amount) for place, amount in mean if amount])
 
 
 def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:

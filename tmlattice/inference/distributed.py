@@ -403,7 +403,7 @@ def fit_distributed_errors(
     fitted = FittedErrors(among, problem, sizes_of(known))
     if learn:
         fitted = _scaled(fitted, point, causes, noisy, weigh)
-    return _with_nuisances(fitted, fit_nuisances(fitted.problem, causes, point.nuisances).nuisances)
+    return _with_nuisances(fitted, point.nuisances)
 
 
 def rescaled(
