@@ -199,8 +199,13 @@ def _starts(sparse: Explanation | None) -> list[tuple[tuple[Cause, ...], float]]
     """
     starts: list[tuple[tuple[Cause, ...], float]] = [((), 0.0)]
     if sparse is not None and sparse.fit.causes and not sparse.fit.kicks:
-        starts.append((sparse.fit.causes, sparse.fit.log_evidence + 0.5 * sparse.fit.chi2))
+        starts.append((sparse.fit.causes, _log_prior(sparse.fit)))
     return starts
+
+
+def _log_prior(result: Fit) -> float:
+    """Log prior probability of the causes with amounts within their errors."""
+    return result.log_evidence + 0.5 * result.chi2
 
 
 # --- with distributed errors ---------------------------------------------------------------------
@@ -272,7 +277,9 @@ def _hidden(
 ) -> tuple[Explanation, FittedErrors]:
     """Search again with scales estimated without the most probable fault.
 
-    Scales that include a fault are too large, and hide it.
+    Scales that include a fault are too large, and hide it. Where they explain the readings nearly
+    as well as the fault does, there is none: scales without a leading candidate are smaller, and
+    make it look significant.
     """
     known = small.problem.known
     amounts = small.problem.estimate(found.fit.clean).tolist()
@@ -295,7 +302,10 @@ def _hidden(
         again, _ = _linearised(small, result, [own], learn=True, noisy=noisy, weigh=weigh)
     except UnstableRingError:
         return found, small
-    if (again.outlier_evidence or 0.0) > search.problem.judgement.log_odds:
+    enough = search.problem.judgement.log_odds
+    if not weigh and again.log_marginal + _log_prior(result) - small.log_marginal < enough:
+        return found, small
+    if (again.outlier_evidence or 0.0) > enough:
         established = frozenset({(cause.effect, cause.element)})
     other = explain(replace(search, problem=again.problem, established=established), again.before)
     return (other, again) if other.count else (found, small)
