@@ -75,7 +75,7 @@ def test_sizes_of_small_errors_are_learnt_beside_a_fault(small_ring, measured_wi
     # of some tens of numbers each: to a fifth, and what is left of the families' slack
     assert 0.5 < sizes["quadrupole_gradient"] / USUAL["quadrupole_gradient"] < 2
     assert 0.5 < sizes["monitor_gain"] / USUAL["monitor_gain_x"] < 2
-    assert 0.3 < sizes["horizontal orbit"] < 3  # in units of the bends' usual errors
+    assert 0.3 < sizes["horizontal orbit"] < 3  # in units of usual errors
 
 
 def test_a_pattern_of_kicks_moves_the_response_as_at_has_it(small_ring):

@@ -26,21 +26,25 @@ def kicking(ring: Ring, plane: int) -> Indices:
 
 
 def orbits_of_kicks(
-    model: ResponseModel, sources: Sequence[int] | Indices, exits: Indices, rows: Array, plane: int
+    model: ResponseModel,
+    sources: Sequence[int] | Indices,
+    exits: Indices,
+    rows: Array,
+    kicks: Array | int,
 ) -> Array:
-    """Closed orbit for a kick of 1 rad behind each of some magnets, m, [place, source].
+    """Closed orbit for a kick behind each of some magnets, m, [place, source].
 
     Args:
         model: of the ring.
         sources: magnets.
         exits: number of magnets before each place, [place].
         rows: d orbit / d state there, [place, n].
-        plane: of the kicks.
+        kicks: changes of the state, [source, n]; or the plane, for 1 rad each.
     """
     behind = np.asarray(sources) + 1
-    kick = np.zeros((len(behind), model.dimension))
-    kick[:, 2 * plane + 1] = 1.0
-    launch_kick = np.einsum("kij,kj->ki", model.inverse[behind], kick)
+    if isinstance(kicks, int):
+        kicks = np.tile(np.eye(model.dimension)[2 * kicks + 1], (len(behind), 1))
+    launch_kick = np.einsum("kij,kj->ki", model.inverse[behind], kicks)
     start = launch_kick @ model.closing.T
     return np.asarray(rows @ start.T + (exits[:, None] >= behind) * (rows @ launch_kick.T))
 

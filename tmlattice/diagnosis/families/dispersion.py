@@ -7,7 +7,7 @@ BPMs separate. They are linearised in the design's optics.
 A family of closed-orbit patterns of small kicks, which act in sextupoles. A response is hardly
 sensitive to a kick itself, but off axis sextupoles focus and couple. With usual alignment that
 exceeds the quadrupoles' own errors. Single kicks are degenerate, so the numbers are amplitudes of
-patterns: the combinations of bends' kicks that focus most.
+patterns: the combinations of usual errors of bends and quadrupoles that focus most.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,7 +26,7 @@ from tmlattice.beam.kicks import (
     orbits_of_kicks,
 )
 from tmlattice.diagnosis.families.family import Family, StatedCause
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause, background_rms, directions, find
 from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -218,7 +218,7 @@ def dispersion_beside(
 LEAST_FOCUSING = 0.02
 """Share of the strongest pattern below which one is omitted; quadrupole gradients absorb it."""
 TOGETHER = 32
-"""Number of bends whose derivatives are computed at a time."""
+"""Number of errors whose derivatives are computed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,77 +226,79 @@ class _Orbit(_PatternFamily):
     """Patterns of kicks.
 
     Attributes:
-        places: bends.
-        patterns: usual kicks of each, as the effect's amounts, [pattern, bend].
+        causes: errors that kick.
+        patterns: usual amounts of each, [pattern, error].
     """
 
-    places: tuple[str, ...]
+    causes: tuple[Hypothesis, ...]
     patterns: Array
 
-    trust, rms = 1.0, 1.0  # in units of usual kicks
-    effect: ClassVar[str]
+    trust, rms = 1.0, 1.0  # in units of usual errors
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
         return len(self.patterns)
 
     def rows(self, at: Predicted, values: Array) -> Array:
-        """Derivatives by the kicks of all bends."""
+        """Derivatives by all errors."""
         out = np.zeros((len(self.patterns), at.data.orbits[..., 0].size))
-        for start in range(0, len(self.places), TOGETHER):
-            places = self.places[start : start + TOGETHER]
-            pairs = [(self.effect, place) for place in places]
-            slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, pairs)]
+        for start in range(0, len(self.causes), TOGETHER):
+            some = self.causes[start : start + TOGETHER]
+            slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, some)]
             out += self.patterns[:, start : start + TOGETHER] @ np.stack(slopes)
         return np.asarray(out.reshape(-1, *at.data.shape) * at.gain(self.block))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The errors with the kicks of the bends."""
+        """The errors of bends and quadrupoles."""
         amounts = (values @ self.patterns).tolist()
-        causes = [Cause(self.effect, *one) for one in zip(self.places, amounts, strict=True)]
+        causes = [Cause(*one, amount) for one, amount in zip(self.causes, amounts, strict=True)]
         return replace(errors, ring=(*errors.ring, *(c for c in causes if c.amount)))
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Kicks of all bends."""
-        hypotheses: list[Hypothesis] = [(self.effect, place) for place in self.places]
-        return [dict(zip(hypotheses, pattern, strict=True)) for pattern in self.patterns.tolist()]
+        """Amounts of all errors."""
+        return [dict(zip(self.causes, pattern, strict=True)) for pattern in self.patterns.tolist()]
 
 
 class HorizontalOrbit(_Orbit):
-    """The horizontal orbit by field errors of bends, which focuses in sextupoles."""
+    """The horizontal orbit, which focuses in sextupoles."""
 
-    name, effect, effects = "horizontal orbit", "dipole_field", ("dipole_field",)
+    name, effects = "horizontal orbit", ("dipole_field", "quadrupole_offset_x")
     block, variable = 0, "horizontal orbit"
 
 
 class VerticalOrbit(_Orbit):
-    """The vertical orbit by rolls of bends, which couples in sextupoles."""
+    """The vertical orbit, which couples in sextupoles."""
 
-    name, effect, effects = "vertical orbit", "dipole_roll", ("dipole_roll",)
+    name, effects = "vertical orbit", ("dipole_roll", "quadrupole_offset_y")
     block, variable = 1, "vertical orbit"
 
 
 def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
-    """Return a family for each plane; none without sextupoles or bends.
+    """Return a family for each plane; none without sextupoles.
 
     Args:
         ring: the design.
         model: of the design.
     """
     magnets = ring.magnets
-    bends = [i for i, e in enumerate(magnets) if e.kind == "bend" and e.angle]
     strong = [i for i, e in enumerate(magnets) if e.kind == "sextupole" and e.k2]
-    if not bends or not strong:
+    if not strong:
         return []
+    strength = np.array([magnets[i].k2 * magnets[i].length for i in strong])
+    exits = np.array(strong) + 1
     found: list[Family] = []
     kinds: tuple[Any, ...] = (HorizontalOrbit, VerticalOrbit)
     for plane, kind in enumerate(kinds):
-        kicks = np.array([abs(magnets[i].angle) for i in bends]) * find(kind.effect).background
-        exits = np.array(strong) + 1
-        moved = orbits_of_kicks(model, bends, exits, model.tangents[exits][:, 2 * plane], plane)
-        moved = moved * kicks
-        focused = moved * np.array([[magnets[i].k2 * magnets[i].length] for i in strong])
-        _, size, patterns = np.linalg.svd(focused, full_matrices=False)
-        kept = patterns[size > LEAST_FOCUSING * size[0]] * find(kind.effect).background
-        found.append(kind(tuple(magnets[i].name for i in bends), kept))
+        usual = background_rms(dict.fromkeys(kind.effects))
+        causes = tuple((name, place) for name in usual for place in find(name).places(ring))
+        size = np.array([usual[name] for name, _ in causes])
+        kicks = directions(model.layers, causes)
+        rows = model.tangents[exits][:, 2 * plane]
+        orbits = np.zeros((len(strong), len(causes)))
+        by_layer = orbits_of_kicks(model, kicks.layer, exits, rows, kicks.D0)
+        np.add.at(orbits.T, kicks.owner, by_layer.T)
+        _, focusing, patterns = np.linalg.svd(strength[:, None] * orbits * size, False)
+        kept = focusing > LEAST_FOCUSING * focusing.max(initial=0.0)
+        if kept.any():
+            found.append(kind(causes, patterns[kept] * size))
     return found

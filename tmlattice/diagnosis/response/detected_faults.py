@@ -178,11 +178,15 @@ class _Search:
 
     def next(self) -> State | None:
         """The state with the most probable further cause, if it is detected; else None."""
+        # the distributed errors have outliers already, so the evidence need not grow with a fault;
+        # a second optimum, where all readings are far less probable, is none
+        least = log_evidence(self.state, self.state.good) - self.judgement.log_odds
         tried: list[tuple[float, State]] = []
         for cause, _, information in self.leaders():
             state = self.put(self.state, cause, information)
-            if state is not None:
-                tried.append((log_evidence(state, state.good) + self.problem.prior(cause), state))
+            found = -np.inf if state is None else log_evidence(state, state.good)
+            if state is not None and found > least:
+                tried.append((found + self.problem.prior(cause), state))
         for _, state in sorted(tried, key=lambda one: -one[0]):
             state = self.better(state, state.apart[-1])  # noqa: PLW2901
             if self.clear(self.seen(state), state.apart[-1]):

@@ -19,7 +19,12 @@ from scipy.special import ndtri
 
 from tmlattice.diagnosis.families.dispersion import orbit_families
 from tmlattice.diagnosis.families.family import Family
-from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient, SkewGradient
+from tmlattice.diagnosis.families.fields import (
+    FamilyGradient,
+    OtherGradient,
+    QuadrupoleGradient,
+    SkewGradient,
+)
 from tmlattice.diagnosis.families.steps import (
     CorrectorCalibration,
     CorrectorRoll,
@@ -44,8 +49,8 @@ Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 USUAL: tuple[Family, ...] = (
-    CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), MonitorRoll(),
-    CorrectorRoll(), SkewGradient(),
+    CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), OtherGradient(),
+    MonitorRoll(), CorrectorRoll(), SkewGradient(),
 )  # fmt: skip
 """Families of every ring."""
 ANEW = 20_000
