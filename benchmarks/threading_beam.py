@@ -1,6 +1,7 @@
 """Machines whose first turn is lost, steered until the beam circulates; AT is the machine.
 
-`python benchmarks/threading_beam.py LATTICE [--machines 50] [--offset 2e-3] [--first-seed 0] [--out FILE.jsonl]`
+`python benchmarks/threading_beam.py LATTICE [--machines 50] [--offset 2e-3] [--first-seed 0]
+[--out FILE.jsonl]`
 
 Each machine has all usual errors of the catalogue, and quadrupoles displaced by `--offset` rms, m.
 Machines whose beam completes the first turn are not counted. Six shots of two turns are read as far

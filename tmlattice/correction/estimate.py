@@ -55,15 +55,6 @@ class Estimate:
     energy_error: float = 0.0
     found: Ring | None = field(default=None, repr=False)
 
-    @property
-    def linearised(self) -> DistributedErrors | None:
-        """Return the posterior about `ring`, with which its next measurement is diagnosed."""
-        if self.known is None:
-            return None
-        amounts = self.known.amounts.copy()
-        amounts[self.kept] = 0.0
-        return replace(self.known, amounts=amounts)
-
     def storing(self) -> "Estimate":
         """Return the estimate whose ring stores a beam: with the posterior mean, which is
         linearised, or a half of it, a quarter, ...; unchanged if it stores none."""
