@@ -22,6 +22,7 @@ from tmlattice.correction.knobs import KINDS
 from tmlattice.effects import Cause, apply, background_rms, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors, posterior
+from tmlattice.inference.newton import fit_nuisances
 from tmlattice.lattice import Element, Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import Data, of_measurement
@@ -32,6 +33,8 @@ Flags = NDArray[np.bool_]
 
 FITS = 12
 """Posteriors at most, each with readings that the one before it made reachable."""
+UNSURE = 0.5
+"""Relative error of a scale from which it is not learnt."""
 UNREAD = 2
 """Readings at the end of a shot, at least, that a lost beam lacks: one alone may be a dead BPM."""
 SURPRISE = 2.0
@@ -72,33 +75,47 @@ def estimate_of_turns(
 
 
 def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> DistributedErrors:
-    """The posterior given the readings; those behind a loss in the model come when it gets there,
-    and half as many where no launch brings it to the last one."""
+    """The posterior given the readings: those behind a loss in the model come when it gets there,
+    and half as many where they are not explained, since the model is too nonlinear."""
     problem = FirstTurns(model=Model(ring, data.settings, data.turns), data=data, places={})
     usual = background_rms({"all": None})
     seen = [(n, p) for n in usual for p in find(n).places(ring) if problem.sees((n, p))]
     known = DistributedErrors.usual(seen, usual) if known is None else known.extended(seen)
-    amounts, used, most = known.amounts, -1, data.valid.shape[1]
+    amounts, used, most = known.amounts, 0, data.valid.shape[1]
     found = None
     for _ in range(FITS):
-        own = zip(known.hypotheses, amounts.tolist(), strict=True)
-        there = problem.with_fixed([Cause(*h, a) for h, a in own if a])
-        readings = there.model.readings(problem.first, there.fixed)
-        kept = data.valid & np.isfinite(readings)
+        there = _with(problem, known, amounts)
+        kept = data.valid & np.isfinite(there.model.readings(problem.first, there.fixed))
         kept[:, most:] = False
-        if found is not None and kept.sum() <= used:
+        count = int(kept.sum())
+        if count <= used:
             break
+        own = problem.without(~kept)
         try:
-            found = posterior(problem.without(~kept), known, linearised_at=amounts)
+            tried = posterior(own, known, linearised_at=amounts, learn=False)
+            better = _chi2(own, known, tried.amounts) < _chi2(own, known, amounts) + count
         except UnstableRingError:
-            most = int(kept.any(axis=(0, 2)).nonzero()[0].max(initial=0) + 1) // 2
-            if not most:
-                raise
-            continue
-        amounts, used, most = found.amounts, int(kept.sum()), data.valid.shape[1]
+            better = False
+        if better:
+            found, amounts, used, most = own, tried.amounts, count, data.valid.shape[1]
+        else:
+            most = int(np.flatnonzero(kept.any(axis=(0, 2)))[-1] + 1) // 2
     if found is None:
         raise UnstableRingError("the beam is lost in the model before it is read")
-    return found.known
+    learnt = posterior(found, known, linearised_at=amounts)
+    sure = np.array([learnt.errors[name] < UNSURE for name, _ in known.hypotheses])
+    known = replace(known, rms=np.where(sure, learnt.before.rms, known.rms))
+    return posterior(found, known, linearised_at=amounts, learn=False).known
+
+
+def _with(problem: FirstTurns, known: DistributedErrors, amounts: Array) -> FirstTurns:
+    own = zip(known.hypotheses, amounts.tolist(), strict=True)
+    return problem.with_fixed([Cause(*h, amount) for h, amount in own if amount])
+
+
+def _chi2(problem: FirstTurns, known: DistributedErrors, amounts: Array) -> float:
+    point = fit_nuisances(_with(problem, known, amounts), (), problem.first)
+    return np.inf if point.lost else point.chi2
 
 
 def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> DistributedErrors:
