@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from tmlattice import correct, load_ring
-from tmlattice.correction.turns import estimate_of_turns
+from tmlattice.correction.first_turn import estimate_of_turns
 from tmlattice.effects import RingEffect, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.machine.at_engine import AtEngine

@@ -17,9 +17,9 @@ from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
 from tmlattice.correction.applied import applied, sentence
 from tmlattice.correction.estimate import estimate_with, read_estimate
+from tmlattice.correction.first_turn import estimate_of_turns
 from tmlattice.correction.knobs import read_settings, write_knobs
 from tmlattice.correction.result import read_correction
-from tmlattice.correction.turns import estimate_of_turns
 from tmlattice.diagnosis.twin import known_document
 from tmlattice.effects import Cause, apply, find
 from tmlattice.errors import (

@@ -97,8 +97,8 @@ def correct(
     """
     from tmlattice.correction import correct as run
     from tmlattice.correction.estimate import read_estimate
+    from tmlattice.correction.first_turn import estimate_of_turns
     from tmlattice.correction.knobs import write_knobs
-    from tmlattice.correction.turns import estimate_of_turns
     from tmlattice.files import output_file
     from tmlattice.report.speaking import write_correction
 
@@ -152,13 +152,15 @@ def _first_turns(folders: tuple[Path, ...]) -> list["Measurement"]:
 
     if len(folders) == 1 and not (folders[0] / "measurement.json").is_file():
         return []
-    found = [read_measurement(folder) for folder in folders]
-    for folder, one in zip(folders, found, strict=True):
+    found: list[Measurement] = []
+    for folder in folders:
+        one = read_measurement(folder)
         if not isinstance(one, Measurement):
             raise MeasurementError(
                 f"'{folder}' holds no first turns; run `tmlattice diagnose` with --lattice-out, "
                 "and give that file"
             )
+        found.append(one)
     return found
 
 

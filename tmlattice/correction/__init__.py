@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
-from tmlattice.correction.first_turn import Threading
+from tmlattice.correction.first_turn import Threading, estimate_of_turns
 from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_knobs
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.solve import (
@@ -27,7 +27,6 @@ from tmlattice.correction.solve import (
     safest,
 )
 from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
-from tmlattice.correction.turns import estimate_of_turns
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.lattice import Ring, load_ring

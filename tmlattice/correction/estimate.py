@@ -18,11 +18,11 @@ from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
 from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
+from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
 
 Array = NDArray[np.float64]
-Hypothesis = tuple[str, str | None]
 
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
 """Shares of a posterior mean that are tried until the ring stores a beam."""
