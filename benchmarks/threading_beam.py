@@ -1,12 +1,13 @@
 """Machines whose first turn is lost, steered until the beam circulates; AT is the machine.
 
-`python benchmarks/threading_beam.py LATTICE [--machines 50] [--offset 2e-3] [--out FILE.jsonl]`
+`python benchmarks/threading_beam.py LATTICE [--machines 50] [--offset 2e-3] [--first-seed 0]
+[--out FILE.jsonl]`
 
 Each machine has all usual errors of the catalogue, and quadrupoles displaced by `--offset` rms, m.
 Machines whose beam completes the first turn are not counted. Six shots of two turns are read as far
-as the beam gets, diagnosed, and corrected with the target `first_turn`; then again from the
-estimated ring and its posterior, `--rounds` times at most. Where a diagnosis refuses its data,
-the machine is measured again, as a round.
+as the beam gets, and corrected with the target `first_turn`; then again with the posterior of all
+rounds before, `--rounds` times at most. Where the readings are refused, the machine is measured
+again, as a round.
 The oracle knows all errors of the ring. A beam circulates if it is launched on the axis and read on
 20 turns. Machines that FILE has already are not measured again.
 """
@@ -17,15 +18,13 @@ import logging
 import subprocess
 import time
 import warnings
-from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from tmlattice import correct, diagnose, load_ring
-from tmlattice.correction.estimate import estimate_of
-from tmlattice.effects import Cause, RingEffect, apply, background_rms, find
+from tmlattice import correct, load_ring
+from tmlattice.correction.first_turn import estimate_of_turns
+from tmlattice.effects import RingEffect, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.shots import draw_background
@@ -64,22 +63,17 @@ def case(ring, seed, options):
     best = changes(correct(apply(ring, on_ring), goal=ring, targets=TARGET))
     found = {"seed": seed, "before": round(before, 3), "rounds": [],
              "oracle": turns(ring, on_ring, best)}  # fmt: skip
-    kicks, model, known = Counter(), ring, None
+    kicks, estimate = dict[str, float](), None
     for number in range(options.rounds):
         data = simulate(ring, causes, settings=[settings(kicks)] * SHOTS, shots=SHOTS, turns=2,
                         seed=1000 * seed + number).measurement()  # fmt: skip
         try:
-            estimate = estimate_of(diagnose(model, replace(data, settings=()), known=known))
-            own = changes(correct(estimate, targets=TARGET))
+            estimate = estimate_of_turns(ring, [data], estimate and estimate.known)
+            own = correct(estimate, targets=TARGET)
         except TmlatticeError as error:
             found.setdefault("refused", {})[number] = str(error)
             continue  # and measure again
-        kicks.update(own)
-        model = apply(estimate.ring, [
-            Cause(f"corrector_kick_{'xy'['h' not in ring[name].kind[0]]}", name, kick)
-            for name, kick in own.items()
-        ])  # fmt: skip
-        known = estimate.linearised
+        kicks |= {s.knob.name: s.new for s in own.settings}
         found["rounds"].append(round(turns(ring, on_ring, kicks), 3))
         if found["rounds"][-1] >= TURNS:
             break
@@ -103,6 +97,7 @@ def main() -> None:
     arguments.add_argument("--machines", type=int, default=50)
     arguments.add_argument("--offset", type=float, default=2e-3)
     arguments.add_argument("--rounds", type=int, default=8)
+    arguments.add_argument("--first-seed", type=int, default=0)
     arguments.add_argument("--out", type=Path)
     options = arguments.parse_args()
     warnings.simplefilter("ignore")
@@ -116,7 +111,7 @@ def main() -> None:
         rows = [row for row in rows if study.items() <= row.items()]
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent,
                             text=True, stdout=subprocess.PIPE, check=False).stdout  # fmt: skip
-    seed = max((row["seed"] for row in rows), default=-1)
+    seed = max((row["seed"] for row in rows), default=options.first_seed - 1)
     while len(rows) < options.machines:
         seed += 1
         begun = time.process_time()

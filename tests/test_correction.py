@@ -16,7 +16,8 @@ from tmlattice import correct, diagnose, simulate, write_measurement
 from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
 from tmlattice.correction.applied import applied, sentence
-from tmlattice.correction.estimate import estimate_of, estimate_with, read_estimate
+from tmlattice.correction.estimate import estimate_with, read_estimate
+from tmlattice.correction.first_turn import estimate_of_turns
 from tmlattice.correction.knobs import read_settings, write_knobs
 from tmlattice.correction.result import read_correction
 from tmlattice.diagnosis.twin import known_document
@@ -117,6 +118,25 @@ def test_orbit_and_coupling_in_their_units_and_signs(small_ring, quadrupoles):
     assert before > 2e-4
     assert after < 0.35 * before
     assert found.stays["closed_orbit"][0][1] == pytest.approx(after, rel=0.05)
+
+
+def test_a_target_that_rises_is_named(small_ring, quadrupoles):
+    """One magnet brings the tunes back, at the price of beta beating: the summary states both."""
+    machine = apply(small_ring, [Cause("family_gradient", "QF", 0.01)])
+    found = correct(
+        machine, goal=small_ring, targets={"tunes": 1e-3, "beta_beating": 0.03},
+        knobs=[replace(k, error=0.0) for k in default_knobs(small_ring, ["quadrupoles"])
+               if k.name == quadrupoles[0]],
+    )  # fmt: skip
+    before, after = (np.array([p[0] for p in part["beta_beating"]])
+                     for part in (found.before, found.after))  # fmt: skip
+    assert (beating(set_to(machine, found), small_ring) > beating(machine, small_ring)).all()
+    assert (after > before).all()
+    for plane in np.flatnonzero(after > before):
+        words = f"the beta beating in {'xy'[plane]} from {100 * before[plane]:.3g} to "
+        assert words in found.words.split("It raises ")[1]
+        assert words in " ".join(found.report().split())
+    assert "It raises" not in correct(machine, goal=small_ring).words
 
 
 def test_limits_steps_and_excitation_curves(small_ring, wrong):
@@ -446,30 +466,79 @@ def test_threading_brings_a_lost_beam_round(ring_kicking_x):
         correct(ring, goal=ring, targets=["first_turn", "tunes"])
 
 
-def test_first_turns_of_a_lost_beam_thread_it(ring_kicking_x):
-    """Diagnosed and steered in two rounds, with the posterior carried on, AT's beam comes round."""
-    ring = ring_kicking_x("i % 2")
-    rng = np.random.default_rng(2)
-    causes = [
-        Cause(f"quadrupole_offset_{plane}", e.name, 3e-3 * rng.standard_normal())
+def displaced(ring, rms, seed):
+    rng = np.random.default_rng(seed)
+    return [
+        Cause(f"quadrupole_offset_{plane}", e.name, rms * rng.standard_normal())
         for e in ring.elements if e.kind == "quadrupole" for plane in "xy"
     ]  # fmt: skip
-    machine, model, known = apply(ring, causes), ring, None
-    reached = [turns_of_at(machine)[0]]
-    for number in range(3):
-        data = simulate(machine, turns=2, seed=number, engine="at").measurement()
-        estimate = estimate_of(diagnose(model, data, known=known))
-        own = correct(estimate, targets=["first_turn"])
-        machine, model, known = (
-            set_to(machine, own),
-            set_to(estimate.ring, own),
-            estimate.linearised,
-        )
+
+
+def measured_with(ring, causes, kicks, seed):
+    settings = [{name: {"kick": kick} for name, kick in kicks.items()}] * 6
+    return simulate(ring, causes, turns=2, settings=settings, seed=seed).measurement()
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_first_turns_of_a_lost_beam_thread_it(ring_kicking_x, seed):
+    """Measured and steered, again with all measurements so far, AT's beam comes round."""
+    ring = ring_kicking_x("i % 2")
+    causes = displaced(ring, 3e-3, seed)
+    machine = apply(ring, causes)
+    kicks, measured, reached = {}, [], [turns_of_at(machine)[0]]
+    while reached[-1] < 1.0 and len(measured) < 4:
+        measured.append(measured_with(ring, causes, kicks, len(measured)))
+        own = correct(measured, goal=ring, targets=["first_turn"])
+        assert [s.knob.present for s in own.settings] == [
+            kicks.get(s.knob.name, 0.0) for s in own.settings
+        ]
+        kicks |= {s.knob.name: s.new for s in own.settings}
+        machine = set_to(machine, own)
         reached.append(turns_of_at(machine)[0])
-        if reached[-1] == 1.0:
-            break
     assert reached[0] < 0.1
     assert reached[-1] == 1.0, reached
+
+
+def test_first_turns_are_steered_by_a_command(ring_kicking_x, tmp_path):
+    """All measurements so far in, new settings of the correctors out."""
+    ring = ring_kicking_x("i % 2")
+    causes, kicks, folders = displaced(ring, 3e-3, 2), {}, []
+    save_ring(ring, tmp_path / "design.json")
+    for number in range(2):
+        folders.append(str(tmp_path / f"turns {number}"))
+        write_measurement(folders[-1], measured_with(ring, causes, kicks, number))
+        out = tmp_path / f"settings {number}"
+        done = CliRunner().invoke(tmlattice, [
+            "correct", *folders, "--design", str(tmp_path / "design.json"), "--target",
+            "first_turn", "--out", str(out),
+        ])  # fmt: skip
+        assert done.exit_code == 0, done.output
+        rows = list(csv.DictReader((out / "settings.csv").open()))
+        for row in rows:
+            assert float(row["present"]) == pytest.approx(kicks.get(row["device"], 0.0), rel=1e-8)
+        kicks |= {row["device"]: float(row["new"]) for row in rows}
+    steered = [Cause(f"corrector_kick_{'xy'[ring[n].kind == 'vcorrector']}", n, kick)
+               for n, kick in kicks.items()]  # fmt: skip
+    machine = apply(ring, causes)
+    assert turns_of_at(apply(machine, steered))[0] > turns_of_at(machine)[0] + 0.02
+    write_measurement(tmp_path / "response", simulate_response(
+        ring, [], engine="ocelot", progress=False).measured)  # fmt: skip
+    done = CliRunner().invoke(tmlattice, ["correct", str(tmp_path / "response"), "--design",
+                                          str(tmp_path / "design.json")])  # fmt: skip
+    assert "holds no first turns" in str(done.exception)
+
+
+def test_a_loss_is_a_reading(ring_kicking_x):
+    """One kick behind the last BPM that reads the beam: only the loss shows it."""
+    ring = ring_kicking_x("i % 2")
+    lost = ring["QD::5"]
+    measured = measured_with(ring, [Cause("quadrupole_offset_y", lost.name, 0.06)], {}, 0)
+    last = np.flatnonzero(np.isfinite(measured.readings[0, 0, :, 1]))[-1]
+    assert ring.monitors[last].s < lost.s
+    estimate = estimate_of_turns(ring, [measured])
+    beam = AtEngine(estimate.ring).track(np.zeros((1, 6)))[0, 0]
+    assert np.isnan(beam[last + 1]).all()
+    assert np.isfinite(beam[last]).all()
 
 
 def test_a_beam_is_threaded_as_far_as_it_is_known(ring_kicking_x):
@@ -629,13 +698,18 @@ def test_a_second_iteration_and_the_way_back(small_ring, tmp_path):
     said = run("diagnose", design, tmp_path / "after", "--reference", tmp_path / "before",
                "--effects", "family_gradient", "--settings", settings)  # fmt: skip
     assert "calibration 0.8 " in said or "calibration 0.79" in said or "calibration 0.80" in said
-    assert f"--knobs {settings}" in said
+    assert "the same command without --reference" in said
     first, second, k1 = table("first")["QF"], table("second")["QF"], small_ring["QF::1"].k1
     assert first["new"] == pytest.approx(k1 / 1.02, rel=5e-4)
     assert second["present"] == first["new"]
     assert second["new"] == pytest.approx(first["new"] / (1 + errors["after"]), rel=2e-3)
     statement = (tmp_path / "second" / "settings.madx").read_text()
     assert float(statement.split("qf->k1 = ")[1].split(";")[0]) == pytest.approx(second["new"])
+    run("diagnose", design, tmp_path / "after", "--effects", "quadrupole_gradient",
+        "--settings", settings, "--out", tmp_path / "at once")  # fmt: skip
+    at_once = table("at once")["QF"]
+    assert at_once["present"] == first["new"]
+    assert at_once["new"] == pytest.approx(second["new"], rel=2e-3)
     run("correct", tmp_path / "after.json", "--design", design, "--goal", tmp_path / "before.json",
         "--knobs", settings, "--target", "tunes", "--out", tmp_path / "back")  # fmt: skip
     back = 1.02 / (1 + errors["after"])

@@ -13,6 +13,7 @@ from tmlattice.cli.options import (
     console,
     json_option,
     machine_file,
+    named_data,
     named_number,
     open_ring,
     outputs,
@@ -23,6 +24,7 @@ from tmlattice.cli.progress import tell
 
 if TYPE_CHECKING:
     from tmlattice.lattice import Ring
+    from tmlattice.measurement import Measurement
 
 KINDS = "supplies, quadrupoles, skew_quadrupoles, correctors, sextupoles, rf"
 
@@ -37,7 +39,7 @@ TARGET = Word("NAME[=TOLERANCE]", _target, "'{2}' is no tolerance; give for exam
 
 
 @click.command("correct", cls=OfMachine)
-@click.argument("estimated", metavar="ESTIMATED", type=FILE)
+@click.argument("estimated", metavar="ESTIMATED...", type=FILE, nargs=-1, required=True)
 @click.option(
     "--design",
     metavar="LATTICE",
@@ -77,7 +79,7 @@ TARGET = Word("NAME[=TOLERANCE]", _target, "'{2}' is no tolerance; give for exam
     help="Folder for settings.csv, statements of MAD-X, AT and elegant, report.html.",
 )
 def correct(
-    estimated: Path,
+    estimated: tuple[Path, ...],
     design: str | None,
     goal: str | None,
     knobs: str | None,
@@ -89,30 +91,40 @@ def correct(
     """Settings of power supplies that bring the ESTIMATED ring to the design, with their gain.
 
     ESTIMATED is a lattice file of `diagnose --lattice-out`, with the file of remaining
-    uncertainties next to it, or the folder of `diagnose --out` with it. Predicted rms errors have
-    68 % intervals. Changes that may make the ring worse are shortened, or not made.
+    uncertainties next to it, or the folder of `diagnose --out` with it; or, to thread a lost beam
+    (--target first_turn), the folders of its measured first turns, in the order of time. Predicted
+    rms errors have 68 % intervals. Changes that may make the ring worse are shortened, or not made.
     """
     from tmlattice.correction import correct as run
     from tmlattice.correction.estimate import read_estimate
+    from tmlattice.correction.first_turn import estimate_of_turns
     from tmlattice.correction.knobs import write_knobs
     from tmlattice.files import output_file
     from tmlattice.report.speaking import write_correction
 
     with outputs(out, json_file) as (folder, write):
-        path, start = _sources(estimated, design)
+        turns = _first_turns(estimated)
+        path, start = (estimated[0], design) if turns else _sources(estimated[0], design)
         machine = machine_file()
         start = start or (machine.lattice_name() if machine else None)
         if not start:
             raise click.UsageError(f"name the lattice that was diagnosed with --design{HINT}")
         settings = open_ring(start)
+        if turns:
+            tell("estimated ring")
+            with named_data(" or ".join(map(str, estimated))):
+                estimate = estimate_of_turns(settings, turns)
+            settings = estimate.settings
         devices = _devices(knobs, settings, dict(targets))
         if example_file:
             with output_file(example_file) as temporary:
                 write_knobs(temporary, devices)
             console().print(f"written: {example_file}")
             return
-        tell("estimated ring")
-        estimate, warnings = read_estimate(path, settings, open_ring(str(path)))
+        warnings: tuple[str, ...] = ()
+        if not turns:
+            tell("estimated ring")
+            estimate, warnings = read_estimate(path, settings, open_ring(str(path)))
         wanted = open_ring(goal) if goal else None
         options: dict[str, Any] = {"targets": dict(targets)} if targets else {}
         found = run(estimate, goal=wanted, knobs=devices, progress=tell, **options)
@@ -127,6 +139,29 @@ def correct(
     written += [str(json_file)] if json_file else []
     if written:
         screen.print(f"\nwritten: {'; '.join(written)}", soft_wrap=True)
+
+
+def _first_turns(folders: tuple[Path, ...]) -> list["Measurement"]:
+    """Measured first turns; empty: an estimated ring is given.
+
+    Raises:
+        MeasurementError: several estimated rings, or another measurement.
+    """
+    from tmlattice.errors import MeasurementError
+    from tmlattice.measurement import Measurement, read_measurement
+
+    if len(folders) == 1 and not (folders[0] / "measurement.json").is_file():
+        return []
+    found: list[Measurement] = []
+    for folder in folders:
+        one = read_measurement(folder)
+        if not isinstance(one, Measurement):
+            raise MeasurementError(
+                f"'{folder}' holds no first turns; run `tmlattice diagnose` with --lattice-out, "
+                "and give that file"
+            )
+        found.append(one)
+    return found
 
 
 def _sources(estimated: Path, design: str | None) -> tuple[Path, str | None]:

@@ -29,7 +29,9 @@ from tmlattice.cli.options import (
 from tmlattice.cli.progress import tell
 
 if TYPE_CHECKING:
-    from tmlattice.correction import Correction
+    from collections.abc import Sequence
+
+    from tmlattice.correction import Correction, Knob
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
@@ -57,8 +59,9 @@ log = logging.getLogger(__name__)
     "settings_file",
     type=FILE,
     metavar="FILE",
-    help="settings.csv of `tmlattice correct`, applied between the reference and the measurement: "
-    "the calibration of each device, measured over asked change, is printed.",
+    help="settings.csv of the last correction, applied before this measurement: the next "
+    "correction starts from them. With the --reference before them the calibration of each "
+    "device, measured over asked change, is printed instead.",
 )
 @background_option("Distributed errors (not given: estimated from the data)")
 @assume_option
@@ -149,8 +152,6 @@ def diagnose(
         if effects is not None:
             names(effects)  # a wrong name is known before the work
         background_rms(dict(background))
-        if settings_file and not references:
-            raise click.UsageError("--settings needs the measurement from before: --reference")
         from tmlattice.diagnosis import diagnose as run
         from tmlattice.measurement import Measurement, OrbitResponse
 
@@ -200,14 +201,14 @@ def diagnose(
         if lattice_out:
             source["lattice_out"] = str(lattice_out.absolute())
         known = None
-        if lattice_out:
+        if lattice_out or (asked and not before):
             tell("remaining uncertainties")  # minutes, of a large response
             from tmlattice.diagnosis.twin import known_of
 
             known = known_of(result)
         # of what was changed on purpose it would be the way back
-        correction = None if asked else _correction(result, known)
-        calibrations = applied(result, asked) if asked else []
+        correction = None if asked and before else _correction(result, known, asked)
+        calibrations = applied(result, asked) if asked and before else []
         if calibrations:
             source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]
         document = result.as_json()
@@ -226,8 +227,7 @@ def diagnose(
         console().print(of_device(own), soft_wrap=True)
     if calibrations:
         console().print(
-            "\nTo correct what is left, diagnose the measurement without --reference and with "
-            f"--lattice-out, and run `tmlattice correct` with --knobs {settings_file}.",
+            "\nTo correct what is left, give the same command without --reference.",
             soft_wrap=True,
         )
     if reading:
@@ -283,9 +283,13 @@ def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
     return None
 
 
-def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Correction | None":
+def _correction(
+    result: "Diagnosis",
+    known: "DistributedErrors | None",
+    asked: "Sequence[tuple[Knob, float]]",
+) -> "Correction | None":
     """Settings of supplies that bring the estimated ring to the design, where the covariance of its
-    errors is known and they have an expected gain."""
+    errors is known and they have an expected gain; some supplies have applied settings."""
     from tmlattice.correction import correct
     from tmlattice.correction.estimate import estimate_of
     from tmlattice.errors import TmlatticeError
@@ -294,11 +298,26 @@ def _correction(result: "Diagnosis", known: "DistributedErrors | None") -> "Corr
         return None
     tell("correction")
     try:
-        found = correct(estimate_of(result, known))
+        estimate = estimate_of(result, known)
+        found = correct(estimate, knobs=_after(asked, estimate.settings) or None)
     except TmlatticeError:  # no supply acts, or the ring stores no beam
         log.info("no correction", exc_info=True)
         return None
     return None if found.refused else found
+
+
+def _after(asked: "Sequence[tuple[Knob, float]]", ring: "Ring") -> "list[Knob]":
+    """Devices with their applied settings, and all others of the lattice."""
+    from tmlattice.correction.knobs import default_knobs
+
+    devices = [replace(knob, present=new) for knob, new in asked]
+    kinds = {"quadrupole", "skew_quadrupole"} | {knob.kind for knob in devices}
+    taken = {(knob.kind, member) for knob in devices for member in knob.members}
+    others = (
+        knob for knob in default_knobs(ring)
+        if knob.kind in kinds and not taken & {(knob.kind, member) for member in knob.members}
+    )  # fmt: skip
+    return [*devices, *others] if devices else []
 
 
 def _save_rings(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
-from tmlattice.correction.first_turn import Threading
+from tmlattice.correction.first_turn import Threading, estimate_of_turns
 from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_knobs
 from tmlattice.correction.result import Correction, Setting
 from tmlattice.correction.solve import (
@@ -30,6 +30,7 @@ from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.lattice import Ring, load_ring
+from tmlattice.measurement import Measurement
 
 __all__ = ["Correction", "Knob", "Setting", "correct", "default_knobs", "read_knobs"]
 
@@ -42,7 +43,7 @@ INTERVAL = (50.0, 15.87, 84.13)
 
 
 def correct(
-    diagnosis: Diagnosis | Estimate | Ring | Any,
+    diagnosis: Diagnosis | Estimate | Ring | Measurement | Sequence[Measurement] | Any,
     *,
     goal: Ring | Any | None = None,
     knobs: Sequence[Knob | str] | str | Path | None = None,
@@ -54,7 +55,8 @@ def correct(
 
     Args:
         diagnosis: of any measurement; or an `Estimate`; or a ring that is taken as certain, as all
-            that `load_ring` takes.
+            that `load_ring` takes; or measured first turns of a beam that is lost, one measurement
+            or several in the order of time, with their kicks in the shots' settings.
         goal: the ring whose optics are wanted, and whose strengths are the present settings of a
             ring that is given as one; None: the diagnosis's design.
         knobs: devices; kinds of `default_knobs`; or the path of a table. None: quadrupole supplies
@@ -104,13 +106,17 @@ def correct(
     return Correction(**found, ring=estimate.settings, provenance=made)
 
 
-def _estimate(diagnosis: Diagnosis | Estimate | Any, goal: Ring | None) -> Estimate:
+def _estimate(diagnosis: Any, goal: Ring | None) -> Estimate:
     if isinstance(diagnosis, Estimate):
         return diagnosis
     if isinstance(diagnosis, Diagnosis):
         return estimate_of(diagnosis)
     if goal is None:
         raise TmlatticeError("a lattice alone has no goal; give the design (goal=, --design)")
+    if isinstance(diagnosis, Measurement):
+        diagnosis = [diagnosis]
+    if isinstance(diagnosis, list | tuple):
+        return estimate_of_turns(goal, diagnosis)
     return estimate_with(load_ring(diagnosis), goal, None)
 
 

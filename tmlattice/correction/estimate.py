@@ -18,11 +18,11 @@ from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
 from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
+from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
 
 Array = NDArray[np.float64]
-Hypothesis = tuple[str, str | None]
 
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
 """Shares of a posterior mean that are tried until the ring stores a beam."""
@@ -54,15 +54,6 @@ class Estimate:
     energy: float = 0.0
     energy_error: float = 0.0
     found: Ring | None = field(default=None, repr=False)
-
-    @property
-    def linearised(self) -> DistributedErrors | None:
-        """Return the posterior about `ring`, with which its next measurement is diagnosed."""
-        if self.known is None:
-            return None
-        amounts = self.known.amounts.copy()
-        amounts[self.kept] = 0.0
-        return replace(self.known, amounts=amounts)
 
     def storing(self) -> "Estimate":
         """Return the estimate whose ring stores a beam: with the posterior mean, which is

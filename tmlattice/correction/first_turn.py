@@ -2,32 +2,62 @@
 
 The target is the trajectory of a beam that is launched on the axis, at the BPMs on two turns: if it
 stays near the axis on both, it is closed.
+
+The estimated ring comes from where the beam was read and lost. Too few readings exist to search for
+single faults: all errors are distributed, and their scales are learnt with each measurement. A loss
+is a reading too: behind the last BPM that read it the beam was beyond the aperture.
+
+>>> estimate = estimate_of_turns(ring, [first, second])     # the second with the kicks after it
+>>> correction = correct(estimate, targets=["first_turn"])
 """
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from tmlattice.beam.model import Model
+from tmlattice.beam.readouts import APERTURE
+from tmlattice.correction.estimate import Estimate, estimate_with
+from tmlattice.correction.knobs import KINDS
 from tmlattice.correction.targets import TARGETS, THREADING, Weighted
-from tmlattice.lattice import Ring
+from tmlattice.effects import Cause, apply, background_rms, find
+from tmlattice.errors import UnstableRingError
+from tmlattice.inference.distributed import DistributedErrors, posterior
+from tmlattice.inference.metric import Hypothesis
+from tmlattice.inference.newton import fit_nuisances
+from tmlattice.lattice import Element, Ring
+from tmlattice.measurement import Measurement
+from tmlattice.observe.data import Data, of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 
 Array = NDArray[np.float64]
-Hypothesis = tuple[str, str | None]
 
 TURNS = 2
 LOST = 0.1
 """m; reading of a lost beam. It is beyond any aperture, so that the first readings outside of one
 still show the beam's direction."""
+FITS = 12
+"""Posteriors at most, each with readings that the one before it made reachable."""
+UNSURE = 0.5
+"""Relative error of a scale from which it is not learnt."""
+UNREAD = 2
+"""Readings at the end of a shot, at least, that a lost beam lacks: one alone may be a dead BPM."""
+SURPRISE = 2.0
+"""Standard deviations beyond which a loss shows that the scale of the errors is too small: five per
+cent of all losses. The scale is then the one that makes it this far."""
+TRUNCATIONS = 50
+"""Of the posterior, at most."""
 
 
 class Trajectory:
     """A beam that is launched on the axis of a ring.
 
     Attributes:
-        values: at the BPMs on `TURNS` turns, m, [1, reading, plane]; `LOST` where it is lost.
+        values: at the BPMs on `TURNS` turns, m, [reading, plane]; `LOST` where it is lost.
         per_energy: 0: no RF acts on it.
     """
 
@@ -92,3 +122,166 @@ class Threading(Weighted):
     def changes(self, derivatives: Array) -> dict[str, Array]:
         """Return the derivatives of `errors`."""
         return {THREADING: derivatives}
+
+
+# --- the estimated ring ---------------------------------------------------------------------------
+def estimate_of_turns(
+    ring: Ring, measurements: Sequence[Measurement], known: DistributedErrors | None = None
+) -> Estimate:
+    """Return the estimate of first turns, at the kicks of the last shot.
+
+    Args:
+        ring: the design.
+        measurements: in the order of time, with the kicks in their shots' settings.
+        known: posterior of the measurements before, `Estimate.known`; None: there are none.
+
+    Raises:
+        UnstableRingError: the model loses the beam before it is read.
+        UnknownNameError, MeasurementError: a monitor that the ring does not have, or no reading.
+    """
+    kicks: dict[str, float] = {}
+    for measured in measurements:
+        data = of_measurement(ring, measured)
+        known = given_losses(ring, _given_readings(ring, data, known), data)
+        changed = data.settings[-1].items()
+        kicks = {name: own["kick"] for name, own in changed if "kick" in own}
+    estimate = estimate_with(ring, ring, known)
+    settings, causes = ring, []
+    for name, kick in kicks.items():
+        element = ring[name]
+        change = (kick - element.angle) * estimate.calibrations.get(element.name, 1.0)
+        causes.append(Cause(str(KINDS[element.kind].effect), element.name, change))
+        settings = settings.with_elements({ring.index(name): replace(element, angle=kick)})
+    return replace(estimate, settings=settings, ring=apply(estimate.ring, causes))
+
+
+def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> DistributedErrors:
+    """The posterior given the readings: those behind a loss in the model come when it gets there,
+    and half as many where they are not explained, since the model is too nonlinear."""
+    problem = FirstTurns(model=Model(ring, data.settings, data.turns), data=data, places={})
+    usual = background_rms({"all": None})
+    seen = [(n, p) for n in usual for p in find(n).places(ring) if problem.sees((n, p))]
+    known = DistributedErrors.usual(seen, usual) if known is None else known.extended(seen)
+    amounts, used, most = known.amounts, 0, data.valid.shape[1]
+    found = None
+    for _ in range(FITS):
+        there = _with(problem, known, amounts)
+        kept = data.valid & np.isfinite(there.model.readings(problem.first, there.fixed))
+        kept[:, most:] = False
+        count = int(kept.sum())
+        if count <= used:
+            break
+        own = problem.without(~kept)
+        try:
+            tried = posterior(own, known, linearised_at=amounts, learn=False)
+            better = _chi2(own, known, tried.amounts) < _chi2(own, known, amounts) + count
+        except UnstableRingError:
+            better = False
+        if better:
+            found, amounts, used, most = own, tried.amounts, count, data.valid.shape[1]
+        else:
+            most = int(np.flatnonzero(kept.any(axis=(0, 2)))[-1] + 1) // 2
+    if found is None:
+        raise UnstableRingError("the beam is lost in the model before it is read")
+    learnt = posterior(found, known, linearised_at=amounts)
+    sure = np.array([learnt.errors[name] < UNSURE for name, _ in known.hypotheses])
+    known = replace(known, rms=np.where(sure, learnt.before.rms, known.rms))
+    return posterior(found, known, linearised_at=amounts, learn=False).known
+
+
+def _with(problem: FirstTurns, known: DistributedErrors, amounts: Array) -> FirstTurns:
+    own = zip(known.hypotheses, amounts.tolist(), strict=True)
+    return problem.with_fixed([Cause(*h, amount) for h, amount in own if amount])
+
+
+def _chi2(problem: FirstTurns, known: DistributedErrors, amounts: Array) -> float:
+    point = fit_nuisances(_with(problem, known, amounts), (), problem.first)
+    return np.inf if point.lost else point.chi2
+
+
+def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> DistributedErrors:
+    """Return the posterior given where the beam was lost.
+
+    Of the places between the last BPM that read the beam and the next one, with two planes and two
+    sides of the aperture each, the one with the fewest standard deviations is taken, and the
+    posterior is that of a Gaussian beyond this threshold. Other losses follow, the most probable
+    first, until the mean has all of them.
+
+    Args:
+        ring: the design.
+        known: posterior given the readings.
+        data: the shots; of those with equal settings and last readings, one is used.
+    """
+    read = np.asarray(data.valid.any(axis=2))  # [shot, reading]
+    end = read.shape[1] - read[:, ::-1].argmax(axis=1)  # the first reading behind the last one
+    shots = [
+        i for i in np.flatnonzero(read.any(axis=1) & (end <= read.shape[1] - UNREAD))
+        if not any(end[k] == end[i] and data.settings[k] == data.settings[i] for k in range(i))
+    ]  # fmt: skip
+    if not shots:
+        return known
+    estimate = estimate_with(ring, ring, known)
+    probed, behind = _probed(estimate.ring)
+    model = Model(probed, [data.settings[i] for i in shots], data.turns)
+    launches = data.launches[shots]
+    paths = model.paths(launches)
+    places = paths.states[:, model.where][..., [0, 2]]  # [shot, reading, plane]
+    slopes = np.nan_to_num(model.signatures(paths, list(estimate.hypotheses), launches))
+    losses = []
+    for shot, first in enumerate(end[shots].tolist()):
+        turn, monitor = divmod(first, len(ring.monitors))
+        some = turn * len(probed.monitors) + np.arange(behind[monitor], behind[monitor + 1])
+        own = slopes[:, shot, some].reshape(len(slopes), -1)
+        losses.append((places[shot, some].ravel(), estimate.independent(own)))
+    return _truncated(known, losses)
+
+
+def _truncated(
+    known: DistributedErrors, losses: Sequence[tuple[Array, Array]]
+) -> DistributedErrors:
+    """The posterior beyond thresholds.
+
+    Args:
+        known: posterior.
+        losses: positions at some places, m, and their slopes by errors of `known.correlated`.
+    """
+    for _ in range(TRUNCATIONS):
+        nearest = []
+        for at, slopes in losses:
+            inside = (np.abs(at) < APERTURE).all()  # false for a beam that overflows
+            sigma = np.linalg.norm(slopes, axis=0)
+            distance = (APERTURE - np.abs(at)) / np.maximum(sigma, 1e-30)
+            k = int(np.argmin(distance))
+            if inside and sigma[k]:
+                nearest.append((float(distance[k]), np.sign(at[k]) or 1.0, slopes[:, k] / sigma[k]))
+        if not nearest:
+            break
+        distance, side, direction = min(nearest, key=lambda one: one[0])
+        scale = max(distance / SURPRISE, 1.0)
+        z = distance / scale
+        mean = float(norm.pdf(z) / norm.sf(z))
+        share = max(1 - scale**2 * (1 + z * mean - mean**2), 0.0)
+        step = side * scale * mean * direction
+        losses = [
+            (at + step @ slopes,
+             slopes - (1 - np.sqrt(1 - share)) * np.outer(direction, direction @ slopes))
+            for at, slopes in losses
+        ]  # fmt: skip
+        amounts = known.amounts_at(step)
+        known = known.updated(amounts, np.array([share]), direction[None])
+    return known
+
+
+def _probed(ring: Ring) -> tuple[Ring, list[int]]:
+    """The ring with BPMs behind its magnets too, and the first of them behind each of its own."""
+    elements: list[Element] = []
+    behind, count = [0], 0
+    for element in ring.elements:
+        elements.append(element)
+        if element.kind == "monitor":
+            behind.append(count := count + 1)
+        elif element.is_magnet and element.length:
+            end = element.s + element.length / 2
+            elements.append(replace(ring.monitors[0], name=f"behind {element.name}", s=end))
+            count += 1
+    return replace(ring, elements=tuple(elements)), [*behind, count]

@@ -123,10 +123,37 @@ class Correction(Speaks):
         first = [setting.knob.name for setting in self.settings[:3]]
         count = len(self.settings)
         names = ", ".join(first) + (f" and {count - 3} more" if count > 3 else "")
-        parts = [_change(name, self.before[name], self.after[name]) for name in self.targets]
-        most = sorted((part for part in parts if part), key=lambda part: -part[0])[:3]
+        falls = []
+        for name in self.targets:  # its larger plane
+            plane = max((0, 1), key=lambda p: self.before[name][p][0])
+            now, then = self.before[name][plane][0], self.after[name][plane][0]
+            if then < now:
+                falls.append((now / max(then, 1e-30), self._change(name, plane)))
+        most = sorted(falls, key=lambda fall: -fall[0])[:3]
         devices = f"The device {names} takes" if count == 1 else f"The {count} devices {names} take"
-        return f"{devices} {'; '.join(text for _, text in most)}."
+        worse = self.worse
+        rises = f" It raises {'; '.join(worse)}, since the others gain more." if worse else ""
+        return f"{devices} {'; '.join(text for _, text in most)}.{rises}"
+
+    @property
+    def worse(self) -> list[str]:
+        """Targets that the correction raises: their interval is above the present rms, and their
+        rms above the tolerance."""
+        return [
+            self._change(name, plane)
+            for name, tolerance in self.targets.items() for plane in (0, 1)
+            if self.after[name][plane][1] > self.before[name][plane][0]
+            and self.after[name][plane][0] > tolerance
+        ]  # fmt: skip
+
+    def _change(self, name: str, plane: int) -> str:
+        target, now = TARGETS[name], self.before[name][plane][0]
+        then, low, high = self.after[name][plane]
+        factor, unit = (100.0, "%") if target.unit == "relative" else (1.0, target.unit)
+        scale = (
+            f"{factor * now:.3g} to {factor * then:.3g} ± {factor * (high - low) / 2:.2g} {unit}"
+        )
+        return f"the {target.words} in {target.planes[plane]} from {scale.rstrip()}"
 
     report = Method(
         "tmlattice.report.correction_texts", "correction_text", "The whole as plain text."
@@ -177,17 +204,3 @@ def read_correction(path: Path, ring: Ring) -> Correction:
         for member in setting.knob.members:
             ring[member]
     return found
-
-
-def _change(
-    name: str, before: tuple[Interval, Interval], after: tuple[Interval, Interval]
-) -> tuple[float, str] | None:
-    """Factor by which a target's worse plane shrinks, and a sentence; None: it does not."""
-    p = max((0, 1), key=lambda plane: before[plane][0])
-    (now, *_), (then, low, high) = before[p], after[p]
-    if not then < now:
-        return None
-    target = TARGETS[name]
-    factor, unit = (100.0, "%") if target.unit == "relative" else (1.0, target.unit)
-    scale = f"{factor * now:.3g} to {factor * then:.3g} ± {factor * (high - low) / 2:.2g} {unit}"
-    return now / max(then, 1e-30), f"the {target.words} in {target.planes[p]} from {scale.rstrip()}"
