@@ -117,10 +117,7 @@ def test_two_errors_of_one_strength_multiply_as_in_the_model(small_ring):
 def test_quadrupole_offset_is_that_of_its_centre(tmp_path):
     offset = np.array([3e-4, 0, -2e-4, 0])
     engine = engine_of(
-        tmp_path,
-        QUADRUPOLE,
-        ("quadrupole_offset_x", offset[0]),
-        ("quadrupole_offset_y", offset[2]),
+        tmp_path, QUADRUPOLE, ("quadrupole_offset_x", offset[0]), ("quadrupole_offset_y", offset[2])
     )
     body = quadrupole(0.24, 0.7)
     expected = body @ (LAUNCH[:4] - offset) + offset
@@ -581,11 +578,7 @@ def test_a_setting_that_cannot_be_is_named(small_ring):
 
 
 @pytest.mark.parametrize(
-    "element",
-    [
-        "TDCavity(l=0.5, eid='it')",
-        "SBend(l=1.0, angle=0.1, h_pole1=0.2, eid='it')",
-    ],
+    "element", ["TDCavity(l=0.5, eid='it')", "SBend(l=1.0, angle=0.1, h_pole1=0.2, eid='it')"]
 )
 def test_what_at_cannot_build_is_named(tmp_path, element):
     with pytest.raises(LatticeError, match="cannot build 'it'"):

@@ -31,10 +31,7 @@ from tmlattice.report.plain import report_text
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "real_rings"
 real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no measured rings")
-CHANGED = [
-    Cause("family_gradient", "QF", 0.003),
-    Cause("quadrupole_gradient", "QD::5", -0.008),
-]
+CHANGED = [Cause("family_gradient", "QF", 0.003), Cause("quadrupole_gradient", "QD::5", -0.008)]
 
 
 def machine(ring, changes=(), seed=1, drift=0.0):

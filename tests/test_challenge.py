@@ -229,12 +229,7 @@ def test_rates_by_hand(small_ring, quads):
 def test_confusion_calibration_and_pulls_by_hand(small_ring, quads):
     rows = rows_by_hand(small_ring, quads)
     assert confusion(rows) == {
-        "quadrupole_gradient": {
-            "quadrupole_gradient": 2,
-            "ambiguous": 1,
-            "unknown": 1,
-            "none": 1,
-        }
+        "quadrupole_gradient": {"quadrupole_gradient": 2, "ambiguous": 1, "unknown": 1, "none": 1}
     }
     bins = {b["from"]: b for b in calibration(rows)}
     assert bins[0.95]["true"]["share"] == 1.0

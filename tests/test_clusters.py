@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from tmlattice.inference.errors import (
-    LinearFit,
-    Rows,
-    cluster_robust_errors,
-)
+from tmlattice.inference.errors import LinearFit, Rows, cluster_robust_errors
 from tmlattice.inference.normal import normal_equations, solve
 from tmlattice.inference.priors import Group
 

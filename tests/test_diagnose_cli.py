@@ -20,11 +20,7 @@ from tmlattice.files import write_json
 from tmlattice.machine import simulate
 from tmlattice.measurement import OrbitResponse, write_measurement
 from tmlattice.report.plain import report_text
-from tmlattice.report.text import (
-    amount_text,
-    least_text,
-    probability_text,
-)
+from tmlattice.report.text import amount_text, least_text, probability_text
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}

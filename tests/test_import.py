@@ -397,11 +397,7 @@ def element(place, **fields):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        element(2, PassMethod=3.0),
-        element(3, FamName=np.full(5, np.nan)),
-    ],
+    "change", [element(2, PassMethod=3.0), element(3, FamName=np.full(5, np.nan))]
 )
 def test_fields_that_are_not_needed_may_be_anything(simulated, brought, change):
     found = brought(changed(simulated, RINGData_Lattice=change, LocoFlags_ClosedOrbitType=3.0))

@@ -9,13 +9,7 @@ import pytest
 
 from tmlattice.effects import CATALOGUE, Cause, background_rms, find
 from tmlattice.errors import BeamLostError, EffectError, TmlatticeError
-from tmlattice.machine import (
-    Machine,
-    Simulation,
-    draw_background,
-    draw_shots,
-    simulate,
-)
+from tmlattice.machine import Machine, Simulation, draw_background, draw_shots, simulate
 from tmlattice.machine.machine import CHUNK
 from tmlattice.measurement import read_measurement, read_truth, write_truth
 

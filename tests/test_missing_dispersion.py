@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.kicks import (
-    by_energy,
-    dispersion_of_kicks,
-    kicking,
-)
+from tmlattice.beam.kicks import by_energy, dispersion_of_kicks, kicking
 from tmlattice.beam.response_derivatives import derivatives
 from tmlattice.diagnosis import diagnose
 from tmlattice.diagnosis.families.dispersion import (

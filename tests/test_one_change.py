@@ -13,12 +13,7 @@ from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
-from tmlattice.diagnosis.response.undetermined import (
-    Blur,
-    Undetermined,
-    and_orbits,
-    undetermined,
-)
+from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import Cause, find
 from tmlattice.inference.judgement import DEFAULT

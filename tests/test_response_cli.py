@@ -14,11 +14,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.cli.command import tmlattice
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.calibration import (
-    calibrated_response,
-    read_calibration,
-    write_calibration,
-)
+from tmlattice.observe.calibration import calibrated_response, read_calibration, write_calibration
 from tmlattice.observe.compared import OfResponse
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")

@@ -120,10 +120,7 @@ def swapped(measured, what, pair):
     return replace(measured, response=measured.response[:, order], rf=rf)
 
 
-EXCHANGED = {
-    "neighbours": ("correctors", "v5", "v6"),
-    "monitors": ("monitors", "end_1", "end_14"),
-}
+EXCHANGED = {"neighbours": ("correctors", "v5", "v6"), "monitors": ("monitors", "end_1", "end_14")}
 
 
 @pytest.mark.parametrize("case", EXCHANGED)

@@ -82,8 +82,7 @@ def test_tunes_read_back_bit_by_bit(tmp_path, chromaticity, error):
     of_chromaticity = None if chromaticity is None else error
     tune = [[0.1234567890123456, 0.0], [math.nan, 0.9]]
     round_trip(
-        tmp_path,
-        TuneReading(tune, error, chromaticity, of_chromaticity, SETTINGS, (0, 4), **hints),
+        tmp_path, TuneReading(tune, error, chromaticity, of_chromaticity, SETTINGS, (0, 4), **hints)
     )
 
 

@@ -9,14 +9,7 @@ import pytest
 from command import tmlattice
 
 from tmlattice.errors import TmlatticeError
-from tmlattice.fitting.study import (
-    UNSTABLE,
-    Case,
-    faults,
-    run_case,
-    study_tune_fit,
-    summarise,
-)
+from tmlattice.fitting.study import UNSTABLE, Case, faults, run_case, study_tune_fit, summarise
 
 SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 QUICK = {"launch": (1e-4, 0.0, 1e-4, 0.0), "change": -0.02, "noise": 1e-6}

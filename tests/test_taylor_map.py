@@ -71,8 +71,7 @@ def test_symplectic_defect_matches_direct_evaluation(n, order, rng):
 
 
 @pytest.mark.parametrize(
-    "coefficients",
-    [[[0.0, 0.0]], [[0, 0], [[1, 0]]], [[0, 0], np.eye(2), np.zeros((2, 4))]],
+    "coefficients", [[[0.0, 0.0]], [[0, 0], [[1, 0]]], [[0, 0], np.eye(2), np.zeros((2, 4))]]
 )
 def test_wrong_shapes_are_refused(coefficients):
     with pytest.raises(ValueError, match="W"):

@@ -8,11 +8,7 @@ from numpy.testing import assert_allclose
 from tmlattice import Cause, simulate
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import background_rms, find
-from tmlattice.inference.distributed import (
-    DistributedErrors,
-    fit_distributed_errors,
-    posterior,
-)
+from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors, posterior
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe import response_problem
