@@ -35,8 +35,7 @@ def small_ring():
 
 @pytest.fixture(scope="session")
 def ring_kicking_x(tmp_path_factory):
-    """The small ring, of whose correctors v0 to v15 some kick in x; by a function of which these
-    are, as an expression of i."""
+    """The small ring whose correctors v0 to v15 kick in x where an expression of i holds."""
     from tmlattice import load_ring
 
     def ring(which):

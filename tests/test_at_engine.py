@@ -1,8 +1,4 @@
-"""The AT engine: every effect against a formula, the ring against OCELOT's maps.
-
-One element is followed by a monitor, a metre of drift and a second monitor: they give its exit
-state (x, px, y, py), since a drift of AT is x += L px on energy.
-"""
+"""The AT engine: every effect against a formula, the ring against OCELOT's maps."""
 
 from dataclasses import replace
 
@@ -43,6 +39,7 @@ def engine_of(tmp_path, element, *causes, **options):
 
 
 def exit_state(engine, launch=LAUNCH, **setting):
+    """(x, px, y, py) from two monitors a metre apart: a drift of AT is x += L px on energy."""
     a, b = engine.track(launch[None], settings=[{"it": setting}] if setting else None)[0, 0]
     return np.array([a[0], b[0] - a[0], a[1], b[1] - a[1]])
 
@@ -194,8 +191,7 @@ BEND = "SBend(l=2.0, angle=0.028, eid='it')"
 
 
 def bend_kick(strength, engine, ideal):
-    """x and px behind a bend of phi = 0.028, h = 0.014 / m whose field is stronger by a h:
-    x'' + h^2 x = -a h."""
+    """x and px behind a bend whose field is stronger by a h: x'' + h^2 x = -a h."""
     difference = exit_state(engine, np.zeros(6)) - exit_state(ideal, np.zeros(6))
     h = 0.014
     expected = -strength / h * (1 - np.cos(0.028)), -strength * np.sin(0.028)

@@ -132,8 +132,7 @@ def test_a_scheduler_without_its_package_says_how_to_install_it(tmp_path, monkey
 
 
 def test_many_measurements_are_diagnosed_with_one_file_each(tmp_path, small_ring):
-    """On local processes, on a scheduler and here alike; what is done is not done again, but of
-    other data or options; one that cannot be read stops no other."""
+    """Locally, on a scheduler and here alike; what is done is repeated for other data alone."""
     from distributed import LocalCluster
 
     for i, name in enumerate(("QD::5", "QF::2")):

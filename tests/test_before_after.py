@@ -137,8 +137,7 @@ def crowded(small_ring):
 
 @pytest.mark.slow
 def test_single_magnets_do_not_hide_a_small_change_of_their_supply(small_ring, before, crowded):
-    """They had counted as what magnets of a supply scatter by: 8e-4, which hid it, and was in the
-    error of every amount."""
+    """They had counted as the scatter of the supply's magnets, 8e-4, which hid its change."""
     change = diagnose(small_ring, crowded, reference=before)
     true = {("family_gradient", "qf"): 4e-4}
     true |= {("quadrupole_gradient", name): amount for name, amount in SINGLE.items()}
@@ -228,9 +227,7 @@ def test_what_was_exchanged_on_both_days_is_no_change(small_ring, before, axis, 
 
 
 def test_a_bad_step_and_channels_of_one_measurement_alone_do_no_harm(small_ring):
-    """In the reference a supply jumped while v6 was stepped; since, v9 was reversed. The change is
-    one of the ring at its beam's energy: off by two thousandths the tunes are others by 0.026 and
-    0.03."""
+    """A supply jumped during the step of v6, v9 was reversed, the energy is off by 2e-3."""
     energy = Cause("energy_offset", None, 2e-3)
     before = machine(small_ring, [energy])
     after = machine(small_ring, [energy, *CHANGED], seed=2, drift=0.01)
@@ -289,8 +286,7 @@ def test_a_plane_that_is_not_read_takes_nothing_of_the_other(small_ring, before,
 
 
 def test_a_change_is_one_of_the_beam_by_monitors_that_mix_the_planes(small_ring, before):
-    """Gains, rolls and a shear of each monitor, none the transpose of another: what the beam did is
-    what was put in, in both planes; by the own gain where the other plane is not read."""
+    """Gains, rolls and a shear of each monitor: what the beam did is what was put in."""
     rng = np.random.default_rng(5)
     data = response_data(small_ring, before)
     monitors = np.eye(2) + 0.2 * rng.standard_normal((len(before.monitors), 2, 2))
@@ -388,8 +384,7 @@ def test_measured_pairs(tmp_path, null):
 
 
 def test_correctors_of_the_machine_before_kick_as_they_were_fitted(small_ring, before):
-    """A rolled one; one that is reversed besides, whose other plane had the wrong sign; and one
-    that kicks across alone."""
+    """A rolled one, one that is reversed as well, and one that kicks across alone."""
     data = response_data(small_ring, before)
     calibration, roll = np.zeros((2, len(data.kicks)))
     calibration[[4, 5, 6]], roll[[4, 5, 6]] = (0.01, -2.0, -1.0), (0.05, 0.05, 0.9)

@@ -252,8 +252,7 @@ def test_within_one_monitor_gap_counts_monitors_between(small_ring):
 
 
 def test_one_action_by_hand(small_ring):
-    """A thin gradient in the quadrupole has the true action; its roll, a neighbour, a second
-    finding and an open verdict have not."""
+    """A thin gradient in the quadrupole has the true action; its roll or a neighbour has not."""
     true = Cause("quadrupole_gradient", "QD::5", 0.08)
 
     def told(effect, element, verdict="identified", more=0):
@@ -293,8 +292,7 @@ def scored(folder, tier, cases, lattice=LATTICE, **options):
 
 
 def test_a_fixed_set_of_single_faults_keeps_its_rates(tmp_path):
-    """Bounds leave room for one case of chance: a loss of a tenth of the rates breaks them.
-    (The same on petra3, fault by fault: test_diagnosis.py.)"""
+    """Bounds leave room for one case of chance: a loss of a tenth of the rates breaks them."""
     found = scored(tmp_path, "A", 16, signal=(20.0, 100.0))
     tool = {key: value["share"] for key, value in found["bands"]["above 20"]["tool"].items()}
     assert tool["detected"] == 1.0

@@ -1,5 +1,4 @@
-"""Cases of every kind of measurement: blind, as clearly seen as they say, and scored beside what
-the data allow."""
+"""Cases of every kind of measurement: blind, as clearly seen as they say, and scored."""
 
 import json
 from importlib import resources

@@ -87,8 +87,7 @@ ALL_ALONG = (
 
 @pytest.mark.parametrize(("faults", "seed", "clear"), [(SEVERAL, 13, 3), (ALL_ALONG, 11, 4)])
 def test_more_than_three_faults_are_no_small_errors_everywhere(small_ring, faults, seed, clear):
-    """Three are sought first. Of the first case chi-square alone would let three stand, while a
-    scan sees a fourth; of the second they do not, though neighbouring monitors agree."""
+    """Three are sought first; chi-square alone would let three stand in the first case."""
     data = simulate(small_ring, faults, shots=8, seed=seed).measurement()
     found = diagnose(small_ring, data)
     named = {(f.effect, f.element): f for f in found.findings}

@@ -336,8 +336,7 @@ def test_no_progress_is_shown_where_there_is_no_terminal(tmp_path):
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory, small_ring):
-    """Folders written from networks of the small ring with one weak magnet: an on-momentum one of
-    two shots, one off momentum, an orbit response, and one with a changed corrector."""
+    """Measurements of the small ring with one weak magnet, one of each kind that is tried."""
     import numpy as np
 
     from tmlattice import Measurement, OrbitResponse, TaylorNetwork, write_measurement

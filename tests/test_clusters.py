@@ -12,8 +12,7 @@ NOISE = 1e-2
 
 
 def made_up(rng, lacking):
-    """Rows of a ring, and what it lacks, three times the noise: two waves in every column, with
-    which ring errors go too; or the like at every monitor; or nothing."""
+    """Rows of a ring, and what it lacks, three times the noise, by columns or by monitors."""
     plane = np.arange(COLUMNS) % 2
     own = rng.standard_normal((COLUMNS, MONITORS))
     drives, waves = rng.standard_normal((COLUMNS, 2)), rng.standard_normal((2, MONITORS))

@@ -35,8 +35,7 @@ FAULTS = [
 
 @pytest.mark.parametrize("cause", FAULTS, ids=str)
 def test_a_fault_of_the_at_machine_is_found(petra3, cause):
-    """Place and effect in the credible set, the amount within four of its errors, the gap gone:
-    a wrong sign, a swapped plane or a neighbour taken for the magnet fails."""
+    """A wrong sign, a swapped plane or a neighbour taken for the magnet fails."""
     result = diagnose(petra3, measured(petra3, [cause]))
     assert len(result.findings) == 1
     finding = first(result)

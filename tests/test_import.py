@@ -174,9 +174,7 @@ def test_names_numbers_and_units_of_a_loco_file(simulated, brought):
 
 
 def test_ring_answers_as_at_does(simulated, brought):
-    """Kicks inside sextupoles and of both planes at one place, and the RF: within 1e-3 of AT's
-    thick symplectic elements, which is what two halves around a thin kick leave (1e-4) and the
-    bends' edges (4e-4)."""
+    """Within 1e-3 of AT: two halves around a thin kick leave 1e-4, edges of bends 4e-4."""
     found = brought(simulated)
     data, (expected, rf) = found.measurement, design(found)
     assert_allclose(data.response, expected, atol=1e-3 * np.abs(expected).max())
@@ -781,9 +779,7 @@ def rms(values):
 @real
 @pytest.mark.parametrize("name", README)
 def test_a_real_ring_is_that_of_its_readme_and_its_model_is_locos_own(name):
-    """The README's monitors and correctors count the bad, its rms leave them out. LOCO's model
-    before its first iteration, made by MATLAB's AT with its own integrators of sextupoles and
-    bends: a thousandth, or what a tune difference of 1e-4 makes."""
+    """LOCO's own model before its first iteration, by MATLAB's AT, to a thousandth."""
     x, y, horizontal, vertical, noise, measured, left = README[name]
     path = DATA / f"{name}.loco.mat"
     data = bring_in([path], Options(keep_bad=True)).measurement

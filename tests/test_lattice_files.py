@@ -163,11 +163,7 @@ ELEMENTS["sheared sextupole"].T2 = offset
 @pytest.mark.filterwarnings("ignore:.*beyond its first-order matrix")
 @pytest.mark.parametrize("what", ELEMENTS)
 def test_element_moves_a_particle_as_in_at(what):
-    """Offsets of 0.1 mm and 0.1 mrad; what is left is of third order.
-
-    A strong bend is compared to first order: AT leaves out second-order terms of its edges and of
-    curvature times gradient, which OCELOT has.
-    """
+    """0.1 mm and 0.1 mrad to second order; strong bends, whose terms AT lacks, to first."""
     from tmlattice.maps.magnets import way_map
 
     lattice = at.Lattice([ELEMENTS[what].deepcopy()], energy=ENERGY * 1e9, periodicity=1)

@@ -215,8 +215,7 @@ def cells(things):
 
 @pytest.mark.parametrize("at_iteration", [0, 1, 2])
 def test_every_parameter_of_a_fit_is_as_before_it(simulated, bring, at_iteration):  # noqa: F811
-    """Gradients, rolls (functions of the parameter), and skew gradients of a later iteration; the
-    lattice was saved after the last iteration or after another."""
+    """Gradients, rolls, and skew gradients of a later iteration; saved after any of them."""
     variables = copy.deepcopy(simulated)
     lattice = variables["RINGData"]["Lattice"]
     for element in lattice:

@@ -215,8 +215,7 @@ def test_a_sum_without_numbers_is_passed_over(small_ring, data, tmp_path):
 
 
 def test_turns_of_a_stored_beam_that_was_lost(small_ring):
-    """Zeros behind a loss, and in a gap of whole turns, are no readings; a BPM that repeats its
-    reading is frozen."""
+    """Zeros behind a loss and in a gap are no readings; a BPM that repeats itself is frozen."""
     names = [monitor.name for monitor in small_ring.monitors]
     read = 1e-3 * np.random.default_rng(1).standard_normal((2, 64, len(names), 2))
     read[1, 40, 11:], read[1, 41:] = 0.0, 0.0

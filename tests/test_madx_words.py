@@ -1,5 +1,4 @@
-"""What real machines' MAD-X files say (PETRA III, PS, PS Booster, LHC of omc3) and AT's reader does
-not know; referees: OCELOT's matrices, formulas of MAD-X's manual."""
+"""Words of real MAD-X files that AT's reader does not know; referees: OCELOT, the manual."""
 
 import warnings
 

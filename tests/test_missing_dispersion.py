@@ -1,5 +1,4 @@
-"""Dispersion that no gradient makes: kicks of the closed orbit, of which a beam of more energy
-lacks a share. The referee is AT, in which displaced quadrupoles are displaced."""
+"""Dispersion that no gradient makes: kicks of the closed orbit; AT displaces quadrupoles."""
 
 from dataclasses import replace
 
@@ -143,8 +142,7 @@ def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, mea
 
 
 def test_patterns_are_read_as_they_were_put(ring_kicking_x, rng):
-    """Linear about other kicks of both planes; beside an energy spread too, which changes the RF's
-    orbit by its own."""
+    """Linear about other kicks of both planes, and together with an energy spread."""
     ring = ring_kicking_x("i % 2")
     data = response_data(ring, simulated(ring, [], kick=1e-5, noise=2e-8, engine="ocelot"))
     families = HorizontalKicks(), VerticalKicks()
@@ -165,8 +163,7 @@ def test_patterns_are_read_as_they_were_put(ring_kicking_x, rng):
 
 @pytest.mark.parametrize("plane", [0, 1])
 def test_dispersion_at_correctors_counts_as_that_at_monitors_does(ring_kicking_x, plane):
-    """Against the closed orbits, six coordinates, of a ring whose correctors are powered: all of
-    its maps, without the formula. What its energy is of an orbit stands in the model."""
+    """Against closed orbits, six coordinates, of a ring whose correctors are powered."""
     ring = ring_kicking_x("i % 2")
     rng = np.random.default_rng(0)
     plain = ring.with_elements({
@@ -242,8 +239,7 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
 
 @pytest.mark.parametrize("plane", [0, 1])
 def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_ring, plane):
-    """In a ring that is changed, too: the layers that are made anew have theirs. Slopes against
-    differences, to what these are good for."""
+    """In a ring that is changed, too; slopes against differences."""
     design = ResponseModel(small_ring)
     where = kicking(small_ring, plane)
     orbit_kicks = np.zeros((len(small_ring.magnets), 2))
@@ -274,8 +270,7 @@ def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_rin
 
 @pytest.mark.parametrize("family", [HorizontalKicks(), VerticalKicks()])
 def test_the_ring_of_a_change_has_the_dispersion_that_was_fitted(small_ring, family):
-    """To what weak patterns make, which are left out. In its own optics: kicks that make it in the
-    design make two fifths of it too much or too little there, in x."""
+    """In its own optics: kicks of the design's optics make two fifths too much or too little."""
     wrong = np.random.default_rng(2)
     causes = [Cause("quadrupole_gradient", e.name, 1e-2 * wrong.standard_normal())
               for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
@@ -303,8 +298,7 @@ def test_the_ring_of_a_change_has_the_dispersion_that_was_fitted(small_ring, fam
 
 @pytest.mark.slow
 def test_a_change_acts_on_the_dispersion_that_kicks_make(plain):
-    """AT's orbits of quadrupoles that are displaced by a millimetre, on both days: 13 % of the RF's
-    orbit. A reference without kicks has another dispersion, of which 8e-4 of scatter was made."""
+    """Quadrupoles displaced by a millimetre on both days: 13 % of the RF's orbit."""
     rng = np.random.default_rng(7)
     both = [Cause("quadrupole_offset_x", e.name, 1e-3 * rng.standard_normal())
             for e in plain.elements if e.kind == "quadrupole"]  # fmt: skip

@@ -1,8 +1,4 @@
-"""Objects of other packages become rings and rings become objects: the referee is each package's
-own closed orbit, tunes and dispersion.
-
-xtrack and cpymad are no dependencies: what needs them is skipped where they are not installed.
-"""
+"""Objects of other packages as rings and back; referees: their own orbits, tunes, dispersion."""
 
 import functools
 import inspect
@@ -305,8 +301,7 @@ def of_madx(ring, start):
 
 
 def differences(ring, package, request):
-    """Largest differences of tunes, closed orbit (m) and dispersion (m) between a package's own
-    figures of a ring and `ring.twiss()`; along the ring where the package has its elements."""
+    """Largest differences of tunes, closed orbit (m), dispersion (m) from `ring.twiss()`."""
     of = {"AT": of_at, "OCELOT": of_ocelot, "xtrack": of_xtrack}
     if package == "MAD-X":
         tunes, orbit, dispersion = of_madx(ring, request.getfixturevalue("madx"))

@@ -81,8 +81,7 @@ def test_a_closed_orbit_stands_where_an_error_makes_one(small_ring):
 
 
 def test_what_is_left_is_no_noise_where_an_effect_is_missing(small_ring):
-    """Coupling is looked for by no effect that may be the cause: in their own plane the readings
-    are left with noise alone."""
+    """Coupling, which no effect of the fit makes; in-plane readings are left with noise."""
     measured = simulate_response(
         small_ring, [Cause("skew_gradient", "QD::5", 0.02)], engine="ocelot", seed=1
     ).measured

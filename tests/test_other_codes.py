@@ -41,8 +41,7 @@ def madx(tmp_path_factory):
 
 
 def table(ring, folder, centre=0.0, drop=(), drifts=False, **header):
-    """The table that MAD-X's TWISS writes of a ring, with or without drifts; integrated
-    strengths."""
+    """The table that MAD-X's TWISS writes of a ring, with or without drifts."""
     header = {"ENERGY": ring.energy, "MASS": ring.mass, "LENGTH": ring.length, **header}
     kept = [c for c in COLUMNS if c not in drop]
     lines = [f"@ {k} %le {v!r}" for k, v in header.items() if v is not None]

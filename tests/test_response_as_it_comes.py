@@ -51,8 +51,7 @@ def left(result):
 
 
 def test_no_column_is_exchanged_in_a_design_that_is_far_off(tmp_path, measured):
-    """2 % weaker it is across a resonance, where neighbours fit in each other's place by chance:
-    four pairs had been exchanged, and 344 of the noise left."""
+    """2 % weaker it is across a resonance, where neighbours fit each other's place by chance."""
     far = ring_of(tmp_path, ("k = 0.9", "k = 0.88"))
     known = ["quadrupole_gradient", "monitor_gain_x", "monitor_gain_y"]
     result = diagnose(far, measured, effects=known)

@@ -99,8 +99,7 @@ def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):
 
 
 def test_the_scale_of_edges_is_that_of_a_rectangular_magnet(small_ring):
-    """Two edges of half the angle each, each of h tan(edge): far from it no dipole's edges are off.
-    A wiggler's poles, which bend both ways, have theirs too."""
+    """Two edges of half the angle, each of h tan(edge); a wiggler's poles have theirs too."""
     data = response_data(small_ring, simulate_response(small_ring, [], engine="ocelot").measured)
     bends = [e for e in small_ring.elements if e.kind == "bend"]
     expected = {stem(e.name): 2 * e.angle / e.length * np.tan(e.angle / 2) for e in bends}

@@ -280,8 +280,7 @@ def test_tunes_go_with_the_energy_as_ats(small_ring):
 
 
 def test_a_wiggler_that_focuses_is_fitted_and_has_its_amount(small_ring):
-    """Its vertical focusing is a step of the fit, which leaves noise; weighed apart, all of it is
-    seen once more."""
+    """Its vertical focusing is a step of the fit; weighed apart, all of it is seen again."""
     (wiggler,) = (e.name for e in small_ring.elements if e.kind == "wiggler")
     measured = simulate_response(
         small_ring, [Cause("insertion_device_focusing", wiggler, 2e-4)], kick=STEP, noise=1e-9,

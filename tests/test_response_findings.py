@@ -19,10 +19,7 @@ def measured(ring, causes, **options):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_reversed_corrector_is_named_also_where_it_is_held_out(small_ring, seed):
-    """Its own kick would hide a held-out corrector's calibration: half of its monitors are fitted.
-
-    Seed 0 holds v3 out, seed 1 does not.
-    """
+    """Seed 0 holds v3 out, whose own kick would hide its calibration; seed 1 does not."""
     response = measured(small_ring, [Cause("corrector_calibration", "v3", -2.0)])
     result = diagnose(small_ring, response, seed=seed)
     held = dict(zip(result.response.measured.correctors, result.response.held, strict=False))

@@ -117,8 +117,7 @@ def test_scale_of_the_prior_is_that_of_the_truth(rng, freedom):
 
 
 def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
-    """What the data leave to the priors (the scale of all correctors against that of all monitors)
-    was said to be known, as soon as the one number that taught its size was small."""
+    """The scale of correctors against that of monitors was held known for a small number."""
     alike = np.array([[1.0], [1.0]])  # only the sum of two numbers is read
     there = Normal(1e8 * alike @ alike.T, 1e8 * 0.02 * alike[:, 0])
     groups = [
@@ -129,8 +128,7 @@ def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
 
 
 def test_a_scale_that_fell_is_found_again(rng):
-    """Each of 40 numbers is known no better than they are large: from a hundredth of that, whither
-    the scale had fallen while another family was missing, EM stood still."""
+    """40 numbers known no better than they are large: EM stood still at a hundredth of that."""
     truth = 0.01 * rng.standard_normal(40)
     there = Normal(1e4 * np.eye(40), 1e4 * truth + 1e2 * rng.standard_normal(40))
     found = [
@@ -142,8 +140,7 @@ def test_a_scale_that_fell_is_found_again(rng):
 
 
 def test_gains_of_little_information_come_in(small_ring):
-    """Gains of 10 % and gradients of 1 % in readings that tell little of each: nothing was kept
-    with most seeds, for the gains' size had fallen to nothing before the gradients came in."""
+    """Gains of 10 %, gradients of 1 %: the gains' scale had fallen before the gradients came."""
     rng = np.random.default_rng(5)
     causes = [
         Cause("quadrupole_gradient", own.name, 0.01 * float(rng.standard_normal()))

@@ -102,8 +102,7 @@ def test_monitors_in_any_order_have_the_noise_that_they_have(small_ring, whole):
 
 
 def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, monkeypatch):
-    """Gradients are not fitted: 53 smooth orbits that have nothing to do with their columns take
-    0.17 to 0.13 µm; and have nothing to say where nothing is missing."""
+    """53 smooth orbits that have nothing to do with their columns help too, by chance."""
     data = response_data(small_ring, whole)
     split = split_columns(data, 0.2, np.random.default_rng(1))
     calibrations = replace(STEPS[0], families=STEPS[0].families[:1])

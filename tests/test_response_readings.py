@@ -155,8 +155,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
 
 @pytest.mark.parametrize("waves", [0.0, 3.0])
 def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring, clean, waves):
-    """Of real rings gradients scattered by two of their stated errors between seeds of the split,
-    which share four fifths of the readings; two halves of the correctors differed by four."""
+    """Real rings: gradients scattered by two of their stated errors between seeds."""
     rng = np.random.default_rng(5)
     response, planes = clean.response.copy(), np.array(clean.planes)
     for c, plane in enumerate(planes):

@@ -151,8 +151,7 @@ def test_derivative_vs_finite_difference(bent, effect):
 
 
 def test_correctors_that_are_not_set_move_no_map_wherever_their_fields_are(bent):
-    """Of a model that is changed, against one that is made anew; two correctors of `bent` are
-    kicks, and their maps do change."""
+    """A changed model against one made anew; two correctors of `bent` are kicks and change."""
     rng = np.random.default_rng(1)
     model = ResponseModel(bent)
     causes = [

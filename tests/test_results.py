@@ -304,8 +304,7 @@ def test_two_lattices_differ_by_what_was_changed(small_ring):
 
 
 def test_two_responses_differ_by_calibrations(small_ring):
-    """One corrector gives 10 % more; the kicks of the second are half as large. All others agree
-    within the noise."""
+    """One corrector gives 10 % more; the kicks of the second are half as large."""
     one = response(small_ring)
     strong = Cause("corrector_calibration", "v3", 0.1)
     other = response(small_ring, [strong], seed=9, kick=5e-5)

@@ -1,7 +1,4 @@
-"""What lives beside the program: another user, his files, the working directory, ports.
-
-The sentences of SECURITY.md on these, each with a test of its name.
-"""
+"""Sentences of SECURITY.md on other users, their files, the working directory and ports."""
 
 import contextlib
 import os
@@ -315,8 +312,7 @@ def slow(*names):
     "name", ["info", "diagnose", "simulate", "study", *slow("challenge run", "challenge score")]
 )
 def test_no_module_of_the_working_directory_is_loaded_and_no_port_is_open(beside, name):
-    """By no command, in no process of it; nor by `python -m tmlattice`. Nothing listens, on no
-    address and on no Unix socket."""
+    """By no process of a command; nothing listens, on no address and no Unix socket."""
     (beside / "MARK").unlink(missing_ok=True)
     words = [sys.executable, "-m", "tmlattice", *COMMANDS[name]]
     process = psutil.Popen(words, cwd=beside, stdout=subprocess.DEVNULL)

@@ -119,8 +119,7 @@ def test_tunes_and_modes_vs_at(small_ring):
 
 @pytest.mark.parametrize("which", ["small_ring", "with_cavities"])
 def test_tunes_and_modes_with_rf_vs_at(request, which):
-    """A cavity where the dispersion is not zero beats the modes by a hundredth; the model did not
-    know it, and took the loss of energy, with which the RF comes on, for many small errors."""
+    """A cavity where the dispersion is not zero beats the modes by a hundredth."""
     ring = request.getfixturevalue(which)
     causes = [WRONG[0], LOSS]
     model = ResponseModel(apply(ring, causes))

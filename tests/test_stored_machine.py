@@ -1,5 +1,4 @@
-"""A stored beam of the virtual machine: turns, closed orbits, dispersion, tunes, against AT's own
-tools and against one another."""
+"""Turns, closed orbits, dispersion, tunes of the virtual machine against AT's own tools."""
 
 from pathlib import Path
 
@@ -116,8 +115,7 @@ def test_lines_of_a_thousand_particles_that_decohere_are_at_modes(tiny):
 
 @pytest.mark.parametrize("cavity", [False, True])
 def test_a_beam_in_the_network_decoheres_as_in_at(tiny, with_cavity, cavity):
-    """With the cavity at the end of a turn instead of its start, other particles are ahead: the
-    spread, times the dispersion, is small there."""
+    """With the cavity at a turn's end other particles are ahead: the spread is small there."""
     options = {"turns": 64, "amplitude": 3e-4, "particles": 300, "noise": 0.0, "seed": 2}
     options |= {"emittance": (1e-9, 1e-10), "spread": 1e-5 if cavity else 1e-3}
     by_at, by_network = (

@@ -1,7 +1,4 @@
-"""Quadrupoles that share no name, and that the design has alike: one supply, wherever it is asked.
-
-As at BESSY II and MLS (q1m1t1r, q1m2t1r, ...); a change by such a one is in `test_before_after`.
-"""
+"""Quadrupoles that share no name and are alike in the design, as at BESSY II: one supply."""
 
 import json
 import pickle
@@ -120,8 +117,7 @@ def by_hypothesis(found):
 
 @pytest.mark.parametrize("k1", [1.17, 0.0])
 def test_derivatives_of_a_changed_ring(ring, k1):
-    """Those that are kept of the ring before, and those that a shot's settings change: as worked
-    out anew. A magnet that is off has none."""
+    """Kept ones, and those that a shot's settings change, are as worked out anew."""
     layers = LayerMaps(ring, 6)
     directions_nearby(layers, HYPOTHESES)
     there = ring.with_changed("QFm3r", k1=k1)

@@ -66,8 +66,7 @@ def test_most_probable_amounts(problem):
 
 
 def test_errors_of_clusters_are_those_of_fits_without_them(problem):
-    """Each column, and each monitor, is left out of a fit with dense covariances; the errors are
-    widened by how far these fits are from that of all, over what is expected of that."""
+    """Each column, and each monitor, is left out of a fit with dense covariances."""
     rows, weight, patterns, left = problem
     J, V, seen = dense(rows, weight, patterns)
     prior = np.eye(J.shape[1])

@@ -48,8 +48,7 @@ FIRST_UNSEEN = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 @pytest.mark.parametrize("noise", [2e-4, 1e-3, 5e-3])
 @pytest.mark.parametrize("slopes", [DETERMINED, SUM_ALONE, FIRST_UNSEEN])
 def test_moments_are_those_of_all_combinations_of_scales(slopes, noise):
-    """Three members of a group of 24; of the others nothing is read. Where two members stand for
-    each other a Gaussian has not the two peaks that the errors have, and theirs is nearly right."""
+    """Three members of 24 are read; where two stand for each other a Gaussian is nearly right."""
     group = members(24)
     seen = problem(slopes, np.array([FAULT, 4e-4, -6e-4]), noise)
     matrix, vector = np.zeros((24, 24)), np.zeros(24)

@@ -76,8 +76,7 @@ def test_a_rejected_family_may_be_present(problem):
 
 
 def test_rejected_families_are_exchangeable(problem, monkeypatch):
-    """ALS: one of two families that do nearly the same is there, and a chain that adds and takes
-    away one of them at a time would stay with one."""
+    """ALS: one of two families that do nearly the same is present; a chain may stay with one."""
     monkeypatch.undo()  # draws as many as it draws
     J, left, *_ = problem
     J = np.column_stack([J, J[:, 10] + 0.5 * np.random.default_rng(3).standard_normal(len(J))])

@@ -18,8 +18,7 @@ BY = 0.2
 
 
 def moved(ring, folder, name):
-    """The ring with a corrector that many metres further up, in the drift before the monitors
-    before it; that of v0 ends the ring."""
+    """The ring with a corrector BY metres upstream, in the drift before two monitors."""
     path = folder / f"{name}.json"
     save_ring(ring, path)
     content = json.loads(path.read_text())
@@ -54,9 +53,7 @@ def measured_with(ring):
 def test_it_is_the_finding_whether_it_was_fitted_or_held_out(
     small_ring, further_up, name, by, held
 ):
-    """BPMs between the two places, and the lattice's first place. As a jump in its place the
-    corrector had left more than another kick elsewhere would, at the BPM between. Its step is
-    neither fitted nor used for validation."""
+    """BPMs stand between the two places; its step is neither fitted nor used for validation."""
     lattice, machine = small_ring, further_up[name]
     if by > 0:
         lattice, machine = machine, lattice

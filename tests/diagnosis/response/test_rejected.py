@@ -21,8 +21,7 @@ BOTH, ONE, SWAPPED, CORRECTOR = "end_3", "end_8", "end_11", "v6"
 
 @pytest.fixture(scope="module")
 def day(ring_kicking_x, tmp_path_factory):
-    """A BPM that reads noise in both planes, one in y alone, one whose planes are swapped, and a
-    corrector whose orbit is noise, among usual errors."""
+    """A noisy BPM, one noisy in y alone, one with swapped planes, and a noisy corrector."""
     rng = np.random.default_rng(5)
     ring = ring_kicking_x("i % 2")
     causes = [
@@ -71,8 +70,7 @@ def predicted(folder, name="found.json.calibration.json"):
 
 
 def left(table, measured, columns):
-    """rms of what the prediction leaves of correctors in their plane, m; the kick of each is fitted
-    to every other BPM."""
+    """rms of in-plane residuals, m, after the kick of each is fitted to every other BPM."""
     squares = []
     for k in columns:
         p = "xy".index(measured.planes[k])
