@@ -1,25 +1,21 @@
 """What changed between two orbit responses of one machine, simulated and measured."""
 
 import json
-import os
 import pickle
 from collections import Counter
 from dataclasses import replace
-from importlib.resources import files
-from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from conftest import SMALL
+from shared import measured_data, small_steps, valid
 
 from tmlattice import diagnose, load_ring
-from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import save_ring
-from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import read_measurement, write_measurement
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_change import response_change
@@ -28,9 +24,6 @@ from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
 from tmlattice.report.plain import report_text
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
-REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "real_rings"
-real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no measured rings")
 CHANGED = [Cause("family_gradient", "QF", 0.003), Cause("quadrupole_gradient", "QD::5", -0.008)]
 
 
@@ -53,10 +46,7 @@ def machine(ring, changes=(), seed=1, drift=0.0):
               + drift * day.standard_normal())
         for i in range(16)
     ]  # fmt: skip
-    return simulate_response(
-        ring, [*static, *drifts, *changes], kick=1e-5, noise=2e-8, rf_step=-3000.0,
-        engine="ocelot", progress=False, seed=seed,
-    ).measured  # fmt: skip
+    return small_steps(ring, [*static, *drifts, *changes], seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -331,38 +321,30 @@ def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):
         return change
 
     monkeypatch.setattr("tmlattice.diagnosis.diagnose", found)
-    words = ["diagnose", SMALL, str(tmp_path / "after"), "--reference", str(tmp_path / "before")]
-    done = CliRunner().invoke(
-        tmlattice, [*words, "--out", str(tmp_path / "out")], catch_exceptions=False
-    )
-    assert done.exit_code == 0, done.output
+    words = ["diagnose", SMALL, "after", "--reference", "before"]
+    done = tmlattice(*words, "--out", "out", cwd=tmp_path, check=0)
     assert asked["reference"].correctors == before.correctors == asked["correctors"]
-    assert "Since the reference: 2 faults" in done.output
-    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    schema = files("tmlattice") / "schemas" / "diagnosis.schema.json"
-    jsonschema.validate(document, json.loads(schema.read_text()))
+    assert "Since the reference: 2 faults" in done.stdout
+    document = valid(tmp_path / "out" / "diagnosis.json", "diagnosis")
     assert document["provenance"]["options"]["reference"] is True
     assert {own["element"] for own in document["findings"]} == {"qf", "QD::5"}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Since the reference" in page
     assert "residuals of the reference and of the result" in page
-    wrong = CliRunner().invoke(tmlattice, [*words, "--lattice-out", str(tmp_path / "r.json")])
-    assert wrong.exit_code == 2
-    assert "no meaning for a change since a reference" in wrong.output
+    wrong = tmlattice(*words, "--lattice-out", "r.json", cwd=tmp_path, check=2)
+    assert "no meaning for a change since a reference" in wrong.stderr
 
 
 @pytest.mark.slow
-@real
 @pytest.mark.parametrize("null", [False, True])
 def test_measured_pairs(tmp_path, null):
     """Fourteen supplies that were changed on purpose, by 0.1 to 0.75 %; and a pair of nothing."""
     names = ("07-11_a", "07-11_b") if null else ("07-17_before", "07-17_after")
-    folders = []
+    folder_of, folders = measured_data("real_rings"), []
     for name in names:
         folder = tmp_path / name
-        file = REAL / f"lnls_2014-{name}.loco.mat"
-        done = CliRunner().invoke(tmlattice, ["import", str(file), "--out", str(folder)])
-        assert done.exit_code == 0, done.output
+        file = folder_of / f"lnls_2014-{name}.loco.mat"
+        tmlattice("import", file, "--out", folder, cwd=tmp_path, check=0)
         folders.append(folder)
     ring = load_ring(folders[0] / "lattice.json")
     first, second = (read_measurement(folder) for folder in folders)
@@ -370,7 +352,7 @@ def test_measured_pairs(tmp_path, null):
     if null:
         assert (result.verdict, result.findings) == ("none", ())
         return
-    settings = [json.loads((REAL / f"lnls_2014-{name}.setpoints.json").read_text())
+    settings = [json.loads((folder_of / f"lnls_2014-{name}.setpoints.json").read_text())
                 for name in names]  # fmt: skip
     currents = {
         supply.casefold(): [float(np.ravel(own[supply]["value"])[0]) for own in settings]

@@ -10,11 +10,11 @@ import time
 from importlib.resources import files
 from pathlib import Path
 
-import jsonschema
 import pytest
 from command import tmlattice
+from conftest import SMALL
+from shared import valid
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 QUICK = ["--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--epochs", "20"]
 
 
@@ -41,8 +41,7 @@ def outcome(tmp_path_factory):
 
 def test_tune_fit_on_the_built_in_ring(outcome):
     folder, _ = outcome
-    result = json.loads((folder / "result.json").read_text())
-    jsonschema.validate(result, schema("tune-fit"))
+    result = valid(folder / "result.json", "tune-fit")
     assert result["layers"] == 1519
     assert result["monitors"] == 246
     assert result["change"] == -0.2
@@ -93,8 +92,7 @@ def test_a_method_alone_does_not_pay_for_the_others_and_quiet_prints_nothing(tmp
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300,
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    result = json.loads((tmp_path / "a.json").read_text())
-    jsonschema.validate(result, schema("tune-fit"))
+    result = valid(tmp_path / "a.json", "tune-fit")
     assert [m["method"] for m in result["methods"]] == ["sparse"]
     assert result["regularization"] is None
     assert sorted(p.name for p in (tmp_path / "tune-fit").iterdir()) == [
@@ -133,8 +131,7 @@ def test_tune_fit_prints_the_table_and_writes_three_figures(outcome):
 def test_info(tmp_path):
     done = tmlattice("info", SMALL, "--json", "info.json", cwd=tmp_path, check=0)
     assert "quadrupole" in done.stdout
-    facts = json.loads((tmp_path / "info.json").read_text())
-    jsonschema.validate(facts, schema("info"))
+    facts = valid(tmp_path / "info.json", "info")
     assert facts["counts"]["quadrupole"] == 32
     assert facts["layers"] == 114
 
@@ -380,8 +377,7 @@ def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
         "tune-fit", SMALL, "--measurement", folders / name, "--epochs", 150, "--method", "adam",
         "--out", "fit", cwd=tmp_path, check=0,
     )  # fmt: skip
-    result = json.loads((tmp_path / "fit" / "tune-fit.json").read_text())
-    jsonschema.validate(result, schema("tune-fit"))
+    result = valid(tmp_path / "fit" / "tune-fit.json", "tune-fit")
     assert result["shots"] == 2
     assert result["measurement"] == str(folders / name)
     assert result["magnet"] is result["change"] is result["tunes"]["true"] is None

@@ -1,14 +1,12 @@
 """The data checks: what is wrong everywhere is named, and healthy data of sick machines are not."""
 
-import json
 from dataclasses import replace
-from importlib.resources import files
 
-import jsonschema
 import numpy as np
 import pytest
 from command import tmlattice
 from conftest import SMALL
+from shared import valid
 
 from tmlattice.diagnosis import diagnose
 from tmlattice.diagnosis.data_checks import check_data
@@ -435,13 +433,10 @@ def test_check_prints_a_table_and_writes_its_schema(tmp_path, machine):
     write_measurement(tmp_path / "bad", replace(machine, readings=machine.readings * [-1, 1]))
     done = tmlattice("check", SMALL, "good", "--json", "c.json", cwd=tmp_path, check=0)
     assert "no global error" in done.stdout
-    schema = json.loads((files("tmlattice") / "schemas" / "check.schema.json").read_text())
-    jsonschema.validate(json.loads((tmp_path / "c.json").read_text()), schema)
+    valid(tmp_path / "c.json", "check")
     done = tmlattice("check", SMALL, "bad", "--json", "c.json", cwd=tmp_path, check=1)
     assert "--assume x-reversed" in " ".join(done.stdout.split())
-    document = json.loads((tmp_path / "c.json").read_text())
-    jsonschema.validate(document, schema)
-    assert document["status"] == "wrong"
+    assert valid(tmp_path / "c.json", "check")["status"] == "wrong"
     tmlattice("check", SMALL, "bad", "--assume", "x-reversed", "-q", cwd=tmp_path, check=0)
     done = tmlattice("diagnose", SMALL, "bad", cwd=tmp_path, check=2)
     assert "x has the wrong sign at every BPM" in done.stderr

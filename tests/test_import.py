@@ -1,9 +1,7 @@
 """`tmlattice import`: measurements of other programs, against AT, LOCO's own model and README."""
 
 import json
-import os
 import re
-from pathlib import Path
 
 import at
 import h5py
@@ -14,6 +12,7 @@ import scipy.io
 from at.load.utils import element_from_dict
 from command import tmlattice
 from numpy.testing import assert_allclose
+from shared import measured_data
 
 import tmlattice as package
 from tmlattice import load_ring, read_measurement
@@ -27,11 +26,6 @@ from tmlattice.measurement import Measurement, TurnByTurn
 from tmlattice.observe.spectra import lines
 from tmlattice.report.plain import report_text
 
-DATA = Path(os.environ.get("TMLATTICE_DATA", ""), "real_rings")
-real = pytest.mark.skipif(
-    not os.environ.get("TMLATTICE_DATA") or not DATA.is_dir(),
-    reason="TMLATTICE_DATA names no folder with real_rings in it",
-)
 pytestmark = pytest.mark.usefixtures("forked_readers")
 
 ENERGY, CELLS, HARMONIC = 1.5, 8, 88
@@ -776,12 +770,11 @@ def rms(values):
     return 1e6 * np.sqrt(np.nanmean(values**2))
 
 
-@real
 @pytest.mark.parametrize("name", README)
 def test_a_real_ring_is_that_of_its_readme_and_its_model_is_locos_own(name):
     """LOCO's own model before its first iteration, by MATLAB's AT, to a thousandth."""
     x, y, horizontal, vertical, noise, measured, left = README[name]
-    path = DATA / f"{name}.loco.mat"
+    path = measured_data("real_rings", f"{name}.loco.mat")
     data = bring_in([path], Options(keep_bad=True)).measurement
     assert len(data.monitors) == x == y
     assert [data.planes.count(plane) for plane in "xy"] == [horizontal, vertical]
@@ -808,20 +801,18 @@ def test_a_real_ring_is_that_of_its_readme_and_its_model_is_locos_own(name):
     assert not any(word in doubts for word in ("assume", "momentum", "is not that of"))
 
 
-@real
 def test_noise_of_a_loco_file_is_that_of_two_orbits():
     """The Middle Layer's own file of the same day has the scatter of one orbit."""
     name = "lnls_2014-07-17_before"
-    loco = read_mat(DATA / f"{name}.loco.mat", ["LocoMeasData"])["LocoMeasData"]
-    orbit = read_mat(DATA / f"{name}.bpm.mat")
+    loco = read_mat(measured_data("real_rings", f"{name}.loco.mat"))["LocoMeasData"]
+    orbit = read_mat(measured_data("real_rings", f"{name}.bpm.mat"))
     one = np.concatenate([orbit["BPMxData"]["Sigma"], orbit["BPMyData"]["Sigma"]])
     assert_allclose(loco["BPMSTD"], np.sqrt(2) * one, rtol=1e-9)
 
 
-@real
 def test_middle_layers_files_of_a_real_ring_are_its_loco_file():
     parts = ("loco", "response", "dispersion", "bpm")
-    paths = [DATA / f"lnls_2014-07-17_before.{part}.mat" for part in parts]
+    paths = [measured_data("real_rings", f"lnls_2014-07-17_before.{p}.mat") for p in parts]
     found, loco = bring_in(paths).measurement, bring_in(paths[:1]).measurement
     assert found.correctors == loco.correctors
     assert_allclose(found.response, loco.response, atol=1e-15)
@@ -830,9 +821,8 @@ def test_middle_layers_files_of_a_real_ring_are_its_loco_file():
     assert_allclose(found.rf.orbit, loco.rf.orbit, atol=1e-15)
 
 
-@real
 def test_esrf_ebs():
-    place = DATA / "esrf_ebs"
+    place = measured_data("real_rings", "esrf_ebs")
     found = bring_in([*place.glob("*.h5"), place / "name_mapping.json", place / "betamodel.mat"])
     data, (columns, rf) = found.measurement, design(found)
     assert len(data.monitors) == 320
@@ -846,9 +836,8 @@ def test_esrf_ebs():
     assert not found.doubts
 
 
-@real
 def test_turns_of_the_sps():
-    found = bring_in([DATA / "sps" / "sps_200turns.sdds"])
+    found = bring_in([measured_data("real_rings", "sps", "sps_200turns.sdds")])
     assert found.measurement.readings.shape[1] == 201
     assert "201 of one plane" in " ".join(found.assumed)
     spectrum = lines(found.measurement)

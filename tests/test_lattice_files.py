@@ -2,15 +2,12 @@
 
 import json
 import math
-import os
-from importlib.resources import files
-from pathlib import Path
 
 import at
-import jsonschema
 import numpy as np
 import pytest
 from at_ring import at_lattice
+from shared import measured_data, valid
 
 from tmlattice import load_ring, ring_maps
 from tmlattice.beam.chain import Chain
@@ -280,8 +277,7 @@ def test_own_json_keeps_every_map_to_the_bit(tmp_path, request, which, dimension
     for key in ("W0", "W1", "W2", "R0", "R1", "R2", "at"):
         assert np.array_equal(getattr(before, key), getattr(after, key)), key
     assert path.stat().st_size < 500_000
-    schema = json.loads((files("tmlattice") / "schemas" / "lattice.schema.json").read_text())
-    jsonschema.validate(json.loads(path.read_text()), schema)
+    valid(path, "lattice")
     save_ring(again, tmp_path / "twice.json")
     twice = json.loads((tmp_path / "twice.json").read_text())
     assert {**twice, "name": ""} == {**json.loads(path.read_text()), "name": ""}
@@ -482,10 +478,7 @@ def test_change_of_the_reference_momentum_is_refused():
 
 @pytest.fixture(scope="module")
 def real():
-    folder = os.environ.get("TMLATTICE_DATA")
-    path = Path(folder or "nowhere") / "petra3_orbit_response" / "p3_low_beta.mat"
-    if not path.is_file():
-        pytest.skip("TMLATTICE_DATA has no petra3_orbit_response/p3_low_beta.mat")
+    path = measured_data("petra3_orbit_response", "p3_low_beta.mat")
     return path, load_ring(path)
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import gradients, parted
 
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import by_energy, dispersion_of_kicks, kicking
@@ -61,8 +62,7 @@ def with_kicks(ring, measured, more):
 
 
 def state_of(ring, measured, fit):
-    data = response_data(ring, measured)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
+    data, split = parted(ring, measured, 1)
     return fit_steps(data, split, WITHOUT).state if fit else begin(data, split)
 
 
@@ -120,8 +120,7 @@ def test_vertical_patterns_make_what_is_displaced_in_y_in_at(plain):
 def measured(small_ring, beside):
     """Gradients that scatter, without kicks and with them."""
     rng = np.random.default_rng(5)
-    causes = [Cause("quadrupole_gradient", e.name, 5e-3 * rng.standard_normal())
-              for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
+    causes = gradients(small_ring, 5e-3, rng)
     plain = simulated(small_ring, causes, kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
     return causes, plain, with_kicks(small_ring, plain, beside)
 
@@ -272,9 +271,7 @@ def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_rin
 def test_the_ring_of_a_change_has_the_dispersion_that_was_fitted(small_ring, family):
     """In its own optics: kicks of the design's optics make two fifths too much or too little."""
     wrong = np.random.default_rng(2)
-    causes = [Cause("quadrupole_gradient", e.name, 1e-2 * wrong.standard_normal())
-              for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
-    causes.append(Cause("energy_offset", None, 1e-3))
+    causes = [*gradients(small_ring, 1e-2, wrong), Cause("energy_offset", None, 1e-3)]
     data = response_data(small_ring, simulated(small_ring, [], kick=1e-5, noise=2e-8))
     ring = Errors.none(data).with_causes(data, causes)
     values = 1e-3 * wrong.standard_normal(family.size(data))

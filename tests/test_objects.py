@@ -3,7 +3,6 @@
 import functools
 import inspect
 import io
-import os
 import warnings
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import at
 import machine_data
 import numpy as np
 import pytest
+from shared import measured_data
 
 import tmlattice
 from tmlattice import Cause, load_ring, twiss
@@ -340,11 +340,7 @@ TABLE = {
 @functools.cache
 def loaded(name):
     place = RINGS[name]
-    if name == "sps":
-        place = Path(os.environ.get("TMLATTICE_DATA", "nowhere")) / place
-        if not place.is_file():
-            pytest.skip("TMLATTICE_DATA has no real_rings/sps")
-    return quiet(load_ring, place)
+    return quiet(load_ring, measured_data(place) if name == "sps" else place)
 
 
 @pytest.mark.parametrize("name", RINGS)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import parted
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS
@@ -43,8 +44,7 @@ def before(small_ring):
 @pytest.fixture(scope="module")
 def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
-    data = response_data(small_ring, before)
-    split = split_columns(data, 0.2, np.random.default_rng(0))
+    data, split = parted(small_ring, before)
     *_, (_, state) = one_by_one(begin(data, split), STEPS)
     return state
 

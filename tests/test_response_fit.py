@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
+from shared import gradients, parted
 
 from tmlattice.diagnosis.families.fields import FocusingChange, VerticalFocusing
 from tmlattice.diagnosis.families.steps import STEPS, Trial
@@ -142,11 +143,7 @@ def test_a_scale_that_fell_is_found_again(rng):
 def test_gains_of_little_information_come_in(small_ring):
     """Gains of 10 %, gradients of 1 %: the gains' scale had fallen before the gradients came."""
     rng = np.random.default_rng(5)
-    causes = [
-        Cause("quadrupole_gradient", own.name, 0.01 * float(rng.standard_normal()))
-        for own in small_ring.elements
-        if own.kind == "quadrupole"
-    ]
+    causes = gradients(small_ring, 0.01, rng)
     causes += [
         Cause(f"monitor_gain_{plane}", own.name, 0.1 * float(rng.standard_normal()))
         for own in small_ring.monitors
@@ -197,8 +194,7 @@ def test_a_device_focuses_and_a_change_of_one_may_do_less(small_ring):
             small_ring, [Cause("vertical_focusing", "d::95", true)], kick=1e-5, noise=2e-8,
             engine="ocelot", progress=False,
         ).measured  # fmt: skip
-        data = response_data(small_ring, measured)
-        split = split_columns(data, 0.2, np.random.default_rng(1))
+        data, split = parted(small_ring, measured, 1)
         *_, (_, state) = one_by_one(begin(data, split), [STEPS[0], Trial((family,), 2, 0)])
         amounts.append(state.values["device"][family.places(data).index("d::95")])
     assert amounts == pytest.approx([0.0, -0.01, 0.01], rel=0.02, abs=0.0)

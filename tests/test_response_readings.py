@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import parted, small_steps
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
@@ -26,15 +27,11 @@ GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}
 @pytest.fixture(scope="module")
 def clean(small_ring):
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
-    return simulate_response(
-        small_ring, [*causes, Cause("corrector_calibration", "v2", 0.1)], kick=1e-5, noise=2e-8,
-        rf_step=-3000.0, engine="ocelot", progress=False, seed=3,
-    ).measured  # fmt: skip
+    return small_steps(small_ring, [*causes, Cause("corrector_calibration", "v2", 0.1)], seed=3)
 
 
 def fitted(ring, measured):
-    data = response_data(ring, measured)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
+    data, split = parted(ring, measured, 1)
     return fit_steps(data, split, [STEPS[0], STEPS[2]]).state
 
 
@@ -127,9 +124,7 @@ EXCHANGED = {"neighbours": ("correctors", "v5", "v6"), "monitors": ("monitors", 
 def test_what_is_exchanged_is_the_finding(small_ring, case):
     """A ring without another fault had been told to have no error; whatever effects are asked."""
     what, *pair = EXCHANGED[case]
-    measured = simulate_response(
-        small_ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=3
-    ).measured  # fmt: skip
+    measured = small_steps(small_ring, seed=3)
     wrong = swapped(measured, what, pair)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient"])
     assert found.verdict == "localised"

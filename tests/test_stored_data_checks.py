@@ -1,15 +1,13 @@
 """What is wrong everywhere in turns, orbits, dispersion and tunes is told; small errors are not."""
 
-import json
 import re
 from dataclasses import replace
-from importlib import resources
 
-import jsonschema
 import numpy as np
 import pytest
 from command import tmlattice
 from conftest import SMALL
+from shared import valid
 
 from tmlattice import diagnose, write_measurement
 from tmlattice.challenge.kinds import measure
@@ -46,9 +44,7 @@ def test_small_errors_are_nothing_global(small_ring, sound, kind):
     found = check_data(small_ring, sound[kind])
     assert found.kind == kind
     assert found.status != "wrong", [check.sentence for check in found.reported]
-    document = json.loads(json.dumps(found.as_json()))
-    schema = resources.files("tmlattice") / "schemas" / "check.schema.json"
-    jsonschema.validate(document, json.loads(schema.read_text()))
+    valid(found.as_json(), "check")
 
 
 CHANGES = {

@@ -2,22 +2,18 @@
 
 import json
 import math
-from importlib.resources import files
 
-import jsonschema
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from shared import valid
 
 from tmlattice import read_measurement, write_measurement
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
 
-VALID = jsonschema.Draft202012Validator(
-    json.loads((files("tmlattice") / "schemas" / "measurement.schema.json").read_text())
-)
 SETTINGS = ({"q": {"k1_relative": 0.01}}, {})
 MONITORS = ("a", 'b,"', "C")
 reading = st.one_of(st.just(math.nan), st.floats(-0.2, 0.2), st.just(-0.0))
@@ -48,7 +44,7 @@ def same(one, other):
 def round_trip(tmp_path, measured):
     write_measurement(tmp_path / "m", measured, force=True)
     same(measured, read_measurement(tmp_path / "m"))
-    VALID.validate(json.loads((tmp_path / "m" / "measurement.json").read_text(encoding="utf-8")))
+    valid(tmp_path / "m" / "measurement.json", "measurement")
 
 
 quick = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))

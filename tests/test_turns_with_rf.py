@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import SMALL
 
 from tmlattice import Cause, diagnose, load_ring, simulate
 from tmlattice.beam import Model
@@ -16,8 +17,6 @@ TURNS = 3
 @pytest.fixture(scope="module")
 def with_cavities(tmp_path_factory, small_ring):
     """The small ring with two cavities of its own, one before its first magnet."""
-    from conftest import SMALL
-
     text = SMALL.read_text()
     text = text.replace(
         "ring = [\n", "ring = [\n    Cavity(l=0.3, v=1e-3, freq=5e8, eid='first'),\n"

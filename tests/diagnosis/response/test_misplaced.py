@@ -1,11 +1,10 @@
 """Correctors that stand elsewhere than in the lattice."""
 
 import json
-from importlib.resources import files
 
-import jsonschema
 import numpy as np
 import pytest
+from shared import valid
 
 from tmlattice import diagnose, load_ring
 from tmlattice.effects import Cause
@@ -76,9 +75,7 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(
     assert one.s == lattice[name].s
     if name == "v5":  # the region of v0 goes over the ring's end
         assert one.where[0] < one.s < one.where[1]
-    document = found.as_json()
-    schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
-    jsonschema.validate(json.loads(json.dumps(document)), schema)
+    document = valid(found.as_json(), "diagnosis")
     assert document["findings"][0]["to_check"].startswith("Check its position")
     assert f"LOCALISED: {one.words[0].upper()}{one.words[1:]}." in " ".join(found.report().split())
     assert not any("spurious kick" in message for message in found.warnings)

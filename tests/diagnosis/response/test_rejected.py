@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
 
 from tmlattice import Cause, write_measurement
-from tmlattice.cli.command import tmlattice
 from tmlattice.lattice import save_ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
@@ -50,8 +49,7 @@ def day(ring_kicking_x, tmp_path_factory):
     words = ["diagnose", folder / "ring.json", folder / "day", "--lattice-out",
              folder / "found.json", "--json", folder / "found.diagnosis.json", "--effects",
              "quadrupole_gradient,monitor_gain_x,monitor_gain_y,monitor_swap"]  # fmt: skip
-    done = CliRunner().invoke(tmlattice, [str(word) for word in words])
-    assert done.exit_code == 0, done.output
+    tmlattice(*words, cwd=folder, check=0)
     return ring, measured, folder
 
 
@@ -59,8 +57,7 @@ def predicted(folder, name="found.json.calibration.json"):
     """{corrector: {monitor: (x, y)}}, m for KICK; NaN of empty fields."""
     words = ["predict", folder / "found.json", "--calibration", folder / name, "--kick", KICK,
              "--out", folder / "predicted.csv"]  # fmt: skip
-    done = CliRunner().invoke(tmlattice, [str(word) for word in words])
-    assert done.exit_code == 0, done.output
+    tmlattice(*words, cwd=folder, check=0)
     table = {}
     with (folder / "predicted.csv").open() as file:
         for row in csv.DictReader(file):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from shared import parted
 
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.linear import linear
@@ -16,8 +17,6 @@ from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Predicted
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +30,7 @@ def settled(small_ring):
         small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
         progress=False, seed=1,
     ).measured  # fmt: skip
-    data = response_data(small_ring, measured)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
+    data, split = parted(small_ring, measured, 1)
     *_, (_, state) = one_by_one(begin(data, split), STEPS[:3])
     return state
 

@@ -1,12 +1,12 @@
 """Among small errors that nobody has stated a fault is named, and without one none is."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import machine_data
 import numpy as np
 import pytest
+from shared import measured_data
 
 from tmlattice import diagnose, load_ring
 from tmlattice.effects import Cause
@@ -92,14 +92,11 @@ def test_orbits_far_off_in_sextupoles_are_no_fault(deck, options, seed):
     assert (found.verdict, found.findings) == ("distributed", ())
 
 
-DECK = Path(os.environ.get("TMLATTICE_DATA") or "nowhere") / "public_decks" / "elena_m.madx"
-
-
-@pytest.mark.skipif(not DECK.is_file(), reason="TMLATTICE_DATA has no public_decks/elena_m.madx")
 @pytest.mark.filterwarnings("ignore:.*have no value")
 def test_a_usual_error_of_an_effect_without_a_family_is_no_fault():
     """Six bends of 60 degrees focus by their fields' errors: 1.3 of the scatter was named."""
-    ring = load_ring(DECK, monitors="lnr.mccay.*_half::0")
+    deck = measured_data("public_decks", "elena_m.madx")
+    ring = load_ring(deck, monitors="lnr.mccay.*_half::0")
     data = simulate_response(ring, background=ALL, seed=1, progress=False).measured
     found = diagnose(ring, data)
     assert (found.verdict, found.findings) == ("distributed", ())
