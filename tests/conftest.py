@@ -34,15 +34,13 @@ def small_ring():
 
 
 @pytest.fixture(scope="session")
-def ring_kicking_x(tmp_path_factory):
+def ring_kicking_x():
     """The small ring whose correctors v0 to v15 kick in x where an expression of i holds."""
-    from tmlattice import load_ring
+    from tests.scenarios import ring_of
 
     def ring(which):
-        path = tmp_path_factory.mktemp("ring") / "small_ring.py"
         other = f'(Hcor if {which} else Vcor)(eid=f"v{{i}}")'
-        path.write_text(SMALL.read_text().replace('Vcor(eid=f"v{i}")', other))
-        return load_ring(path)
+        return ring_of("small", (('Vcor(eid=f"v{i}")', other),))
 
     return ring
 

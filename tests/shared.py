@@ -12,6 +12,11 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
+SHORT = """from ocelot import *
+energy = 1.0
+q, s = Quadrupole(l=0.3, k1=1.2, eid="q"), Sextupole(l=0.1, k2=20.0, eid="s")
+cell = [Monitor(eid="a"), q, Drift(l=0.5, eid="d"), s, Monitor(eid="b"), Monitor(eid="c")]
+"""
 
 
 @functools.cache

@@ -45,7 +45,8 @@ def test_what_cannot_be_looked_for_is_said_in_a_sentence(ring, data, effects, sa
 
 
 def test_what_cannot_be_looked_for_is_left_out_beside_what_can(ring, data):
-    found = diagnose(ring, data, effects=["insertion_device_focusing", "dipole_field"])
+    asked = ["insertion_device_focusing", "dipole_field", "energy_offset"]
+    found = diagnose(ring, data, effects=asked)
     assert {name for name, _ in found.explanation.scan.hypotheses} == {"dipole_field"}
 
 

@@ -78,19 +78,10 @@ def test_tune_fit_has_a_column_for_each_method_and_says_which_to_trust(outcome):
     assert "more than the noise of 20 µm" in said
 
 
-def test_a_method_alone_does_not_pay_for_the_others_and_quiet_prints_nothing(tmp_path):
-    """In a process of its own, where every package is loaded for the first time."""
-    code = (
-        "import sys, tmlattice.fitting.adam as adam\n"
-        "from tmlattice.cli.command import main\n"
-        "adam._adam = None\n"  # whoever fits by it fails
-        "main()\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, "tune-fit", SMALL, *QUICK, "--noise", "1e-6", "--method",
-         "sparse", "--json", "a.json", "--quiet"],
-        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300,
-    )  # fmt: skip
+def test_a_method_alone_does_not_pay_for_the_others_and_quiet_prints_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("tmlattice.fitting.adam._adam", None)  # whoever fits by it fails
+    words = ("tune-fit", SMALL, *QUICK, "--noise", "1e-6", "--method", "sparse")
+    done = tmlattice(*words, "--json", "a.json", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     result = valid(tmp_path / "a.json", "tune-fit")
     assert [m["method"] for m in result["methods"]] == ["sparse"]
@@ -231,26 +222,6 @@ def test_wrong_input_ends_in_one_sentence_and_leaves_nothing(tmp_path, arguments
     assert len(done.stderr.strip().splitlines()) == 1
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def test_existing_results_are_replaced_whole(tmp_path):
-    from tmlattice.files import output_file
-
-    path = tmp_path / "a.json"
-    path.write_text("old")
-
-    def stop_half_way():
-        with output_file(path) as temporary:
-            temporary.write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        stop_half_way()
-    assert path.read_text() == "old"
-    with output_file(path) as temporary:
-        temporary.write_text("new")
-    assert path.read_text() == "new"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
 WAITS_IN_A_SCAN = (

@@ -99,21 +99,6 @@ def test_one_trajectory_locates_and_says_that_it_cannot_name(petra3):
     assert len({m.effect for m in first(result).credible_set}) > 1
 
 
-def test_data_of_another_ring_are_recognised(petra3):
-    data = measured(petra3, [])
-    order = np.random.default_rng(1).permutation(len(data.monitors))
-    mixed = data.__class__(**{**vars(data), "readings": data.readings[:, :, order]})
-    with pytest.raises(MeasurementError, match="follow no trajectory of 'petra3'"):
-        diagnose(petra3, mixed)
-
-
-def test_energy_offset_is_no_hypothesis_where_every_shot_has_its_own_energy(petra3):
-    data = measured(petra3, [], launch_sigma=(1e-4, 2e-5, 1e-4, 2e-5, 1e-4))
-    result = diagnose(petra3, data)
-    assert result.verdict == "none"
-    assert ("energy_offset", None) not in result.explanation.scan.hypotheses
-
-
 # --- evidence and gap against brute force ----
 def test_evidence_vs_integration(small_ring):
     """The evidence of one cause against the integral of likelihood times prior over its amount."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from conftest import SMALL
 from places import PLACES
 
+from tests.scenarios import ring_of
 from tmlattice import load_ring
 from tmlattice.effects import CATALOGUE, Cause, ReadingEffect, apply
 from tmlattice.effects.effect import RingEffect
@@ -75,13 +75,10 @@ def test_a_set_gradient_of_a_bend_is_the_same_in_both_engines(small_ring):
     assert np.sqrt(((changes["at"] - changes["ocelot"]) ** 2).mean()) < 0.02 * size
 
 
-def test_a_matrix_that_kicks_does_so_in_both_engines(tmp_path):
+def test_a_matrix_that_kicks_does_so_in_both_engines():
     """A misaligned magnet of an AT file is such a matrix; beside a fault in its middle as well."""
-    text = SMALL.read_text().replace(
-        "root = sqrt", "wiggler.b[:4, 0] = [1e-5, 2e-5, -3e-5, 1e-5]\nroot = sqrt"
-    )
-    (tmp_path / "ring.py").write_text(text)
-    ring = load_ring(tmp_path / "ring.py")
+    kick = "wiggler.b[:4, 0] = [1e-5, 2e-5, -3e-5, 1e-5]\nroot = sqrt"
+    ring = ring_of("small", (("root = sqrt", kick),))
     launches = np.zeros((1, 6))
     for causes in ([], [Cause("insertion_device_focusing", "wig_1", 0.5)]):
         at, ocelot = (

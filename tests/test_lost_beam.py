@@ -11,7 +11,6 @@ from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.data_checks import check_data
-from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.lost_beam import beam_lost
@@ -130,12 +129,6 @@ def test_coarse_readings_are_no_lost_beam(small_ring):
     readings = np.round(coarse.readings / 5e-5) * 5e-5
     checks = check_data(small_ring, replace(coarse, readings=readings, noise=None))
     assert lost_in(checks).status == "fine"
-
-
-def test_a_copied_shot_stays_a_copy(small_ring, data):
-    copied = replace(data, readings=np.repeat(data.readings[:1], 6, axis=0))
-    with pytest.raises(MeasurementError, match="one reading was copied"):
-        diagnose(small_ring, copied)
 
 
 def test_a_plane_of_zeros_was_not_read(small_ring, data):

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import SMALL
 from shared import parted, small_steps
 
+from tests.scenarios import ring_of
 from tmlattice import diagnose, load_ring
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.assumed import assumed_of
@@ -138,16 +138,6 @@ def test_gross_single_readings_are_left_out_and_a_reversed_monitor_is_not(small_
 NOISE = 1e-6
 
 
-def ring_of(folder, *edits):
-    """The small ring with correctors of both planes by turns, and other edits of its file."""
-    text = SMALL.read_text()
-    for old, new in (('Vcor(eid=f"v{i}")', '(Hcor if i % 2 else Vcor)(eid=f"v{i}")'), *edits):
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "ring.py").write_text(text)
-    return load_ring(folder / "ring.py")
-
-
 def machine(ring, seed=5, **options):
     """Of a ring with small errors everywhere."""
     rng = np.random.default_rng(seed)
@@ -163,13 +153,8 @@ def machine(ring, seed=5, **options):
 
 
 @pytest.fixture(scope="module")
-def ring(tmp_path_factory):
-    return ring_of(tmp_path_factory.mktemp("ring"))
-
-
-@pytest.fixture(scope="module")
-def measured(ring):
-    return machine(ring)
+def measured():
+    return machine(ring_of("both"))
 
 
 def left(result):
@@ -177,9 +162,9 @@ def left(result):
     return result.steps[-1].heldout_rms_in_plane / NOISE
 
 
-def test_no_column_is_exchanged_in_a_design_that_is_far_off(tmp_path, measured):
+def test_no_column_is_exchanged_in_a_design_that_is_far_off(measured):
     """2 % weaker it is across a resonance, where neighbours fit each other's place by chance."""
-    far = ring_of(tmp_path, ("k = 0.9", "k = 0.88"))
+    far = ring_of("both", (("k = 0.9", "k = 0.88"),))
     known = ["quadrupole_gradient", "monitor_gain_x", "monitor_gain_y"]
     result = diagnose(far, measured, effects=known)
     assert result.steps[0].heldout_rms_in_plane > 100 * NOISE

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command import tmlattice
-from conftest import SMALL
 from shared import valid
 
-from tmlattice import diagnose, write_measurement
+from tmlattice import diagnose
 from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
@@ -123,12 +121,3 @@ def test_what_is_assumed_of_them_is_undone(small_ring, sound):
     assert check_data(small_ring, folded, assumed=["tunes-folded"]).status != "wrong"
     with pytest.raises(MeasurementError, match="no meaning for a dispersion measurement"):
         check_data(small_ring, sound["dispersion"], assumed=["turns-backwards"])
-
-
-def test_the_command_checks_them(sound, tmp_path):
-    write_measurement(tmp_path / "good", sound["dispersion"])
-    write_measurement(tmp_path / "bad", step(sound["dispersion"], lambda values: -values))
-    told = tmlattice("check", str(SMALL), "good", cwd=tmp_path, check=0)
-    assert "ok" in told.stdout
-    told = tmlattice("check", str(SMALL), "bad", cwd=tmp_path, check=1)
-    assert "sign" in told.stdout

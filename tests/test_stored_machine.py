@@ -7,7 +7,8 @@ from command import tmlattice
 from conftest import SMALL
 from numpy.testing import assert_allclose
 
-from tmlattice import Cause, load_ring, read_measurement
+from tests.scenarios import ring_of
+from tmlattice import Cause, read_measurement
 from tmlattice.errors import LatticeError, TmlatticeError, UnstableRingError
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
@@ -30,29 +31,22 @@ UPRIGHT = CAUSES[:2]
 FREQUENCY = {"rf": {"frequency_relative": 1e-5}}
 
 
-def tiny_ring(folder, cavity=False):
+def tiny_ring(*edits):
     """Six of the small ring's cells, 1 GeV, with weak sextupoles: chromaticities 6 and 3."""
-    text = SMALL.read_text()
-    changes = {"cells = 16": "cells = 6", "energy = 3.0": "energy = 1.0", "k2=6.0": "k2=1.5",
-               "k2=-9.0": "k2=-1.5"}  # fmt: skip
-    if cavity:
-        changes["ring = [\n"] = "ring = [\n    Cavity(l=0.3, v=2e-4, freq=5e8, eid='first'),\n"
-    for old, new in changes.items():
-        assert old in text
-        text = text.replace(old, new)
-    path = folder / "ring.py"
-    path.write_text(text)
-    return load_ring(path)
+    tiny = (("cells = 16", "cells = 6"), ("energy = 3.0", "energy = 1.0"), ("k2=6.0", "k2=1.5"),
+            ("k2=-9.0", "k2=-1.5"))  # fmt: skip
+    return ring_of("small", (*tiny, *edits))
 
 
 @pytest.fixture(scope="module")
-def tiny(tmp_path_factory):
-    return tiny_ring(tmp_path_factory.mktemp("tiny"))
+def tiny():
+    return tiny_ring()
 
 
 @pytest.fixture(scope="module")
-def with_cavity(tmp_path_factory):
-    return tiny_ring(tmp_path_factory.mktemp("cavity"), cavity=True)
+def with_cavity():
+    cavity = "ring = [\n    Cavity(l=0.3, v=2e-4, freq=5e8, eid='first'),\n"
+    return tiny_ring(("ring = [\n", cavity))
 
 
 def at_modes(ring, causes=()):

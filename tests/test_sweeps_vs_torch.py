@@ -4,6 +4,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from shared import SHORT
 
 from tmlattice import TaylorNetwork
 from tmlattice.beam import sweeps, threads
@@ -49,11 +50,7 @@ def test_values_and_gradients_match_on_the_whole_ring(petra3_network, rng):
 
 
 def test_gradcheck_on_a_short_ring(tmp_path, rng):
-    (tmp_path / "short.py").write_text(
-        "from ocelot import *\nenergy = 1.0\n"
-        "q = Quadrupole(l=0.3, k1=1.2, eid='q')\ns = Sextupole(l=0.1, k2=20.0, eid='s')\n"
-        "cell = [Monitor(eid='a'), q, Drift(l=0.5, eid='d'), s, Monitor(eid='b'), Monitor(eid='c')]"
-    )
+    (tmp_path / "short.py").write_text(SHORT)
     from tmlattice import load_ring
 
     network = dense(TaylorNetwork.from_ring(load_ring(tmp_path / "short.py")), rng, 0.1)

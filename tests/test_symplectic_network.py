@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from shared import SHORT
 
 from tmlattice import TaylorNetwork, one_turn_optics
 from tmlattice.errors import BeamLostError
@@ -95,11 +96,7 @@ def test_action_does_not_drift_in_5000_turns(petra3_network):
 
 @pytest.mark.parametrize("batch", [1, 3])
 def test_gradients_match_finite_differences(tmp_path, rng, batch):
-    (tmp_path / "short.py").write_text(
-        "from ocelot import *\nenergy = 1.0\n"
-        "q = Quadrupole(l=0.3, k1=1.2, eid='q')\ns = Sextupole(l=0.1, k2=20.0, eid='s')\n"
-        "cell = [Monitor(eid='a'), q, Drift(l=0.5, eid='d'), s, Monitor(eid='b'), Monitor(eid='c')]"
-    )
+    (tmp_path / "short.py").write_text(SHORT)
     from tmlattice import load_ring
 
     network = disturbed(TaylorNetwork.from_ring(load_ring(tmp_path / "short.py")).symplectic(), rng)
