@@ -44,9 +44,7 @@ def bent(combined):
         *(Cause("bend_gradient", n, GRADIENT * w) for n, w in zip(bends, wrong, strict=True)),
         *(Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()),
     ]
-    measured = simulate_response(
-        combined, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="at", progress=False
-    ).measured
+    measured = small_steps(combined, causes, engine="at")
     return response_data(combined, measured), bends, wrong
 
 

@@ -334,12 +334,10 @@ def test_predict_reproduces_the_held_out_figure_with_the_beams_energies(tmp_path
     ring, out, told = (tmp_path / name for name in ("ring.json", "predicted.csv", "found.json"))
     calibration = tmp_path / "ring.json.calibration.json"
     effects = ",".join([*KNOWN, *(cause.effect for cause in beam)])
-    tmlattice("diagnose", SMALL, "m", "--lattice-out", ring, "--json", told, "--out", "out",
+    tmlattice("diagnose", SMALL, "m", "--lattice-out", ring, "--json", told,
               "--effects", effects, cwd=tmp_path, check=0)  # fmt: skip
     tmlattice("predict", ring, "--calibration", calibration, "--out", out, "--kick", "1e-5",
               cwd=tmp_path, check=0)  # fmt: skip
-    names = {file.name for file in (tmp_path / "out").iterdir()}
-    assert {"report.html", "report.txt", "diagnosis.json", "maps.png", "steps.png"} <= names
     written = {
         own["effect"]: own["amount"] for own in json.loads(calibration.read_text())["effects"]
     }

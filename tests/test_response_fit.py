@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
-from shared import gradients, parted
+from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.fields import FocusingChange, VerticalFocusing
 from tmlattice.diagnosis.families.steps import STEPS, Trial
@@ -149,10 +149,7 @@ def test_gains_of_little_information_come_in(small_ring):
         for own in small_ring.monitors
         for plane in "xy"
     ]
-    measured = simulate_response(
-        small_ring, causes, kick=1e-5, noise=4e-6, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=3,
-    ).measured  # fmt: skip
+    measured = small_steps(small_ring, causes, noise=4e-6, seed=3)
     data = response_data(small_ring, measured)
     fit = stepwise.fit_steps(data, split_columns(data, 0.2, np.random.default_rng(0)), STEPS[:3])
     assert {step.effect.split(",")[0] for step in fit.steps[1:]} == {

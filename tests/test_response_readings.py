@@ -14,7 +14,6 @@ from tmlattice.diagnosis.response.set_aside import taken_back
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
@@ -70,10 +69,7 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     noise = 2e-8
     ring = small_ring if plane == "x" else ring_kicking_x("i")
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
-    measured = simulate_response(
-        ring, causes, kick=1e-5, noise=noise, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=3,
-    ).measured  # fmt: skip
+    measured = small_steps(ring, causes, noise=noise, seed=3)
     moves, rests = "xy".index(plane), "yx".index(plane)
     orbit = measured.response[measured.planes.index(plane), :, moves].copy()
     orbit *= times * noise / np.sqrt(np.mean(orbit**2))

@@ -4,12 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from shared import valid
+from shared import small_steps, valid
 
 from tmlattice import diagnose, load_ring
 from tmlattice.effects import Cause
 from tmlattice.lattice import save_ring
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -41,9 +40,7 @@ def further_up(small_ring, tmp_path_factory):
 
 
 def measured_with(ring):
-    return simulate_response(
-        ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=1
-    ).measured
+    return small_steps(ring, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -89,10 +86,9 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(
 def test_small_errors_beside_it_are_told_too_and_it_takes_nobody_s_place(small_ring, further_up):
     """Its statistic is large; `max_effects` counts what is fitted."""
     causes = [Cause("quadrupole_gradient", "QD::5", 0.03)]
-    measured = simulate_response(
-        further_up["v5"], causes, background={"quadrupole_gradient": 1e-3}, kick=1e-5, noise=2e-8,
-        rf_step=-3000.0, engine="ocelot", progress=False, seed=1,
-    ).measured  # fmt: skip
+    measured = small_steps(
+        further_up["v5"], causes, background={"quadrupole_gradient": 1e-3}, seed=1
+    )
     found = diagnose(small_ring, measured, max_effects=1, effects=["quadrupole_gradient"])
     assert found.verdict == "localised"
     assert [own.elements for own in found.findings if own.words] == [("v5",)]

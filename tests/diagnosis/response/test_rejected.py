@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command import tmlattice
+from shared import gradients, small_steps
 
 from tmlattice import Cause, write_measurement
 from tmlattice.lattice import save_ring
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -23,17 +23,11 @@ def day(ring_kicking_x, tmp_path_factory):
     """A noisy BPM, one noisy in y alone, one with swapped planes, and a noisy corrector."""
     rng = np.random.default_rng(5)
     ring = ring_kicking_x("i % 2")
-    causes = [
-        Cause("quadrupole_gradient", e.name, 2e-3 * rng.standard_normal())
-        for e in ring.elements if e.kind == "quadrupole"
-    ]  # fmt: skip
+    causes = gradients(ring, 2e-3, rng)
     causes += [Cause("monitor_gain_x", m.name, 0.02 * rng.standard_normal()) for m in ring.monitors]
     causes += [Cause("monitor_gain_y", m.name, 0.02 * rng.standard_normal()) for m in ring.monitors]
     causes += [Cause("monitor_swap", SWAPPED, 1.0)]
-    measured = simulate_response(
-        ring, causes, kick=KICK, noise=1e-7, rf_step=-3000.0, engine="ocelot", progress=False,
-        seed=3,
-    ).measured  # fmt: skip
+    measured = small_steps(ring, causes, kick=KICK, noise=1e-7, seed=3)
     response, at = measured.response.copy(), measured.monitors.index
 
     def noise(part):
