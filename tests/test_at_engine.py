@@ -420,19 +420,6 @@ def network6(petra3):
     return TaylorNetwork.from_ring(petra3, 6)
 
 
-def refit(network, launch, readings):
-    """Rest of the readings after the launch is fitted, finite differences of the network."""
-    launch = launch.copy()
-    free = [0, 1, 2, 3, 5]
-    steps = 1e-6 * np.eye(6)[free]
-    for _ in range(3):
-        rest = readings - network(launch[None])[0].detach().numpy()
-        up, down = (network(launch + s * steps).detach().numpy() for s in (1, -1))
-        slope = ((up - down) / 2e-6).reshape(len(free), -1).T
-        launch[free] += np.linalg.lstsq(slope, rest.ravel(), rcond=None)[0]
-    return readings - network(launch[None])[0].detach().numpy()
-
-
 def test_default_steps_are_converged(petra3, rng):
     launches = rng.standard_normal((4, 6)) * [1e-3, 5e-5, 1e-3, 5e-5, 0, 1e-5]
     coarse, fine = (AtEngine(petra3, steps=n).track(launches)[:, 0] for n in (30, 90))

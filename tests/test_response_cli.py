@@ -84,16 +84,6 @@ def test_command_line(tmp_path):
     assert not any("QF" in file.read_text() for file in folder.iterdir())
 
 
-def test_options_of_the_other_kind_are_refused(tmp_path):
-    for words, said in (
-        (["--kind", "orbit-response", "--shots", "3"], "--shots has no meaning"),
-        (["--corrector", "v1"], "--corrector has no meaning for --kind trajectory"),
-    ):
-        done = tmlattice("simulate", SMALL, *words, "--out", "no", cwd=tmp_path, check=2)
-        assert said in done.stderr
-    assert not (tmp_path / "no").exists()
-
-
 def test_predict_with_a_calibration(tmp_path, small_ring):
     file, out = tmp_path / "ring.calibration.json", tmp_path / "predicted.csv"
     write_calibration(file, CAUSES)

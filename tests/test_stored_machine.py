@@ -303,6 +303,8 @@ def test_command_has_the_kinds_own_defaults(tmp_path, small_ring):
         (["--kind", "closed-orbit", "--engine", "ocelot"], "--engine has no meaning"),
         (["--particles", "10"], "take it out, or give --kind turn-by-turn"),
         (["--kind", "dispersion", "--corrector", "v1"], "or give --kind orbit-response"),
+        (["--kind", "orbit-response", "--shots", "3"], "--shots has no meaning"),
+        (["--corrector", "v1"], "--corrector has no meaning for --kind trajectory"),
     ],
 )
 def test_options_of_other_kinds_are_refused(tmp_path, words, said):

@@ -4,7 +4,6 @@ import numba
 import numpy as np
 import pytest
 import torch
-from shared import SHORT
 
 from tmlattice import TaylorNetwork
 from tmlattice.beam import sweeps, threads
@@ -47,21 +46,6 @@ def test_values_and_gradients_match_on_the_whole_ring(petra3_network, rng):
     expected = torch.autograd.grad(plain.square().sum(), weights)
     for one, other in zip(got, expected, strict=True):
         assert (one - other).abs().max() <= 1e-10 * other.abs().max()
-
-
-def test_gradcheck_on_a_short_ring(tmp_path, rng):
-    (tmp_path / "short.py").write_text(SHORT)
-    from tmlattice import load_ring
-
-    network = dense(TaylorNetwork.from_ring(load_ring(tmp_path / "short.py")), rng, 0.1)
-    launch = torch.from_numpy(0.1 * rng.standard_normal((2, 4))).requires_grad_()
-    names = [name for name, _ in network.named_parameters()]
-
-    def readings(launch, *weights):
-        return torch.func.functional_call(network, dict(zip(names, weights, strict=True)), launch)
-
-    weights = [w.detach().clone().requires_grad_() for w in network.parameters()]
-    assert torch.autograd.gradcheck(readings, (launch, *weights), eps=1e-6, atol=1e-8)
 
 
 def test_a_layer_that_bends_only_slightly_is_not_skipped(small_network, rng):
