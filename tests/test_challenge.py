@@ -33,6 +33,18 @@ def made(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def blind(made, tmp_path_factory):
+    """Run, with the truth hidden beside it."""
+    folder = tmp_path_factory.mktemp("blind")
+    shutil.copytree(made, folder / "A")
+    (folder / "A" / "truth").rename(folder / "hidden")
+    results = run(folder / "A", jobs=1, progress=False, lattice=LATTICE)
+    assert len(results) == 3
+    assert all("error" not in result for result in results.values())
+    return folder
+
+
 def public(folder):
     files = [p for p in sorted((folder / "cases").rglob("*")) if p.is_file()]
     return {str(p.relative_to(folder)): p.read_bytes() for p in files}
@@ -100,13 +112,9 @@ def test_signal_to_noise_by_brute_force_with_at(made, small_ring, name):
     assert 5 * 0.98 <= expected <= 100 * 1.02
 
 
-def test_run_needs_no_truth_and_score_does(made, tmp_path):
-    folder = tmp_path / "blind"
-    shutil.copytree(made, folder)
-    (folder / "truth").rename(tmp_path / "hidden")
-    results = run(folder, jobs=1, progress=False, lattice=LATTICE)
-    assert len(results) == 3
-    assert all("error" not in result for result in results.values())
+def test_run_needs_no_truth_and_score_does(blind, tmp_path):
+    shutil.copytree(blind, tmp_path, dirs_exist_ok=True)
+    folder = tmp_path / "A"
     written = {p.name: p.stat().st_mtime_ns for p in (folder / "results").iterdir()}
     run(folder, jobs=1, progress=False, lattice=LATTICE)  # nothing is done twice
     assert written == {p.name: p.stat().st_mtime_ns for p in (folder / "results").iterdir()}
@@ -306,8 +314,8 @@ def test_a_fixed_set_of_single_faults_keeps_its_rates(tmp_path):
 
 
 def test_a_fixed_set_without_a_fault_stays_silent(tmp_path):
-    # 1.8 expected at a rate of 5 %; five or more have 3 % there, and 88 % at a rate of 20 %
-    assert scored(tmp_path, "E", 36)["false_alarms"]["share"] <= 4 / 36
+    # 1 expected at a rate of 5 %; four or more have 2 % there, and 59 % at a rate of 20 %
+    assert scored(tmp_path, "E", 20)["false_alarms"]["share"] <= 3 / 20
 
 
 def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
@@ -326,10 +334,10 @@ def test_another_seed_or_lattice_is_another_challenge(tmp_path, monkeypatch):
     ring_of.cache_clear()
 
 
-def test_a_damaged_result_or_truth_is_reported_and_not_fatal(made, tmp_path):
+def test_a_damaged_result_or_truth_is_reported_and_not_fatal(blind, tmp_path):
     folder = tmp_path / "set"
-    shutil.copytree(made, folder)
-    run(folder, jobs=1, progress=False, lattice=LATTICE)
+    shutil.copytree(blind / "A", folder)
+    shutil.copytree(blind / "hidden", folder / "truth")
     whole = (folder / "results" / "0000.json").read_text()
     (folder / "results" / "0000.json").write_text(json.dumps(json.loads(whole) | {"seconds": "x"}))
     found = score(folder, jobs=1, oracle=False, progress=False, lattice=LATTICE)

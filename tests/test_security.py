@@ -281,8 +281,7 @@ MODULES = (
 SIMULATE = ("simulate", "ring.json", "--shots", "66", "--engine", "ocelot", "--jobs", "2", "-q")
 STUDY = ("dev", "study", "tune-fit", "ring.json", "--magnets", "2", "--methods", "sparse", "-q")
 COMMANDS = {
-    "info": ("info", "ring.py"),
-    "diagnose": ("diagnose", "ring.json", "M", "--out", "R"),
+    "diagnose": ("diagnose", "ring.py", "M", "--out", "R"),
     "simulate": (*SIMULATE, "--out", "N", "--force"),
     "challenge run": ("dev", "challenge", "run", "set", "--jobs", "2", "-q"),
     "study": (*STUDY, "--jobs", "2", "--out", "study"),
@@ -309,7 +308,7 @@ def slow(*names):
 
 
 @pytest.mark.parametrize(
-    "name", ["info", "diagnose", "simulate", "study", *slow("challenge run", "challenge score")]
+    "name", ["diagnose", "simulate", "study", *slow("challenge run", "challenge score")]
 )
 def test_no_module_of_the_working_directory_is_loaded_and_no_port_is_open(beside, name):
     """By no process of a command; nothing listens, on no address and no Unix socket."""

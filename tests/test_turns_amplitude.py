@@ -142,7 +142,7 @@ def test_a_steady_line_knows_its_energy(small_ring):
 
 def test_what_decoheres_has_an_imaginary_energy(small_ring):
     """Of Gaussian phases 2 pi xi delta n: by the mean turn of its power, sigma / sqrt(pi)."""
-    beam = {"particles": 20_000, "turns": 100, "engine": "network", "amplitude": 5e-4}
+    beam = {"particles": 5_000, "turns": 100, "engine": "network", "amplitude": 5e-4}
     weak = Cause("quadrupole_gradient", "QD::3", 0.01)
     turns = simulate_turns(small_ring, **beam, noise=2e-6).measured
     problem = many_turns(small_ring, turns, {})
