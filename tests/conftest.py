@@ -18,9 +18,13 @@ else:
     os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
 
 
+LONGEST = "scenarios diagnosis import security turns_amplitude response_diagnosis challenge"
+
+
 def pytest_collection_modifyitems(items):
-    """The file that takes longest first: processes end at the same time."""
-    items.sort(key=lambda item: item.path.name != "test_scenarios.py")
+    """The files that take longest first: processes end at the same time."""
+    first = [f"test_{name}.py" for name in LONGEST.split()]
+    items.sort(key=lambda item: first.index(name) if (name := item.path.name) in first else 99)
 
 
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
