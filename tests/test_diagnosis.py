@@ -67,17 +67,17 @@ def test_no_fault_is_nothing_and_says_what_would_have_been_seen(petra3):
     assert first(diagnose(petra3, measured(petra3, [seen]))).where is not None
 
 
-def test_an_effect_without_a_name_is_located(petra3):
+def test_an_effect_without_a_name_is_located(small_ring):
     """A kick that is another one in every shot: the catalogue does not hold it."""
     kicks = [3e-5, -4e-5, 5e-6, 2e-5, -1e-5, 4e-5]
-    settings = [{"hcor_a1_5": {"kick": kick}} for kick in kicks]
-    data = measured(petra3, [], settings=settings)
+    settings = [{"v6": {"kick": kick}} for kick in kicks]
+    data = measured(small_ring, [], settings=settings)
     hidden = data.__class__(**{**vars(data), "settings": ()})
-    result = diagnose(petra3, hidden, effects=[n for n in CATALOGUE if "corrector" not in n])
+    result = diagnose(small_ring, hidden, effects=[n for n in CATALOGUE if "corrector" not in n])
     assert result.verdict == "localised"
     finding = first(result)
     assert (finding.effect, finding.element, finding.credible_set) == (None, None, ())
-    assert finding.where[0] - 15 <= petra3["hcor_a1_5"].s <= finding.where[1] + 15
+    assert finding.where[0] - 1 <= small_ring["v6"].s <= finding.where[1] + 1
     assert result.gap["explained"] is None
 
 

@@ -67,7 +67,7 @@ def measurements(draw):
     )
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(measurements())
 def test_trajectory_reads_back_bit_by_bit(tmp_path, measurement):
     write_measurement(tmp_path / "m", measurement, force=True)
@@ -75,7 +75,7 @@ def test_trajectory_reads_back_bit_by_bit(tmp_path, measurement):
     valid(tmp_path / "m" / "measurement.json", "measurement")
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     arrays(float, (3, 2, 2), elements=reading),
     st.none() | arrays(float, (2, 2), elements=reading),
