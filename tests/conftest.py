@@ -8,6 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from shared import SHORT
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 if "PYTEST_XDIST_WORKER" in os.environ:  # one of several processes: a thread each, one cache
@@ -35,6 +36,16 @@ def small_ring():
     from tmlattice import load_ring
 
     return load_ring(SMALL)
+
+
+@pytest.fixture(scope="session")
+def short_ring(tmp_path_factory):
+    """Six elements, for what takes a time for each."""
+    from tmlattice import load_ring
+
+    path = tmp_path_factory.mktemp("short") / "short.py"
+    path.write_text(SHORT)
+    return load_ring(path)
 
 
 @pytest.fixture(scope="session")

@@ -22,8 +22,8 @@ def dense(network, rng, size=1e-3):
 
 @pytest.mark.parametrize("batch", [1, 2, 16, 17, 70, 130])  # every width of block, full and not
 @pytest.mark.parametrize("dimension", [4, 6])
-def test_values_and_gradients_match_the_plain_loop(small_ring, batch, dimension, rng):
-    network = dense(TaylorNetwork.from_ring(small_ring, dimension), rng)
+def test_values_and_gradients_match_the_plain_loop(short_ring, batch, dimension, rng):
+    network = dense(TaylorNetwork.from_ring(short_ring, dimension), rng)
     launch = torch.from_numpy(1e-4 * rng.standard_normal((batch, dimension)))
     launch.requires_grad_()
     mine, plain = network(launch), plain_readings(network, launch)
