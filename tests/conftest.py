@@ -8,6 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from shared import SHORT
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 if "PYTEST_XDIST_WORKER" in os.environ:  # one of several processes: a thread each, one cache
@@ -18,9 +19,13 @@ else:
     os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
 
 
+LONGEST = "scenarios diagnosis import security turns_amplitude response_diagnosis challenge"
+
+
 def pytest_collection_modifyitems(items):
-    """The file that takes longest first: processes end at the same time."""
-    items.sort(key=lambda item: item.path.name != "test_scenarios.py")
+    """The files that take longest first: processes end at the same time."""
+    first = [f"test_{name}.py" for name in LONGEST.split()]
+    items.sort(key=lambda item: first.index(name) if (name := item.path.name) in first else 99)
 
 
 SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
@@ -34,16 +39,23 @@ def small_ring():
 
 
 @pytest.fixture(scope="session")
-def ring_kicking_x(tmp_path_factory):
-    """The small ring, of whose correctors v0 to v15 some kick in x; by a function of which these
-    are, as an expression of i."""
+def short_ring(tmp_path_factory):
+    """Six elements, for what takes a time for each."""
     from tmlattice import load_ring
 
+    path = tmp_path_factory.mktemp("short") / "short.py"
+    path.write_text(SHORT)
+    return load_ring(path)
+
+
+@pytest.fixture(scope="session")
+def ring_kicking_x():
+    """The small ring whose correctors v0 to v15 kick in x where an expression of i holds."""
+    from tests.scenarios import ring_of
+
     def ring(which):
-        path = tmp_path_factory.mktemp("ring") / "small_ring.py"
         other = f'(Hcor if {which} else Vcor)(eid=f"v{{i}}")'
-        path.write_text(SMALL.read_text().replace('Vcor(eid=f"v{i}")', other))
-        return load_ring(path)
+        return ring_of("small", (('Vcor(eid=f"v{i}")', other),))
 
     return ring
 

@@ -436,48 +436,35 @@ LOCATED = frozenset({"localised"})
 BENDS = [f"bend::{k}" for k in range(32)]
 
 
-def one(effect: str, element: str | None, amount: float, **more: Any) -> Scenario:
-    """A single cause in a response."""
-    return Scenario(
-        f"response: {effect} {element} {amount:g}", (Cause(effect, element, amount),), **more
-    )
+def row(name: str, *causes: Cause, **more: Any) -> Scenario:
+    """What stands in the name before the colon: kinds of measurement, usual errors, a reference."""
+    parts = name.split(":", maxsplit=1)[0].split(", ")
+    own = {"small": USUAL} if {"usual errors", "since"} & {*parts} else {}
+    own |= {"before": ()} if "since" in parts else {}
+    return Scenario(name, causes, tuple(p for p in parts if p in MAKE), **own | more)
 
 
-def usual(effect: str, element: str | None, amount: float, **more: Any) -> Scenario:
-    """A single cause among small errors of every kind, in a response."""
-    row = one(effect, element, amount, small=USUAL, lasts=True, **more)
-    return replace(row, name=row.name.replace("response", "response, usual errors"))
+def one(
+    effect: str, element: str | None, amount: float, head: str = "response", **more: Any
+) -> Scenario:
+    """A single cause."""
+    return row(f"{head}: {effect} {element} {amount:g}", Cause(effect, element, amount), **more)
 
 
-def turned(effect: str, element: str | None, amount: float, **more: Any) -> Scenario:
-    """A single cause in first turns."""
-    return Scenario(
-        f"first turns: {effect} {element} {amount:g}", (Cause(effect, element, amount),),
-        ("first turns",), **more,
-    )  # fmt: skip
+usual = partial(one, head="response, usual errors", lasts=True)
+turned = partial(one, head="first turns")
 
 
 def defect(name: str, damage: Change, *says: str, **more: Any) -> Scenario:
     """A defect of a response's data, among small errors of gradients, calibrations and gains."""
-    small = {
-        **GRADIENTS,
-        "corrector_calibration": 0.02,
-        "monitor_gain_x": 0.01,
-        "monitor_gain_y": 0.01,
-    }
-    options = {
-        "ring": "both",
-        "small": small,
-        "found": (),
-        "verdicts": SOUND,
-        "lasts": True,
-        "says": says,
-    } | more
-    return Scenario(f"response, data: {name}", damage=damage, **options)
+    small = GRADIENTS | {"corrector_calibration": 0.02}
+    small |= {"monitor_gain_x": 0.01, "monitor_gain_y": 0.01}
+    options = {"ring": "both", "small": small, "found": (), "verdicts": SOUND, "says": says}
+    return row(f"response, data: {name}", damage=damage, **options | {"lasts": True} | more)
 
 
 RESPONSES = (
-    Scenario("response: nothing", verdicts=NOTHING, lasts=True),
+    row("response: nothing", verdicts=NOTHING, lasts=True),
     one("quadrupole_gradient", "QF::2", -0.02),
     one("quadrupole_gradient", "QF::2", -0.05),
     one("quadrupole_roll", "QD::4", 0.01),
@@ -495,33 +482,25 @@ RESPONSES = (
     one("energy_offset", None, 2e-3),
     one("energy_spread", None, 1e-3),
     one("family_gradient", "QD", -0.01),
-    Scenario(
+    row(
         "response: two causes",
-        (Cause("quadrupole_roll", "QF::2", 0.02), Cause("corrector_calibration", "v7", 0.2)),
+        Cause("quadrupole_roll", "QF::2", 0.02),
+        Cause("corrector_calibration", "v7", 0.2),
     ),
-    Scenario(
+    row(
         "response: five causes",
-        (
-            Cause("quadrupole_gradient", "QD::5", 0.01),
-            Cause("quadrupole_gradient", "QF::9", -0.008),
-            Cause("quadrupole_gradient", "QF::3", 0.006),
-            Cause("quadrupole_gradient", "QD::12", 0.005),
-            Cause("corrector_calibration", "v2", 0.1),
-        ),
+        Cause("quadrupole_gradient", "QD::5", 0.01),
+        Cause("quadrupole_gradient", "QF::9", -0.008),
+        Cause("quadrupole_gradient", "QF::3", 0.006),
+        Cause("quadrupole_gradient", "QD::12", 0.005),
+        Cause("corrector_calibration", "v2", 0.1),
         made={"kick": 1e-5, "noise": 2e-8, "engine": "ocelot", "rf_step": -3000.0},
         lasts=True,
         fewer=None,
     ),
-    Scenario("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY, lasts=True),
+    row("response: gradients", small={"quadrupole_gradient": 2e-3}, verdicts=MANY, lasts=True),
     *(
-        Scenario(
-            f"response, usual errors: none, {k}",
-            small=USUAL,
-            seed=k,
-            verdicts=SOUND,
-            lasts=True,
-            fewer=fewer,
-        )
+        row(f"response, usual errors: none, {k}", seed=k, verdicts=SOUND, lasts=True, fewer=fewer)
         for k, fewer in ((5, FITTED), (8, None), (11, None))
     ),
     usual("quadrupole_gradient", "QF::2", 0.03),
@@ -534,18 +513,18 @@ RESPONSES = (
     usual("monitor_swap", "end_6", 1.0),
     usual("family_gradient", "QD", -0.0235),
     usual("sextupole_offset_y", "sf::2", -3e-3),
-    Scenario(
+    row(
         "response: edges of all bends",
-        tuple(Cause("vertical_focusing", name, 2e-3) for name in BENDS),
+        *tuple(Cause("vertical_focusing", name, 2e-3) for name in BENDS),
         small=GRADIENTS,
         found=(),
         verdicts=MANY,
         says=("vertical_focusing|vertical focusing",),
         lasts=True,
     ),
-    Scenario(
+    row(
         "response: an insertion device in a straight",
-        (Cause("vertical_focusing", "d::95", 0.01),),
+        Cause("vertical_focusing", "d::95", 0.01),
         small=GRADIENTS,
         found=(),
         verdicts=MANY | ONE,
@@ -553,15 +532,15 @@ RESPONSES = (
         says=("d::95",),
         lasts=True,
     ),
-    Scenario(
+    row(
         "response: kicks in the dispersion",
         small={"quadrupole_offset_x": 1e-4, **GRADIENTS},
         verdicts=SOUND,
         lasts=True,
     ),
-    Scenario(
+    row(
         "response: small errors and the beam's energy",
-        (Cause("energy_offset", None, 2e-3),),
+        Cause("energy_offset", None, 2e-3),
         small=USUAL,
         found=(),
         verdicts=MANY | ONE,
@@ -570,7 +549,7 @@ RESPONSES = (
         lasts=True,
         fewer=None,
     ),
-    Scenario(
+    row(
         "response: a design 2 % off",
         ring="both",
         edits=(("k = 0.9", "k = 0.88"),),
@@ -623,17 +602,17 @@ DEFECTS = (
         others=1,
     ),
     *(
-        Scenario(
+        row(
             f"response, data: exchanged correctors {a}, {b} alone",
             damage=swapped_correctors(a, b),
             verdicts=LOCATED,
             found=(Cause("exchanged", f"{a},{b}", np.nan),),
             lasts=True,
-            fewer=fewer,  # the others are tests of test_response_readings.py, or slow
+            fewer=fewer,
         )
         for a, b, fewer in (("v5", "v6", None), ("v5", "v9", None), ("generated_a", "v5", FITTED))
     ),
-    Scenario(
+    row(
         "response, data: exchanged monitors alone",
         damage=swapped_monitors("end_1", "end_14"),
         verdicts=LOCATED,
@@ -659,8 +638,7 @@ DEFECTS = (
 
 def since(name: str, *causes: Cause, **more: Any) -> Scenario:
     """What changed between two responses of a machine with usual errors."""
-    options = {"small": USUAL, "before": (), "lasts": True} | more
-    return Scenario(f"response, since: {name}", causes, **options)
+    return row(f"response, since: {name}", *causes, **{"lasts": True} | more)
 
 
 CHANGES = (
@@ -706,34 +684,14 @@ CHANGES = (
         lasts=True,
         damage=None,
     ),
-    Scenario(
-        "first turns, since: a magnet",
-        (Cause("quadrupole_gradient", "QD::5", -0.02),),
-        ("first turns",),
-        small=USUAL,
-        before=(),
-    ),
-    Scenario(
-        "first turns, since: nothing",
-        kinds=("first turns",),
-        small=USUAL,
-        before=(),
-        verdicts=NOTHING,
-    ),
-    Scenario(
-        "orbit, since: a kick",
-        (Cause("corrector_kick_x", "v6", 3e-5),),
-        ("orbit",),
-        small=USUAL,
-        before=(),
-    ),
+    row("first turns, since: a magnet", Cause("quadrupole_gradient", "QD::5", -0.02)),
+    row("first turns, since: nothing", verdicts=NOTHING),
+    row("orbit, since: a kick", Cause("corrector_kick_x", "v6", 3e-5)),
 )
 
 TURNS = (
-    Scenario("first turns: nothing", kinds=("first turns",), verdicts=NOTHING),
-    Scenario(
-        "first turns, usual errors: none", kinds=("first turns",), small=USUAL, verdicts=SOUND
-    ),
+    row("first turns: nothing", verdicts=NOTHING),
+    row("first turns, usual errors: none", verdicts=SOUND),
     turned("quadrupole_gradient", "QD::5", -0.05),
     turned("quadrupole_roll", "QF::7", 0.05),
     turned("sextupole_strength", "sf::3", -1.0, made={"amplitude": 3e-3}),
@@ -744,103 +702,76 @@ TURNS = (
     turned("monitor_swap", "end_6", 1.0),
     turned("monitor_offset_x", "end_6", 5e-4),
     turned("quadrupole_gradient", "QD::5", -0.2, small=USUAL),
-    Scenario(
+    row(
         "first turns: two magnets",
-        (
-            Cause("quadrupole_gradient", "QD::5", -0.05),
-            Cause("quadrupole_gradient", "QF::12", 0.05),
-        ),
-        ("first turns",),
+        Cause("quadrupole_gradient", "QD::5", -0.05),
+        Cause("quadrupole_gradient", "QF::12", 0.05),
     ),
-    Scenario(
+    row(
         "first turns, data: one frozen",
-        kinds=("first turns",),
         damage=in_turn(frozen),
         found=(Cause("monitor_dead", "bpm::4", np.nan),),
         verdicts=ANY,
         says=("frozen",),
     ),
-    Scenario(
+    row(
         "first turns, data: one silent",
-        kinds=("first turns",),
         damage=in_turn(dead),
         found=(Cause("monitor_dead", "bpm::4", np.nan),),
         verdicts=ANY,
     ),
-    Scenario("first turns, data: a wild reading", (WEAK,), ("first turns",), damage=in_turn(wild)),
-    Scenario(
-        "first turns, data: lost", (WEAK,), ("first turns",), damage=in_turn(lost), says=("lost",)
-    ),
-    Scenario(
+    row("first turns, data: a wild reading", WEAK, damage=in_turn(wild)),
+    row("first turns, data: lost", WEAK, damage=in_turn(lost), says=("lost",)),
+    row(
         "first turns, data: x reversed",
-        kinds=("first turns",),
         damage=in_turn(reversed_x),
         verdicts=frozenset({"refused"}),
         says=("x",),
     ),
-    Scenario(
+    row(
         "first turns, data: millimetres",
-        kinds=("first turns",),
         damage=in_turn(millimetres),
         verdicts=frozenset({"refused"}),
     ),
-    Scenario(
-        "first turns, x alone: nothing",
-        kinds=("first turns",),
-        damage=in_turn(no_y),
-        verdicts=NOTHING,
-    ),
-    Scenario(
+    row("first turns, x alone: nothing", damage=in_turn(no_y), verdicts=NOTHING),
+    row(
         "first turns, x alone: a magnet",
-        (Cause("quadrupole_gradient", "QD::5", -0.05),),
-        ("first turns",),
+        Cause("quadrupole_gradient", "QD::5", -0.05),
         damage=in_turn(no_y),
     ),
-    Scenario(
+    row(
         "first turns, y alone: a magnet",
-        (Cause("quadrupole_gradient", "QD::5", -0.05),),
-        ("first turns",),
+        Cause("quadrupole_gradient", "QD::5", -0.05),
         damage=in_turn(no_x),
     ),
-    Scenario("turns: nothing", kinds=("turns",), verdicts=NOTHING),
-    Scenario("turns: a magnet", (Cause("quadrupole_gradient", "QD::5", -0.01),), ("turns",)),
-    Scenario("turns: a roll", (Cause("quadrupole_roll", "QF::7", 0.02),), ("turns",)),
-    Scenario("turns: exchanged planes", (Cause("monitor_swap", "end_1", 1.0),), ("turns",)),
-    Scenario("turns, usual errors: none", kinds=("turns",), small=USUAL, verdicts=SOUND),
-    Scenario(
+    row("turns: nothing", verdicts=NOTHING),
+    row("turns: a magnet", Cause("quadrupole_gradient", "QD::5", -0.01)),
+    row("turns: a roll", Cause("quadrupole_roll", "QF::7", 0.02)),
+    row("turns: exchanged planes", Cause("monitor_swap", "end_1", 1.0)),
+    row("turns, usual errors: none", verdicts=SOUND),
+    row(
         "turns, y alone: a magnet",
-        (Cause("quadrupole_gradient", "QD::5", -0.01),),
-        ("turns",),
+        Cause("quadrupole_gradient", "QD::5", -0.01),
         damage=in_turn(no_x),
     ),
-    Scenario("orbit: a kick", (Cause("corrector_kick_x", "v6", 3e-5),), ("orbit",)),
-    Scenario("orbit: nothing", kinds=("orbit",), verdicts=NOTHING),
-    Scenario(
-        "dispersion: a magnet", (Cause("quadrupole_gradient", "QD::3", -0.01),), ("dispersion",)
-    ),
-    Scenario(
-        "orbit, dispersion, tunes: nothing",
-        kinds=("orbit", "dispersion", "tunes"),
-        verdicts=NOTHING,
-    ),
-    Scenario(
+    row("orbit: a kick", Cause("corrector_kick_x", "v6", 3e-5)),
+    row("orbit: nothing", verdicts=NOTHING),
+    row("dispersion: a magnet", Cause("quadrupole_gradient", "QD::3", -0.01)),
+    row("orbit, dispersion, tunes: nothing", verdicts=NOTHING),
+    row(
         "orbit, dispersion, tunes: a kick and a magnet",
-        (Cause("corrector_kick_x", "v6", 3e-5), Cause("quadrupole_gradient", "QD::3", -0.01)),
-        ("orbit", "dispersion", "tunes"),
+        Cause("corrector_kick_x", "v6", 3e-5),
+        Cause("quadrupole_gradient", "QD::3", -0.01),
     ),
-    Scenario(
+    row(
         "turns, dispersion, usual errors: a magnet",
-        (Cause("quadrupole_gradient", "QD::3", -0.05),),
-        ("turns", "dispersion"),
-        small=USUAL,
+        Cause("quadrupole_gradient", "QD::3", -0.05),
         lasts=True,
     ),
-    Scenario("response, dispersion: a magnet", (WEAK,), ("response", "dispersion"), lasts=True),
-    Scenario(
+    row("response, dispersion: a magnet", WEAK, lasts=True),
+    row(
         "response, first turns, usual errors: a magnet",
-        (Cause("quadrupole_gradient", "QF::2", 0.03),),
-        ("response", "first turns"),
-        small=USUAL,
+        Cause("quadrupole_gradient", "QF::2", 0.03),
         lasts=True,
         fewer=None,
     ),

@@ -1,8 +1,4 @@
-"""The AT engine: every effect against a formula, the ring against OCELOT's maps.
-
-One element is followed by a monitor, a metre of drift and a second monitor: they give its exit
-state (x, px, y, py), since a drift of AT is x += L px on energy.
-"""
+"""The AT engine: every effect against a formula, the ring against OCELOT's maps."""
 
 from dataclasses import replace
 
@@ -43,6 +39,7 @@ def engine_of(tmp_path, element, *causes, **options):
 
 
 def exit_state(engine, launch=LAUNCH, **setting):
+    """(x, px, y, py) from two monitors a metre apart: a drift of AT is x += L px on energy."""
     a, b = engine.track(launch[None], settings=[{"it": setting}] if setting else None)[0, 0]
     return np.array([a[0], b[0] - a[0], a[1], b[1] - a[1]])
 
@@ -117,10 +114,7 @@ def test_two_errors_of_one_strength_multiply_as_in_the_model(small_ring):
 def test_quadrupole_offset_is_that_of_its_centre(tmp_path):
     offset = np.array([3e-4, 0, -2e-4, 0])
     engine = engine_of(
-        tmp_path,
-        QUADRUPOLE,
-        ("quadrupole_offset_x", offset[0]),
-        ("quadrupole_offset_y", offset[2]),
+        tmp_path, QUADRUPOLE, ("quadrupole_offset_x", offset[0]), ("quadrupole_offset_y", offset[2])
     )
     body = quadrupole(0.24, 0.7)
     expected = body @ (LAUNCH[:4] - offset) + offset
@@ -197,8 +191,7 @@ BEND = "SBend(l=2.0, angle=0.028, eid='it')"
 
 
 def bend_kick(strength, engine, ideal):
-    """x and px behind a bend of phi = 0.028, h = 0.014 / m whose field is stronger by a h:
-    x'' + h^2 x = -a h."""
+    """x and px behind a bend whose field is stronger by a h: x'' + h^2 x = -a h."""
     difference = exit_state(engine, np.zeros(6)) - exit_state(ideal, np.zeros(6))
     h = 0.014
     expected = -strength / h * (1 - np.cos(0.028)), -strength * np.sin(0.028)
@@ -427,19 +420,6 @@ def network6(petra3):
     return TaylorNetwork.from_ring(petra3, 6)
 
 
-def refit(network, launch, readings):
-    """Rest of the readings after the launch is fitted, finite differences of the network."""
-    launch = launch.copy()
-    free = [0, 1, 2, 3, 5]
-    steps = 1e-6 * np.eye(6)[free]
-    for _ in range(3):
-        rest = readings - network(launch[None])[0].detach().numpy()
-        up, down = (network(launch + s * steps).detach().numpy() for s in (1, -1))
-        slope = ((up - down) / 2e-6).reshape(len(free), -1).T
-        launch[free] += np.linalg.lstsq(slope, rest.ravel(), rcond=None)[0]
-    return readings - network(launch[None])[0].detach().numpy()
-
-
 def test_default_steps_are_converged(petra3, rng):
     launches = rng.standard_normal((4, 6)) * [1e-3, 5e-5, 1e-3, 5e-5, 0, 1e-5]
     coarse, fine = (AtEngine(petra3, steps=n).track(launches)[:, 0] for n in (30, 90))
@@ -581,11 +561,7 @@ def test_a_setting_that_cannot_be_is_named(small_ring):
 
 
 @pytest.mark.parametrize(
-    "element",
-    [
-        "TDCavity(l=0.5, eid='it')",
-        "SBend(l=1.0, angle=0.1, h_pole1=0.2, eid='it')",
-    ],
+    "element", ["TDCavity(l=0.5, eid='it')", "SBend(l=1.0, angle=0.1, h_pole1=0.2, eid='it')"]
 )
 def test_what_at_cannot_build_is_named(tmp_path, element):
     with pytest.raises(LatticeError, match="cannot build 'it'"):

@@ -6,7 +6,6 @@ import signal
 import sys
 import time
 
-import psutil
 import pytest
 
 import tmlattice
@@ -132,8 +131,7 @@ def test_a_scheduler_without_its_package_says_how_to_install_it(tmp_path, monkey
 
 
 def test_many_measurements_are_diagnosed_with_one_file_each(tmp_path, small_ring):
-    """On local processes, on a scheduler and here alike; what is done is not done again, but of
-    other data or options; one that cannot be read stops no other."""
+    """Locally, on a scheduler and here alike; what is done is repeated for other data alone."""
     from distributed import LocalCluster
 
     for i, name in enumerate(("QD::5", "QF::2")):
@@ -178,25 +176,3 @@ def test_a_killed_worker_fails_its_own_case_and_no_other(tmp_path):
     found = run_batch(suicidal, some, tmp_path, jobs=2, progress=False)
     assert [found[name].get("n") for name in "acd"] == [1, 3, 4]
     assert "a worker process was lost (SIGKILL)" in found["b"]["error"]
-
-
-def test_local_workers_open_no_port(tmp_path):
-    """Neither they nor this process listens, on any address, Unix sockets included."""
-    me = psutil.Process()
-    seen = []
-    results = run_batch(
-        late, {name: lambda: {"n": 1} for name in "ab"}, tmp_path, jobs=2, progress=False
-    )
-    assert results["a"] == {"n": 1}
-
-    def look():
-        for process in [me, *me.children(recursive=True)]:
-            seen.append([c for c in process.net_connections("all") if c.status == "LISTEN"])
-            seen.append([c for c in process.net_connections("unix") if process != me])
-        return {"n": 2}
-
-    more = {**cases(c={"n": 1}, d={"n": 1}, e={"n": 1}, f={"n": 1}), "g": look}
-    run_batch(late, more, tmp_path, jobs=2, progress=False)
-    assert len(seen) >= 6  # this process and both workers
-    assert not any(seen)
-    assert not me.children()

@@ -1,9 +1,4 @@
-"""Chromaticities as a reading: fringe fields of bends, and particles slower than light.
-
-The referee is AT, whose exact bends let the focusing of a fringe field rise with the momentum; in
-the second-order maps it does not change. ThomX, which AT ships, has bends of 0.35 m radius, for
-which the vertical chromaticities differ by 0.65.
-"""
+"""Chromaticities against AT's exact bends: fringe fields (ThomX), and slow particles."""
 
 from dataclasses import replace
 from pathlib import Path

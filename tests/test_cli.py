@@ -10,11 +10,11 @@ import time
 from importlib.resources import files
 from pathlib import Path
 
-import jsonschema
 import pytest
 from command import tmlattice
+from conftest import SMALL
+from shared import valid
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 QUICK = ["--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--epochs", "20"]
 
 
@@ -41,8 +41,7 @@ def outcome(tmp_path_factory):
 
 def test_tune_fit_on_the_built_in_ring(outcome):
     folder, _ = outcome
-    result = json.loads((folder / "result.json").read_text())
-    jsonschema.validate(result, schema("tune-fit"))
+    result = valid(folder / "result.json", "tune-fit")
     assert result["layers"] == 1519
     assert result["monitors"] == 246
     assert result["change"] == -0.2
@@ -79,22 +78,12 @@ def test_tune_fit_has_a_column_for_each_method_and_says_which_to_trust(outcome):
     assert "more than the noise of 20 µm" in said
 
 
-def test_a_method_alone_does_not_pay_for_the_others_and_quiet_prints_nothing(tmp_path):
-    """In a process of its own, where every package is loaded for the first time."""
-    code = (
-        "import sys, tmlattice.fitting.adam as adam\n"
-        "from tmlattice.cli.command import main\n"
-        "adam._adam = None\n"  # whoever fits by it fails
-        "main()\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, "tune-fit", SMALL, *QUICK, "--noise", "1e-6", "--method",
-         "sparse", "--json", "a.json", "--quiet"],
-        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300,
-    )  # fmt: skip
+def test_a_method_alone_does_not_pay_for_the_others_and_quiet_prints_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("tmlattice.fitting.adam._adam", None)  # whoever fits by it fails
+    words = ("tune-fit", SMALL, *QUICK, "--noise", "1e-6", "--method", "sparse")
+    done = tmlattice(*words, "--json", "a.json", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    result = json.loads((tmp_path / "a.json").read_text())
-    jsonschema.validate(result, schema("tune-fit"))
+    result = valid(tmp_path / "a.json", "tune-fit")
     assert [m["method"] for m in result["methods"]] == ["sparse"]
     assert result["regularization"] is None
     assert sorted(p.name for p in (tmp_path / "tune-fit").iterdir()) == [
@@ -133,8 +122,7 @@ def test_tune_fit_prints_the_table_and_writes_three_figures(outcome):
 def test_info(tmp_path):
     done = tmlattice("info", SMALL, "--json", "info.json", cwd=tmp_path, check=0)
     assert "quadrupole" in done.stdout
-    facts = json.loads((tmp_path / "info.json").read_text())
-    jsonschema.validate(facts, schema("info"))
+    facts = valid(tmp_path / "info.json", "info")
     assert facts["counts"]["quadrupole"] == 32
     assert facts["layers"] == 114
 
@@ -173,22 +161,18 @@ def test_help_groups_the_commands_by_what_they_are_for(tmp_path):
         assert f"\n  {name} " in done.stdout, name
 
 
-def test_make_run_ends_with_a_fault_found_named_and_reported(tmp_path):
-    """The lines of the Makefile behind the tunes, which have a test of their own."""
+def test_commands_of_make_run_are_understood():
+    """Their options; an example of the README runs what they do."""
     import shlex
 
-    lines = (Path(__file__).parent.parent / "Makefile").read_text().split("\nrun:")[1].splitlines()
-    commands = []
-    for line in lines[1:]:
-        if not line.startswith("\t"):
-            break
-        commands.append(shlex.split(line.strip().removeprefix("$(BIN)/tmlattice ")))
-    assert commands[0] == ["tune-fit"]
-    for words in commands[1:]:
-        done = tmlattice(*words, cwd=tmp_path, check=0)
-    assert words[0] == "diagnose"
-    assert "IDENTIFIED: quadrupole qd::12" in done.stdout
-    assert (tmp_path / "first-run" / "report" / "report.html").stat().st_size > 10_000
+    from tmlattice.cli.command import tmlattice as group
+
+    text = (Path(__file__).parent.parent / "Makefile").read_text().split("\nrun:")[1]
+    lines = text.split("\n\n")[0].splitlines()[1:]
+    commands = [shlex.split(line.removeprefix("\t$(BIN)/tmlattice ")) for line in lines]
+    assert [words[0] for words in commands] == ["tune-fit", "simulate", "diagnose"]
+    for name, *words in commands:
+        group.commands[name].make_context(name, words)
 
 
 def test_version_has_one_source(tmp_path):
@@ -234,26 +218,6 @@ def test_wrong_input_ends_in_one_sentence_and_leaves_nothing(tmp_path, arguments
     assert len(done.stderr.strip().splitlines()) == 1
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def test_existing_results_are_replaced_whole(tmp_path):
-    from tmlattice.files import output_file
-
-    path = tmp_path / "a.json"
-    path.write_text("old")
-
-    def stop_half_way():
-        with output_file(path) as temporary:
-            temporary.write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        stop_half_way()
-    assert path.read_text() == "old"
-    with output_file(path) as temporary:
-        temporary.write_text("new")
-    assert path.read_text() == "new"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
 WAITS_IN_A_SCAN = (
@@ -336,8 +300,7 @@ def test_no_progress_is_shown_where_there_is_no_terminal(tmp_path):
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory, small_ring):
-    """Folders written from networks of the small ring with one weak magnet: an on-momentum one of
-    two shots, one off momentum, an orbit response, and one with a changed corrector."""
+    """Measurements of the small ring with one weak magnet, one of each kind that is tried."""
     import numpy as np
 
     from tmlattice import Measurement, OrbitResponse, TaylorNetwork, write_measurement
@@ -381,8 +344,7 @@ def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
         "tune-fit", SMALL, "--measurement", folders / name, "--epochs", 150, "--method", "adam",
         "--out", "fit", cwd=tmp_path, check=0,
     )  # fmt: skip
-    result = json.loads((tmp_path / "fit" / "tune-fit.json").read_text())
-    jsonschema.validate(result, schema("tune-fit"))
+    result = valid(tmp_path / "fit" / "tune-fit.json", "tune-fit")
     assert result["shots"] == 2
     assert result["measurement"] == str(folders / name)
     assert result["magnet"] is result["change"] is result["tunes"]["true"] is None

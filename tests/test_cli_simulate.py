@@ -2,34 +2,24 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from conftest import SMALL
 
-from tmlattice.cli.command import tmlattice as command
 from tmlattice.effects import CATALOGUE, Cause
-from tmlattice.errors import TmlatticeError
 from tmlattice.machine import simulate
 from tmlattice.measurement import read_measurement, read_truth
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 QUICK = ("simulate", SMALL, "--engine", "ocelot", "--amplitude", "1e-4")
 
 
 def run(*arguments):
-    """In this process: the exit code as `main` would have it, and all that was printed or said."""
-    done = CliRunner().invoke(command, [str(a) for a in arguments], standalone_mode=False)
-    if done.exception is None:
-        return 0, done.output
-    if isinstance(done.exception, TmlatticeError):
-        return 2, str(done.exception)
-    if hasattr(done.exception, "format_message"):
-        return 2, done.exception.format_message()
-    raise done.exception
+    """The exit code, and all that was printed or said."""
+    done = tmlattice(*arguments, cwd=".")
+    return done.returncode, done.stdout + done.stderr
 
 
 @pytest.fixture
@@ -74,21 +64,6 @@ def test_simulate_measures_with_given_settings(folder):
     code, text = run(*QUICK, "--shots", 2, "--settings", "settings.json", "--out", "day", "-q")
     assert (code, text) == (0, "")
     assert read_measurement("day").settings == tuple(settings)
-
-
-def test_simulate_as_a_process_is_silent_when_asked_and_ends_with_2(tmp_path):
-    def process(*arguments):
-        return subprocess.run(
-            [sys.executable, "-m", "tmlattice", *arguments],
-            cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300,
-        )  # fmt: skip
-
-    done = process("simulate", SMALL, "--amplitude", "1e-4", "--out", "day", "--quiet")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    done = process(*QUICK, "--effect", "quadrupole_gradiant qd::5 -0.2", "--out", "other")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("tmlattice: no effect 'quadrupole_gradiant'; did you mean 'quad")
-    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,11 @@
 """Magnets of several fields in one: nothing is lost in the maps, the engines or the JSON."""
 
-import os
 import warnings
-from pathlib import Path
 
 import at
 import numpy as np
 import pytest
+from shared import measured_data
 
 from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
@@ -168,13 +167,6 @@ def test_a_corrector_of_two_planes_kicks_in_both_and_one_that_is_named_in_one():
         np.testing.assert_allclose(kicked - tracked, [0, 1.1e-4], rtol=0, atol=1e-9)
 
 
-def real(*parts):
-    path = Path(os.environ.get("TMLATTICE_DATA") or "nowhere").joinpath("real_rings", *parts)
-    if not path.is_file():
-        pytest.skip(f"TMLATTICE_DATA has no {path.name}")
-    return path
-
-
 def of_loco(path, energy):
     """The lattice of a LOCO file as AT's own elements."""
     from at.load.utils import element_from_dict
@@ -215,7 +207,7 @@ def exact_chromaticity(ring):
 )
 def test_real_sextupoles_with_coils_make_the_chromaticity(name, energy, count, dropped):
     """Without the sextupoles that were dropped it was -27 / -34 at ALS."""
-    lattice = of_loco(real(name), energy)
+    lattice = of_loco(measured_data("real_rings", name), energy)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # skew fields of three bends are left out
         found = ring_from_at(lattice, name)
@@ -235,7 +227,7 @@ def test_real_sextupoles_with_coils_make_the_chromaticity(name, energy, count, d
 
 
 def test_real_multipoles_of_several_orders_keep_those_up_to_the_sextupole():
-    path = real("esrf_ebs", "betamodel.mat")
+    path = measured_data("real_rings", "esrf_ebs", "betamodel.mat")
     with pytest.warns(UserWarning, match=r"orders of multipoles above the sextupole \(64\)"):
         found = load_ring(path, sequence="betamodel")
     lattice = at.load_lattice(path, use="betamodel")

@@ -671,8 +671,7 @@ def test_settings_of_devices_of_a_table_come_back(small_ring, wrong, tmp_path):
 
 
 def test_a_second_iteration_and_the_way_back(small_ring, tmp_path):
-    """A supply that makes four fifths of what it is asked for: its calibration is reported, the
-    next correction starts from the applied settings, and the ring from before is a goal."""
+    """A supply that makes four fifths of what it is asked for, corrected again, and undone."""
 
     def run(*words):
         done = CliRunner().invoke(tmlattice, [str(w) for w in words])

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from shared import SHORT
 
 from tmlattice import TaylorNetwork
 from tmlattice.errors import BeamLostError
@@ -71,11 +72,7 @@ for order in ([0, 1], [0, 1, 0], [1, 1, 1]):  # some layers linear, an odd numbe
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
 @pytest.mark.parametrize("dimension", [4, 6])
 def test_kernels_match_the_plain_loop(tmp_path, dimension):
-    (tmp_path / "short.py").write_text(
-        "from ocelot import *\nenergy = 1.0\n"
-        "q = Quadrupole(l=0.3, k1=1.2, eid='q')\ns = Sextupole(l=0.1, k2=20.0, eid='s')\n"
-        "cell = [Monitor(eid='a'), q, Drift(l=0.5, eid='d'), s, Monitor(eid='b'), Monitor(eid='c')]"
-    )
+    (tmp_path / "short.py").write_text(SHORT)
     done = subprocess.run(
         [sys.executable, "-c", INTERPRETED, str(tmp_path / "short.py"), str(dimension)],
         env={**os.environ, "TRITON_INTERPRET": "1"},

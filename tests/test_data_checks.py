@@ -1,14 +1,12 @@
 """The data checks: what is wrong everywhere is named, and healthy data of sick machines are not."""
 
-import json
 from dataclasses import replace
-from importlib.resources import files
 
-import jsonschema
 import numpy as np
 import pytest
 from command import tmlattice
 from conftest import SMALL
+from shared import valid
 
 from tmlattice.diagnosis import diagnose
 from tmlattice.diagnosis.data_checks import check_data
@@ -138,8 +136,7 @@ def test_healthy_data_of_a_sick_machine_tell_nothing(small_ring, kind):
 
 @pytest.mark.parametrize("seed", [7, 9, 13, 17])
 def test_an_orbit_that_is_millimetres_off_is_no_global_error(small_ring, seed):
-    """Quadrupoles 3 mm off axis, all usual errors, the beam lost on the way: x and y were said to
-    be exchanged, and names to be shifted."""
+    """Quadrupoles 3 mm off axis, and the beam is lost: x and y were said to be exchanged."""
     rms = background_rms({"all": None}) | {f"quadrupole_offset_{plane}": 3e-3 for plane in "xy"}
     causes = draw_background(small_ring, rms, seed)
     data = simulate(small_ring, causes, seed=1000 * seed).measurement()
@@ -197,8 +194,7 @@ def test_a_noise_that_is_not_the_readings_is_told(small_ring, healthy, factor):
 
 
 def test_small_errors_everywhere_are_not_taken_for_noise(small_ring):
-    """A noise of 2 um where errors leave hundreds: they are the same from shot to shot, or in
-    proportion to the orbit."""
+    """Noise of 2 um, errors of hundreds: alike from shot to shot, or in proportion to the orbit."""
     for shots in (6, 12):
         data = simulate(
             small_ring, background={"all": None}, noise=2e-6, shots=shots, seed=2
@@ -419,8 +415,7 @@ def test_an_assumption_undoes_itself_and_touches_nothing_else(small_ring, machin
 
 
 def test_sections_follow_a_trajectory_that_the_machine_made(small_ring):
-    """Referee: the thick tracking of AT, corrector kicks and all: no reading of a section and no
-    launch is off by more than third order, less than 0.1 um where the orbit is 1 mm and more."""
+    """Thick tracking of AT as referee: nothing is off by more than 0.1 um at 1 mm."""
     data = simulate(
         small_ring, shots=4, seed=1, kicks=2e-5, noise=1e-12, launch_sigma=[0] * 5
     ).measurement()
@@ -438,13 +433,10 @@ def test_check_prints_a_table_and_writes_its_schema(tmp_path, machine):
     write_measurement(tmp_path / "bad", replace(machine, readings=machine.readings * [-1, 1]))
     done = tmlattice("check", SMALL, "good", "--json", "c.json", cwd=tmp_path, check=0)
     assert "no global error" in done.stdout
-    schema = json.loads((files("tmlattice") / "schemas" / "check.schema.json").read_text())
-    jsonschema.validate(json.loads((tmp_path / "c.json").read_text()), schema)
+    valid(tmp_path / "c.json", "check")
     done = tmlattice("check", SMALL, "bad", "--json", "c.json", cwd=tmp_path, check=1)
     assert "--assume x-reversed" in " ".join(done.stdout.split())
-    document = json.loads((tmp_path / "c.json").read_text())
-    jsonschema.validate(document, schema)
-    assert document["status"] == "wrong"
+    assert valid(tmp_path / "c.json", "check")["status"] == "wrong"
     tmlattice("check", SMALL, "bad", "--assume", "x-reversed", "-q", cwd=tmp_path, check=0)
     done = tmlattice("diagnose", SMALL, "bad", cwd=tmp_path, check=2)
     assert "x has the wrong sign at every BPM" in done.stderr

@@ -18,6 +18,7 @@ import scipy.io
 import torch
 from at_ring import at_lattice
 from command import tmlattice
+from conftest import SMALL
 from test_lattice_files import madx, write
 from test_other_codes import ELEGANT
 
@@ -315,8 +316,7 @@ def test_damaged_matlab_files_end_no_process(tmp_path, small_ring):
 
 def test_a_case_runs_no_lattice_that_is_not_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    ring = Path(__file__).parent / "lattices" / "small_ring.py"
-    shutil.copy(ring, "small_ring.py")
+    shutil.copy(SMALL, "small_ring.py")
     make("A", 1, 1, Path("set"), lattice="small_ring.py", shots=2, progress=False)
     Path("evil.py").write_text(Path("small_ring.py").read_text() + "\nopen('MARK', 'w')\n")
     case = Path("set/cases/0000/case.json")

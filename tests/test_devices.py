@@ -1,11 +1,7 @@
 """Names of the control system: from the files of a machine to text, page and JSON."""
 
-import json
-import os
-from pathlib import Path
-
-import jsonschema
 import pytest
+from shared import measured_data, valid
 
 from tmlattice import Cause, diagnose, read_measurement, simulate
 from tmlattice.importers.bring_in import Options, bring_in
@@ -15,9 +11,6 @@ from tmlattice.report.page import page
 
 DEVICES = {"end_3": "BPMx(3,2), BPMy(3,2)", "v5": "HCM(5,1)"}
 GAIN = Cause("monitor_gain_x", "end_3", -0.4)
-SCHEMA = json.loads(
-    (Path(__file__).parents[1] / "tmlattice/schemas/diagnosis.schema.json").read_text()
-)
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +34,7 @@ def test_text_page_and_json_show_them(small_ring, measured):
     found = diagnose(small_ring, measured)
     (finding,) = found.findings
     assert finding.element == "end_3"
-    document = json.loads(json.dumps(found.as_json()))
-    jsonschema.validate(document, SCHEMA)
+    document = valid(found.as_json(), "diagnosis")
     assert document["devices"] == DEVICES
     assert document["findings"][0]["device"] == DEVICES["end_3"]
     assert document["findings"][0]["recommended_action"]["device"] == DEVICES["end_3"]
@@ -63,17 +55,13 @@ def test_channels_of_a_table_are_kept(small_ring, tmp_path):
     assert read_measurement(tmp_path / "day").devices == brought.measurement.devices
 
 
-@pytest.mark.skipif("TMLATTICE_DATA" not in os.environ, reason="data of real rings")
 @pytest.mark.parametrize(
     ("file", "monitor", "corrector"),
     [("siam_2007-09-25", "BPMx(1,1), BPMy(1,1)", "VCM(4,3)"),
      ("soleil_2012-01-20", "BPMx(1,2), BPMz(1,2)", "VCOR(16,6)")],
 )  # fmt: skip
 def test_device_lists_of_loco(file, monitor, corrector):
-    path = Path(os.environ["TMLATTICE_DATA"], "real_rings", f"{file}.loco.mat")
-    if not path.is_file():
-        pytest.skip("no real rings")
-    data = bring_in([path]).measurement
+    data = bring_in([measured_data("real_rings", f"{file}.loco.mat")]).measurement
     assert data.devices[data.monitors[0]] == monitor
     assert corrector in data.devices.values()
     assert set(data.devices) == {*data.monitors, *data.correctors}

@@ -6,13 +6,13 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
-from importlib.resources import files
-from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
 from command import tmlattice
+from conftest import SMALL
+from shared import valid
 
 from tmlattice.diagnosis import diagnose
 from tmlattice.effects import Cause
@@ -20,13 +20,8 @@ from tmlattice.files import write_json
 from tmlattice.machine import simulate
 from tmlattice.measurement import OrbitResponse, write_measurement
 from tmlattice.report.plain import report_text
-from tmlattice.report.text import (
-    amount_text,
-    least_text,
-    probability_text,
-)
+from tmlattice.report.text import amount_text, least_text, probability_text
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 SHOTS = {"shots": 4, "seed": 1, "engine": "ocelot", "amplitude": 3e-4, "noise": 2e-6}
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
 FAINT = Cause("quadrupole_gradient", "QD::5", -0.0025)  # a neighbour explains it nearly as well
@@ -41,11 +36,6 @@ CASES = {
         {"effects": ["quadrupole_roll"], "max_effects": 1},
     ),
 }
-
-
-@pytest.fixture(scope="module")
-def schema():
-    return json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +87,7 @@ def outcome(folders, tmp_path_factory):
     """A run as a user starts it, and its folder."""
     folder = tmp_path_factory.mktemp("run")
     done = subprocess.run(
-        [sys.executable, "-m", "tmlattice", "diagnose", SMALL, str(folders / "weak"), "--out",
+        [sys.executable, "-m", "tmlattice", "diagnose", str(SMALL), str(folders / "weak"), "--out",
          "day", "--json", "extra.json"],
         cwd=folder, capture_output=True, text=True, check=False, timeout=300,
     )  # fmt: skip
@@ -105,15 +95,14 @@ def outcome(folders, tmp_path_factory):
     return folder, done
 
 
-def test_command_reports_writes_and_draws(outcome, folders, schema):
+def test_command_reports_writes_and_draws(outcome, folders):
     folder, done = outcome
     assert done.stderr == ""
     assert "\x1b" not in done.stdout
     for words in ("QD::5", "between bpm::5 and end_5", "±", "held out", "fractional tunes",
                   "The remaining residual is noise", "written: day/"):  # fmt: skip
         assert words in done.stdout
-    document = json.loads((folder / "day" / "diagnosis.json").read_text())
-    jsonschema.validate(document, schema)
+    document = valid(folder / "day" / "diagnosis.json", "diagnosis")
     assert json.loads((folder / "extra.json").read_text()) == document
     assert document["findings"][0]["element"] == "QD::5"
     assert document["provenance"]["measurement"] == str(folders / "weak")
@@ -144,7 +133,7 @@ def test_page_holds_its_figures_and_leads_nowhere(outcome):
         assert words in html
 
 
-def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path, schema):
+def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path):
     path = tmp_path / "a.json"
     done = tmlattice(
         "diagnose", SMALL, folders / "weak", "--quiet", "--json", path, "--effects",
@@ -153,8 +142,7 @@ def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path, 
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == [path]
-    document = json.loads(path.read_text())
-    jsonschema.validate(document, schema)
+    document = valid(path, "diagnosis")
     options = document["provenance"]["options"]
     assert options["effects"] == ["quadrupole_gradient", "quadrupole_roll"]
     assert options["background"] == {"monitor_offset_x": 1e-7}
@@ -163,15 +151,14 @@ def test_quiet_prints_nothing_and_json_alone_writes_one_file(folders, tmp_path, 
     assert document["provenance"]["seed"] == 3
 
 
-def test_reference_and_single_shot(folders, tmp_path, schema):
+def test_reference_and_single_shot(folders, tmp_path):
     path = tmp_path / "a.json"
     done = tmlattice(
         "diagnose", SMALL, folders / "one", "--reference", folders / "before", "--json", path,
         "--background", "quadrupole_gradient=1e-4", cwd=tmp_path, check=0,
     )  # fmt: skip
     assert "No reading was held out" in done.stdout
-    document = json.loads(path.read_text())
-    jsonschema.validate(document, schema)
+    document = valid(path, "diagnosis")
     assert document["provenance"]["options"]["reference"] is True
     assert document["gap"]["heldout"] is None
 
@@ -214,21 +201,20 @@ def test_wrong_input_ends_in_one_sentence_and_leaves_out_untouched(
 
 # --- the result -----------------------------------------------------------------------------------
 @pytest.mark.parametrize("verdict", list(CASES))
-def test_json_of_every_verdict_is_valid(diagnoses, schema, tmp_path, verdict):
+def test_json_of_every_verdict_is_valid(diagnoses, tmp_path, verdict):
     diagnosis = diagnoses[verdict]
     assert diagnosis.verdict == verdict
     write_json(tmp_path / "a.json", diagnosis.as_json())
-    jsonschema.validate(json.loads((tmp_path / "a.json").read_text()), schema)
+    valid(tmp_path / "a.json", "diagnosis")
 
 
-def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses, schema):
-    document = json.loads(json.dumps(diagnoses["identified"].as_json()))
-    jsonschema.validate(document, schema)
+def test_schema_refuses_a_missing_key_and_a_finding_under_nothing(diagnoses):
+    document = valid(diagnoses["identified"].as_json(), "diagnosis")
     for key in document:
         with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate({k: v for k, v in document.items() if k != key}, schema)
+            valid({k: v for k, v in document.items() if k != key}, "diagnosis")
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate({**document, "verdict": "none"}, schema)
+        valid({**document, "verdict": "none"}, "diagnosis")
 
 
 @pytest.mark.parametrize(
@@ -268,15 +254,14 @@ def test_report_says_how_much_is_closed_and_how_surely(diagnoses):
     assert closed == pytest.approx(100 * diagnoses["identified"].gap["explained"], abs=0.06)
 
 
-def test_dead_monitor_in_report_and_json(small_ring, schema, tmp_path):
+def test_dead_monitor_in_report_and_json(small_ring, tmp_path):
     data = simulate(small_ring, [Cause("monitor_dead", "end_3", 1.0)], **SHOTS).measurement()
     diagnosis = diagnose(small_ring, data)
     text = report_text(diagnosis)
     assert "IDENTIFIED: BPM end_3, no signal." in text
     assert "no effect on the stored beam" in text
     write_json(tmp_path / "a.json", diagnosis.as_json())
-    document = json.loads((tmp_path / "a.json").read_text())
-    jsonschema.validate(document, schema)
+    document = valid(tmp_path / "a.json", "diagnosis")
     assert document["findings"][0]["detection"]["statistic"] is None
 
 

@@ -132,8 +132,7 @@ def test_every_statistic_of_noise_is_a_chi_square(petra3):
 
 
 def test_evidence_by_the_scan_differs_between_places_as_that_of_the_refits(small_ring):
-    """A weak fault, so that the model is linear: what the scan says picks those that are refitted,
-    and a preference for large amounts would leave out the others."""
+    """A weak fault, so that the model is linear: the scan picks those that are refitted."""
     fault = Cause("quadrupole_gradient", "QD::5", 0.01)
     base = Base(small_ring, [fault], settings=[{}] * 3, amplitude=1e-4, noise=2e-6)
     problem = replace(base.problem, places={"quadrupole_gradient": 16})

@@ -2,10 +2,10 @@
 
 import os
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import measured_data
 
 from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
@@ -71,9 +71,6 @@ def test_base_ring_has_mad_x_s_tunes(tmp_path):
     assert (len(ring.monitors), ring.counts()["hcorrector"]) == (16, 8)
 
 
-FOLDER = Path(os.environ.get("TMLATTICE_DATA") or "nowhere") / "field_lattices"
-
-
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
@@ -88,9 +85,7 @@ FOLDER = Path(os.environ.get("TMLATTICE_DATA") or "nowhere") / "field_lattices"
     ],
 )
 def test_field_lattices(name, expected):
-    path = FOLDER / name
-    if not path.is_file():
-        pytest.skip(f"TMLATTICE_DATA has no field_lattices/{name}")
+    path = measured_data("field_lattices", name)
     np.testing.assert_allclose(tunes(load_ring(path, energy=3.0)), expected, rtol=0, atol=1e-5)
 
 

@@ -10,13 +10,14 @@ import at
 import pytest
 import scipy.io
 from command import tmlattice
+from conftest import SMALL
+from shared import run_page
 from test_import import simulated  # noqa: F401  (a fixture)
 
 import tmlattice as package
 from tmlattice.lattice import save_ring
 
 DOCS = Path(__file__).parent.parent / "docs"
-SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 FAULT = package.Cause("quadrupole_gradient", "QD::5", -0.05)
 MAGNET = "qd::5"  # as AT's file has it
 WEAK = ("--effect", f"{FAULT.effect} {FAULT.element} {FAULT.amount}")
@@ -100,19 +101,14 @@ def test_an_operator_is_told_the_magnet_and_the_settings(place):
 
 def test_in_python_too(place, monkeypatch):
     monkeypatch.chdir(place)
-    (code,) = blocks("tutorials/physicist.md", "python")
-    names = {"tmlattice": package}
-    exec(code, names)
-    diagnosis = names["diagnosis"]
-    (finding,) = diagnosis.findings
+    (finding,) = run_page("tutorials/physicist.md", tmlattice=package)["diagnosis"].findings
     right(finding.recommended_action)
 
 
 def test_objects_of_other_packages(place, monkeypatch):
     monkeypatch.chdir(place)
     before = sorted(place.iterdir())
-    names = {}
-    exec("\n".join(blocks("objects.md", "python")), names)
+    names = run_page("objects.md")
     (finding,) = names["diagnosis"].findings
     right(finding.recommended_action)
     tunes, design = (names[k].get_tune()[:2] for k in ("estimated", "lattice"))
@@ -135,26 +131,21 @@ def test_a_machine_file_from_a_lattice_and_a_file_of_data(place, tmp_path, monke
         supplies = package.load_machine_file(tmp_path / "other.toml").supplies
         assert supplies == tmp_path / "knobs.csv" or supplies[0]["curve"]
     monkeypatch.chdir(tmp_path)
-    names = {}
-    exec("\n".join(blocks("machine_file.md", "python")), names)
-    (finding,) = names["diagnosis"].findings
+    (finding,) = run_page("machine_file.md")["diagnosis"].findings
     right(finding.recommended_action)
 
 
 def test_what_several_measurements_say_together(place, monkeypatch):
     monkeypatch.chdir(place)
     (code,) = blocks("together.md", "python")
-    names = {}
-    exec(code, names)
-    (finding,) = names["diagnosis"].findings
+    (finding,) = run_page("together.md")["diagnosis"].findings
     right(finding.recommended_action)
     (printed,) = re.findall(r"seen_by  # (.*)", code)
     assert finding.seen_by == pytest.approx(json.loads(printed), abs=0.05)
 
 
 def test_the_ring_as_a_layer_learns_as_written():
-    names = {}
-    exec("\n".join(blocks("network_layer.md", "python")), names)
+    names = run_page("network_layer.md")
     assert names["losses"][-1] < 0.5 * names["losses"][0]
     assert names["closure"]().item() < 1e6 * names["losses"][-1]  # LBFGS goes further
     moved = (names["tuned"].W1 != names["network"].W1).any(dim=(1, 2)).tolist()

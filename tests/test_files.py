@@ -82,6 +82,12 @@ def test_what_fails_leaves_the_folder_as_it_was(tmp_path):
         (temporary / "a").write_text("new")
         raise ZeroDivisionError
     assert [(folder / name).read_text() for name in "ab"] == ["old", "old"]
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(pytest.raises(KeyboardInterrupt))
+        stack.enter_context(output_file(folder / "a")).write_text("half")
+        raise KeyboardInterrupt
+    assert (folder / "a").read_text() == "old"
+    assert not litter(tmp_path)
 
 
 def test_a_folder_stays_the_same_folder(tmp_path, monkeypatch):
@@ -198,6 +204,7 @@ def measured(tmp_path_factory):
               cwd=folder, check=0)  # fmt: skip
     (folder / "ring.py").write_bytes(SMALL.read_bytes())
     os.link(folder / "M" / "readings.csv", folder / "linked.csv")
+    (folder / "link").symlink_to(folder / "ring.py")
     return folder
 
 
@@ -209,7 +216,8 @@ def measured(tmp_path_factory):
         ("diagnose", "ring.py", "M", "--lattice-out", "ring.py"),
         ("diagnose", "ring.py", "M", "--json", "x.json", "--corrected-out", "x.json"),
         ("check", "ring.py", "M", "--json", "ring.py"),
-        ("info", "ring.py", "--json", "ring.py"),
+        ("info", "ring.py", "--json", "./x/../ring.py"),
+        ("info", "ring.py", "--json", "link"),
         ("simulate", "ring.py", "--out", "N", "--truth", "ring.py"),
         ("import", "linked.csv", "--lattice", "ring.py", "--out", "linked.csv"),
         ("simulate", "ring.py", "--out", "M"),
@@ -247,33 +255,6 @@ def test_what_a_killed_run_left_is_removed_and_no_more(tmp_path):
         with output_file(tmp_path / "out") as path:
             path.write_text("x")
     assert before - set(litter(tmp_path)) == {path.name for path in stale}
-
-
-KILLED = """
-import os, sys
-from pathlib import Path
-from tmlattice.files import output_folder, output_file
-with output_folder(Path("out")) as folder, output_file(Path("file")) as file:
-    (folder / "a").write_text("new")
-    file.write_text("new")
-    os.kill(os.getpid(), 9)
-"""
-
-
-def test_a_killed_run_leaves_only_what_the_next_removes(tmp_path):
-    write_pair(tmp_path / "out", "old")
-    done = subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, check=False)
-    assert done.returncode == -9
-    assert (tmp_path / "out" / "a").read_text() == "old"
-    left = litter(tmp_path)
-    assert len(left) == 2
-    old = time.time() - 100
-    for path in tmp_path.rglob(f"{PREFIX}*"):
-        os.utime(path, (old, old))
-    write_pair(tmp_path / "out", "new")
-    with output_file(tmp_path / "file") as path:
-        path.write_text("new")
-    assert not litter(tmp_path)
 
 
 AMID = """

@@ -1,13 +1,12 @@
 """Data in and out of a notebook: arrays, data frames, xarray, values that are equal, pickles."""
 
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from conftest import SMALL
+from shared import ROOT, run_page
 
 import tmlattice
 from tmlattice.errors import MeasurementError, UnknownNameError
@@ -213,10 +212,9 @@ def test_frames_go_where_a_measurement_does(small_ring, measured, tmp_path):
 
 def test_the_page_runs_as_written(tmp_path, monkeypatch):
     """With petra3, as it stands; what it says of its magnet is true."""
-    text = (Path(__file__).parent.parent / "docs" / "frames.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    names = {}
-    exec("".join(re.findall(r"```python\n(.*?)```", text, re.S)), names)
+    names = run_page("frames.md")
+    text = (ROOT / "docs" / "frames.md").read_text(encoding="utf-8")
     errors = names["errors"].set_index("element")
     assert abs(errors.amount["qd::12"] + 0.2) < 4 * errors.sigma["qd::12"]
     for name in names["diagnosis"].tables:

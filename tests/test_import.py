@@ -1,9 +1,7 @@
 """`tmlattice import`: measurements of other programs, against AT, LOCO's own model and README."""
 
 import json
-import os
 import re
-from pathlib import Path
 
 import at
 import h5py
@@ -14,6 +12,7 @@ import scipy.io
 from at.load.utils import element_from_dict
 from command import tmlattice
 from numpy.testing import assert_allclose
+from shared import measured_data
 
 import tmlattice as package
 from tmlattice import load_ring, read_measurement
@@ -27,11 +26,6 @@ from tmlattice.measurement import Measurement, TurnByTurn
 from tmlattice.observe.spectra import lines
 from tmlattice.report.plain import report_text
 
-DATA = Path(os.environ.get("TMLATTICE_DATA", ""), "real_rings")
-real = pytest.mark.skipif(
-    not os.environ.get("TMLATTICE_DATA") or not DATA.is_dir(),
-    reason="TMLATTICE_DATA names no folder with real_rings in it",
-)
 pytestmark = pytest.mark.usefixtures("forked_readers")
 
 ENERGY, CELLS, HARMONIC = 1.5, 8, 88
@@ -174,9 +168,7 @@ def test_names_numbers_and_units_of_a_loco_file(simulated, brought):
 
 
 def test_ring_answers_as_at_does(simulated, brought):
-    """Kicks inside sextupoles and of both planes at one place, and the RF: within 1e-3 of AT's
-    thick symplectic elements, which is what two halves around a thin kick leave (1e-4) and the
-    bends' edges (4e-4)."""
+    """Within 1e-3 of AT: two halves around a thin kick leave 1e-4, edges of bends 4e-4."""
     found = brought(simulated)
     data, (expected, rf) = found.measurement, design(found)
     assert_allclose(data.response, expected, atol=1e-3 * np.abs(expected).max())
@@ -280,7 +272,7 @@ def test_lattice_before_the_fit(simulated, brought, tmp_path):
     for _ in range(2):  # the second time from the cache
         ring = load_ring(tmp_path / "day" / "lattice.json")
         assert (ring["qf::0"].k1, ring.model) == (pytest.approx(0.9), found.ring.model)
-    told = package.diagnose(ring, tmp_path / "day")
+    told = package.diagnose(ring, tmp_path / "day", effects=["quadrupole_gradient"])
     assert told.as_json()["model"] == ring.model
     heads = [line for line in report_text(told).splitlines() if ring.model in line]
     assert {line.split(ring.model)[0].strip() for line in heads} >= {"readings less model, rms"}
@@ -327,40 +319,6 @@ def one(array, value, place=1):
     return array
 
 
-WRONG = {
-    "a field is missing": (lambda v: {"CMData_HCMIndex": None}, "HCMIndex holds no numbers"),
-    "numbers are complex": (lambda v: {"LocoMeasData_M": 1j * v["LocoMeasData"]["M"]}, "complex"),
-    "a place is no number": (
-        lambda v: {"CMData_HCMIndex": one(v["CMData"]["HCMIndex"], np.nan)}, "list of places"),
-    "a good list beyond its monitors": (
-        lambda v: {"BPMData_HBPMGoodDataIndex": np.array([1.0, 99.0])}, "counts beyond the 16"),
-    "a step without bounds": (
-        lambda v: {"CMData_HCMKicks": one(v["CMData"]["HCMKicks"], 1e300)}, "has a step of"),
-    "no orbit change": (
-        lambda v: {"LocoMeasData_M": np.nan * v["LocoMeasData"]["M"]}, "no corrector's orbit"),
-    "a magnet of negative length": (
-        lambda v: {"RINGData_Lattice": np.array(
-            [{**e, "Length": -e["Length"]} if e["FamName"] == "QF" else e
-             for e in v["RINGData"]["Lattice"]], dtype=object)}, "has the negative length -0.4 m"),
-    "an RF without bounds": (lambda v: {"LocoMeasData_RF": 9e299}, "cannot be"),
-    "a harmonic without bounds": (lambda v: {"RINGData_CavityHarmNumber": 1e299}, "cannot be"),
-    "an order of a field that would fill the memory": (
-        lambda v: {"RINGData_Lattice": np.array(
-            [{**e, "MaxOrder": 1e9} if e["FamName"] == "QF" else e
-             for e in v["RINGData"]["Lattice"]], dtype=object)}, "MaxOrder 1e"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", WRONG)
-def test_variables_that_are_wrong_are_refused_in_one_sentence(simulated, tmp_path, what):
-    change, word = WRONG[what]
-    fields = {k: "" if v is None else v for k, v in change(simulated).items()}
-    scipy.io.savemat(tmp_path / "a.mat", changed(simulated, **fields))
-    done = tmlattice("import", "a.mat", "--out", "m", cwd=tmp_path, check=2)
-    assert word in done.stderr
-    assert not (tmp_path / "m").exists()
-
-
 def test_parameters_of_no_place_are_not_followed(simulated, brought):
     """Counted from 1; place 0 would be the last element."""
     moved = {"ElemIndex": 0.0, "FieldName": "Length", "FieldIndex": np.array([1.0])}
@@ -397,37 +355,61 @@ def element(place, **fields):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        element(2, PassMethod=3.0),
-        element(3, FamName=np.full(5, np.nan)),
-    ],
+    "change", [element(2, PassMethod=3.0), element(3, FamName=np.full(5, np.nan))]
 )
 def test_fields_that_are_not_needed_may_be_anything(simulated, brought, change):
     found = brought(changed(simulated, RINGData_Lattice=change, LocoFlags_ClosedOrbitType=3.0))
     assert len(found.measurement.correctors) == 32
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"LocoMeasData_M": np.zeros((3, 4))}, "LocoMeasData.M has the shape [3, 4]"),
-        ({"BPMData_BPMIndex": np.arange(16) + 900.0}, "beyond the lattice's"),
-        ({"BPMData_HBPMIndex": np.arange(16) + 9.0}, "not among the 16"),
-        ({"CMData_HCMIndex": np.zeros((2, 8))}, "several elements a row"),
-        ({"CMData_HCMIndex": np.ones(16)}, "different places"),
-        ({"CMData_HCMKicks": np.ones(3)}, "HCMKicks has 3 steps"),
-        ({"RINGData_Lattice": 3.0}, "no list of elements"),
-        ({"LocoMeasData_M": "no numbers"}, "holds no numbers"),
-        ({"RINGData_Lattice": element(2, Length=1e300)}, "has the length 1e+300"),
-        ({"RINGData_Lattice": element(2, Length=np.ones(3))}, "has the length"),
-        ({"RINGData_Lattice": element(1, PolynomB="much")}, "element 2 of the lattice, 'QF'"),
-    ],
-)
-def test_damaged_loco_files_are_a_sentence(simulated, brought, change, told):
-    variables = changed(simulated, **change)
-    with pytest.raises(TmlatticeError, match=re.escape(told)):
-        brought(variables)
+WRONG = {
+    "a field is missing": (lambda v: {"CMData_HCMIndex": None}, "HCMIndex holds no numbers"),
+    "numbers are complex": (lambda v: {"LocoMeasData_M": 1j * v["LocoMeasData"]["M"]}, "complex"),
+    "a place is no number": (
+        lambda v: {"CMData_HCMIndex": one(v["CMData"]["HCMIndex"], np.nan)}, "list of places"),
+    "a good list beyond its monitors": (
+        lambda v: {"BPMData_HBPMGoodDataIndex": np.array([1.0, 99.0])}, "counts beyond the 16"),
+    "a step without bounds": (
+        lambda v: {"CMData_HCMKicks": one(v["CMData"]["HCMKicks"], 1e300)}, "has a step of"),
+    "no orbit change": (
+        lambda v: {"LocoMeasData_M": np.nan * v["LocoMeasData"]["M"]}, "no corrector's orbit"),
+    "a magnet of negative length": (
+        lambda v: {"RINGData_Lattice": np.array(
+            [{**e, "Length": -e["Length"]} if e["FamName"] == "QF" else e
+             for e in v["RINGData"]["Lattice"]], dtype=object)}, "has the negative length -0.4 m"),
+    "an RF without bounds": (lambda v: {"LocoMeasData_RF": 9e299}, "cannot be"),
+    "a harmonic without bounds": (lambda v: {"RINGData_CavityHarmNumber": 1e299}, "cannot be"),
+    "an order of a field that would fill the memory": (
+        lambda v: {"RINGData_Lattice": np.array(
+            [{**e, "MaxOrder": 1e9} if e["FamName"] == "QF" else e
+             for e in v["RINGData"]["Lattice"]], dtype=object)}, "MaxOrder 1e"),
+    "M of another shape": (
+        lambda v: {"LocoMeasData_M": np.zeros((3, 4))}, "LocoMeasData.M has the shape [3, 4]"),
+    "beyond the lattice's": (
+        lambda v: {"BPMData_BPMIndex": np.arange(16) + 900.0}, "beyond the lattice's"),
+    "not among the 16": (lambda v: {"BPMData_HBPMIndex": np.arange(16) + 9.0}, "not among the 16"),
+    "several elements a row": (
+        lambda v: {"CMData_HCMIndex": np.zeros((2, 8))}, "several elements a row"),
+    "different places": (lambda v: {"CMData_HCMIndex": np.ones(16)}, "different places"),
+    "HCMKicks has 3 steps": (lambda v: {"CMData_HCMKicks": np.ones(3)}, "HCMKicks has 3 steps"),
+    "no list of elements": (lambda v: {"RINGData_Lattice": 3.0}, "no list of elements"),
+    "holds no numbers": (lambda v: {"LocoMeasData_M": "no numbers"}, "holds no numbers"),
+    "a length without bounds": (
+        lambda v: {"RINGData_Lattice": element(2, Length=1e300)}, "has the length 1e+300"),
+    "several lengths": (
+        lambda v: {"RINGData_Lattice": element(2, Length=np.ones(3))}, "has the length"),
+    "fields of text": (
+        lambda v: {"RINGData_Lattice": element(1, PolynomB="much")},
+        "element 2 of the lattice, 'QF'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_variables_that_are_wrong_are_refused_in_one_sentence(simulated, brought, what):
+    change, word = WRONG[what]
+    fields = {k: "" if v is None else v for k, v in change(simulated).items()}
+    with pytest.raises(TmlatticeError, match=re.escape(word)):
+        brought(changed(simulated, **fields))
 
 
 @pytest.mark.parametrize("name", ["LocoMeasData", "BPMData", "CMData", "RINGData"])
@@ -782,14 +764,11 @@ def rms(values):
     return 1e6 * np.sqrt(np.nanmean(values**2))
 
 
-@real
 @pytest.mark.parametrize("name", README)
 def test_a_real_ring_is_that_of_its_readme_and_its_model_is_locos_own(name):
-    """The README's monitors and correctors count the bad, its rms leave them out. LOCO's model
-    before its first iteration, made by MATLAB's AT with its own integrators of sextupoles and
-    bends: a thousandth, or what a tune difference of 1e-4 makes."""
+    """LOCO's own model before its first iteration, by MATLAB's AT, to a thousandth."""
     x, y, horizontal, vertical, noise, measured, left = README[name]
-    path = DATA / f"{name}.loco.mat"
+    path = measured_data("real_rings", f"{name}.loco.mat")
     data = bring_in([path], Options(keep_bad=True)).measurement
     assert len(data.monitors) == x == y
     assert [data.planes.count(plane) for plane in "xy"] == [horizontal, vertical]
@@ -816,20 +795,18 @@ def test_a_real_ring_is_that_of_its_readme_and_its_model_is_locos_own(name):
     assert not any(word in doubts for word in ("assume", "momentum", "is not that of"))
 
 
-@real
 def test_noise_of_a_loco_file_is_that_of_two_orbits():
     """The Middle Layer's own file of the same day has the scatter of one orbit."""
     name = "lnls_2014-07-17_before"
-    loco = read_mat(DATA / f"{name}.loco.mat", ["LocoMeasData"])["LocoMeasData"]
-    orbit = read_mat(DATA / f"{name}.bpm.mat")
+    loco = read_mat(measured_data("real_rings", f"{name}.loco.mat"))["LocoMeasData"]
+    orbit = read_mat(measured_data("real_rings", f"{name}.bpm.mat"))
     one = np.concatenate([orbit["BPMxData"]["Sigma"], orbit["BPMyData"]["Sigma"]])
     assert_allclose(loco["BPMSTD"], np.sqrt(2) * one, rtol=1e-9)
 
 
-@real
 def test_middle_layers_files_of_a_real_ring_are_its_loco_file():
     parts = ("loco", "response", "dispersion", "bpm")
-    paths = [DATA / f"lnls_2014-07-17_before.{part}.mat" for part in parts]
+    paths = [measured_data("real_rings", f"lnls_2014-07-17_before.{p}.mat") for p in parts]
     found, loco = bring_in(paths).measurement, bring_in(paths[:1]).measurement
     assert found.correctors == loco.correctors
     assert_allclose(found.response, loco.response, atol=1e-15)
@@ -838,9 +815,8 @@ def test_middle_layers_files_of_a_real_ring_are_its_loco_file():
     assert_allclose(found.rf.orbit, loco.rf.orbit, atol=1e-15)
 
 
-@real
 def test_esrf_ebs():
-    place = DATA / "esrf_ebs"
+    place = measured_data("real_rings", "esrf_ebs")
     found = bring_in([*place.glob("*.h5"), place / "name_mapping.json", place / "betamodel.mat"])
     data, (columns, rf) = found.measurement, design(found)
     assert len(data.monitors) == 320
@@ -854,9 +830,8 @@ def test_esrf_ebs():
     assert not found.doubts
 
 
-@real
 def test_turns_of_the_sps():
-    found = bring_in([DATA / "sps" / "sps_200turns.sdds"])
+    found = bring_in([measured_data("real_rings", "sps", "sps_200turns.sdds")])
     assert found.measurement.readings.shape[1] == 201
     assert "201 of one plane" in " ".join(found.assumed)
     spectrum = lines(found.measurement)

@@ -114,8 +114,7 @@ def test_what_takes_no_part_is_told(small_ring):
 
 
 def test_what_is_left_where_nothing_is_explained_is_what_was_there(small_ring):
-    """One cause more than may be named: with the first alone the sum of squares is that of noise,
-    and yet neither of them is in the model that is shown."""
+    """One cause more than may be named: neither is in the model that is shown."""
     faint = Cause("corrector_kick_y", "v9", 1.4e-6)
     both = {"orbit": _orbit(small_ring, [KICK, faint]), "turns": _turns(small_ring, [])}
     found = diagnose(small_ring, both, background={}, max_effects=1)
@@ -144,8 +143,7 @@ def _small_errors(ring, seed):
 
 
 def test_what_is_sought_beside_a_doubt_makes_the_readings_likelier(small_ring):
-    """Small errors taken beside a supply 30 % off, which the scan of a sound machine doubted, left
-    that supply to be found."""
+    """Small errors fitted together with a supply that a scan doubted left it to be found."""
     orbit = simulate_orbits(
         small_ring, [], noise=(2.53e-6, 2.53e-6), background={"all": None}, seed=758855874,
         machine_seed=758855873,

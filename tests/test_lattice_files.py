@@ -2,15 +2,12 @@
 
 import json
 import math
-import os
-from importlib.resources import files
-from pathlib import Path
 
 import at
-import jsonschema
 import numpy as np
 import pytest
 from at_ring import at_lattice
+from shared import measured_data, valid
 
 from tmlattice import load_ring, ring_maps
 from tmlattice.beam.chain import Chain
@@ -163,11 +160,7 @@ ELEMENTS["sheared sextupole"].T2 = offset
 @pytest.mark.filterwarnings("ignore:.*beyond its first-order matrix")
 @pytest.mark.parametrize("what", ELEMENTS)
 def test_element_moves_a_particle_as_in_at(what):
-    """Offsets of 0.1 mm and 0.1 mrad; what is left is of third order.
-
-    A strong bend is compared to first order: AT leaves out second-order terms of its edges and of
-    curvature times gradient, which OCELOT has.
-    """
+    """0.1 mm and 0.1 mrad to second order; strong bends, whose terms AT lacks, to first."""
     from tmlattice.maps.magnets import way_map
 
     lattice = at.Lattice([ELEMENTS[what].deepcopy()], energy=ENERGY * 1e9, periodicity=1)
@@ -284,8 +277,7 @@ def test_own_json_keeps_every_map_to_the_bit(tmp_path, request, which, dimension
     for key in ("W0", "W1", "W2", "R0", "R1", "R2", "at"):
         assert np.array_equal(getattr(before, key), getattr(after, key)), key
     assert path.stat().st_size < 500_000
-    schema = json.loads((files("tmlattice") / "schemas" / "lattice.schema.json").read_text())
-    jsonschema.validate(json.loads(path.read_text()), schema)
+    valid(path, "lattice")
     save_ring(again, tmp_path / "twice.json")
     twice = json.loads((tmp_path / "twice.json").read_text())
     assert {**twice, "name": ""} == {**json.loads(path.read_text()), "name": ""}
@@ -486,10 +478,7 @@ def test_change_of_the_reference_momentum_is_refused():
 
 @pytest.fixture(scope="module")
 def real():
-    folder = os.environ.get("TMLATTICE_DATA")
-    path = Path(folder or "nowhere") / "petra3_orbit_response" / "p3_low_beta.mat"
-    if not path.is_file():
-        pytest.skip("TMLATTICE_DATA has no petra3_orbit_response/p3_low_beta.mat")
+    path = measured_data("petra3_orbit_response", "p3_low_beta.mat")
     return path, load_ring(path)
 
 

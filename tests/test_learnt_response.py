@@ -40,8 +40,7 @@ def known(monday):
 
 
 def test_what_a_response_leaves_open_holds(small_ring, monday, known):
-    """Skew gradients that were fitted, and held for certain, made pulls of 5 along what is known
-    best: they stand for rolls of quadrupoles and for orbits in sextupoles."""
+    """Skew gradients held for certain made pulls of 5 along what is known best."""
     truth = {(c.effect, c.element): c.amount for c in draw_background(small_ring, USUAL, SEED)}
     inside = {(c.effect, c.element): c.amount for c in monday.causes
               if not c.effect.startswith(("monitor", "corrector"))}  # fmt: skip

@@ -11,7 +11,6 @@ from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.data_checks import check_data
-from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.lost_beam import beam_lost
@@ -132,12 +131,6 @@ def test_coarse_readings_are_no_lost_beam(small_ring):
     assert lost_in(checks).status == "fine"
 
 
-def test_a_copied_shot_stays_a_copy(small_ring, data):
-    copied = replace(data, readings=np.repeat(data.readings[:1], 6, axis=0))
-    with pytest.raises(MeasurementError, match="one reading was copied"):
-        diagnose(small_ring, copied)
-
-
 def test_a_plane_of_zeros_was_not_read(small_ring, data):
     readings = data.readings.copy()
     readings[..., 1] = 0.0
@@ -215,8 +208,7 @@ def test_a_sum_without_numbers_is_passed_over(small_ring, data, tmp_path):
 
 
 def test_turns_of_a_stored_beam_that_was_lost(small_ring):
-    """Zeros behind a loss, and in a gap of whole turns, are no readings; a BPM that repeats its
-    reading is frozen."""
+    """Zeros behind a loss and in a gap are no readings; a BPM that repeats itself is frozen."""
     names = [monitor.name for monitor in small_ring.monitors]
     read = 1e-3 * np.random.default_rng(1).standard_normal((2, 64, len(names), 2))
     read[1, 40, 11:], read[1, 41:] = 0.0, 0.0

@@ -9,13 +9,7 @@ import pytest
 
 from tmlattice.effects import CATALOGUE, Cause, background_rms, find
 from tmlattice.errors import BeamLostError, EffectError, TmlatticeError
-from tmlattice.machine import (
-    Machine,
-    Simulation,
-    draw_background,
-    draw_shots,
-    simulate,
-)
+from tmlattice.machine import Machine, Simulation, draw_background, draw_shots, simulate
 from tmlattice.machine.machine import CHUNK
 from tmlattice.measurement import read_measurement, read_truth, write_truth
 
@@ -286,11 +280,11 @@ def test_unsound_folder_is_not_left_behind(simulation, tmp_path, monkeypatch):
 
 
 def test_memory_is_flat_in_the_number_of_shots(small_ring, tmp_path):
-    """20 turns: the readings of 256 shots would be 3 MB."""
+    """10 turns: the readings of 256 shots would be 1.5 MB."""
     peaks = []
     for shots in (2 * CHUNK, 4 * CHUNK):
         simulation = simulate(
-            small_ring, engine="ocelot", shots=shots, turns=20, amplitude=1e-4, seed=1
+            small_ring, engine="ocelot", shots=shots, turns=10, amplitude=1e-4, seed=1
         )
         if not peaks:
             simulation.write(tmp_path / "warm", progress=False)
@@ -299,7 +293,7 @@ def test_memory_is_flat_in_the_number_of_shots(small_ring, tmp_path):
         short.write(tmp_path / str(shots), progress=False)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    more = len(small_ring.monitors) * 20 * 2 * 8 * 2 * CHUNK  # bytes of the shots that are more
+    more = len(small_ring.monitors) * 10 * 2 * 8 * 2 * CHUNK  # bytes of the shots that are more
     assert peaks[1] - peaks[0] < 0.2 * more, peaks
 
 

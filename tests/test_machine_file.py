@@ -21,8 +21,7 @@ from tmlattice.measurement import write_measurement
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory, small_ring):
-    """A folder with the ring, a day's readings as a folder and as the control room has them, with
-    other names, x reversed and no unit; and the machine file that states so."""
+    """A ring, a day's readings as a folder and as a control room's file, and a machine file."""
     place = tmp_path_factory.mktemp("machine")
     save_ring(small_ring, place / "ring.json")
     fault = [package.Cause("quadrupole_gradient", "QD::5", -0.1)]

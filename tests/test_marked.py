@@ -126,22 +126,3 @@ def test_one_cell_taken_for_a_ring_is_told(file, tmp_path):
     done = tmlattice("info", file.parent / "cell.json", cwd=tmp_path, check=0)
     assert "bends by 45 degrees in all, 1/8 of a turn" in done.stderr
     assert "turn" not in tmlattice("info", file, cwd=tmp_path, check=0).stderr
-
-
-def test_an_output_does_not_write_over_what_is_read(file, tmp_path):
-    copy = tmp_path / "ring.json"
-    copy.write_bytes(file.read_bytes())
-    (tmp_path / "link").symlink_to(copy)
-    for out in ("ring.json", "./x/../ring.json", "link"):
-        done = tmlattice("info", "ring.json", "--json", out, cwd=tmp_path, check=2)
-        assert "is read, and would be written over" in done.stderr
-        assert copy.read_bytes() == file.read_bytes()
-    tmlattice("init", "ring.json", "--monitors", "POS", "-q", cwd=tmp_path, check=0)
-    words = ["ring.json", "--amplitude", "1e-5", "--shots", 2]
-    tmlattice("simulate", *words, "--out", "day", "-q", cwd=tmp_path, check=0)
-    for words in (["diagnose", "day"], ["info"]):
-        for out in ("day/readings.csv", "tmlattice.toml", "ring.json")[words == ["info"] :]:
-            done = tmlattice(*words, "--json", out, cwd=tmp_path, check=2)
-            assert "is read, and would be written over" in done.stderr
-    tmlattice("info", "ring.json", "--json", "/dev/null", "-q", cwd=tmp_path, check=0)
-    assert not (tmp_path / "/dev/null").is_file()

@@ -2,27 +2,18 @@
 
 import json
 import math
-import os
 import tracemalloc
-from importlib.resources import files
-from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from shared import measured_data, valid
 
 from tmlattice import Measurement, OrbitResponse, read_measurement, write_measurement
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement import RfStep, measurement_writer, read_truth, write_truth
-
-REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"
-
-
-def schema(name):
-    return json.loads((files("tmlattice") / "schemas" / f"{name}.schema.json").read_text())
 
 
 def same(a, b):
@@ -76,19 +67,15 @@ def measurements(draw):
     )
 
 
-VALID = jsonschema.Draft202012Validator(schema("measurement"))
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(measurements())
 def test_trajectory_reads_back_bit_by_bit(tmp_path, measurement):
     write_measurement(tmp_path / "m", measurement, force=True)
     same(measurement, read_measurement(tmp_path / "m"))
-    document = json.loads((tmp_path / "m" / "measurement.json").read_text(encoding="utf-8"))
-    VALID.validate(document)
+    valid(tmp_path / "m" / "measurement.json", "measurement")
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     arrays(float, (3, 2, 2), elements=reading),
     st.none() | arrays(float, (2, 2), elements=reading),
@@ -111,8 +98,7 @@ def test_orbit_response_reads_back_bit_by_bit(tmp_path, response, orbit, kicks, 
             assert read.rf.orbit is None
         else:
             np.testing.assert_array_equal(read.rf.orbit, orbit)
-    document = json.loads((tmp_path / "m" / "measurement.json").read_text(encoding="utf-8"))
-    VALID.validate(document)
+    valid(tmp_path / "m" / "measurement.json", "measurement")
 
 
 # The page's own example, and what may be absent in it.
@@ -433,9 +419,8 @@ def test_damaged_orbit_response(folder, changes, table, words):
     assert str(found.value).startswith(str(there))
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="no real orbit response: set TMLATTICE_DATA")
 def test_real_orbit_response_reads_and_reads_back(tmp_path):
-    real = read_measurement(REAL)
+    real = read_measurement(measured_data("petra3_orbit_response"))
     assert isinstance(real, OrbitResponse)
     assert real.response.shape == (330, 246, 2)
     assert [real.planes.count(p) for p in "xy"] == [175, 155]
@@ -543,7 +528,7 @@ def test_truth_reads_back_and_stays_out_of_the_folder(folder, tmp_path):
     launches = np.array([[1e-3, 0, 1e-3, 0, 1e-4 / 3]])
     path = tmp_path / "truth.json"
     write_truth(path, effects, launches, {"quadrupole_gradient": 1e-3}, seed=5)
-    jsonschema.validate(json.loads(path.read_text()), schema("truth"))
+    valid(path, "truth")
     truth = read_truth(path)
     assert list(truth.effects) == effects
     np.testing.assert_array_equal(truth.launches, launches)

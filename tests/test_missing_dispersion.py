@@ -1,17 +1,13 @@
-"""Dispersion that no gradient makes: kicks of the closed orbit, of which a beam of more energy
-lacks a share. The referee is AT, in which displaced quadrupoles are displaced."""
+"""Dispersion that no gradient makes: kicks of the closed orbit; AT displaces quadrupoles."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import gradients, parted
 
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.kicks import (
-    by_energy,
-    dispersion_of_kicks,
-    kicking,
-)
+from tmlattice.beam.kicks import by_energy, dispersion_of_kicks, kicking
 from tmlattice.beam.response_derivatives import derivatives
 from tmlattice.diagnosis import diagnose
 from tmlattice.diagnosis.families.dispersion import (
@@ -66,8 +62,7 @@ def with_kicks(ring, measured, more):
 
 
 def state_of(ring, measured, fit):
-    data = response_data(ring, measured)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
+    data, split = parted(ring, measured, 1)
     return fit_steps(data, split, WITHOUT).state if fit else begin(data, split)
 
 
@@ -125,8 +120,7 @@ def test_vertical_patterns_make_what_is_displaced_in_y_in_at(plain):
 def measured(small_ring, beside):
     """Gradients that scatter, without kicks and with them."""
     rng = np.random.default_rng(5)
-    causes = [Cause("quadrupole_gradient", e.name, 5e-3 * rng.standard_normal())
-              for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
+    causes = gradients(small_ring, 5e-3, rng)
     plain = simulated(small_ring, causes, kick=1e-5, noise=2e-8, engine="ocelot", seed=3)
     return causes, plain, with_kicks(small_ring, plain, beside)
 
@@ -147,8 +141,7 @@ def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, mea
 
 
 def test_patterns_are_read_as_they_were_put(ring_kicking_x, rng):
-    """Linear about other kicks of both planes; beside an energy spread too, which changes the RF's
-    orbit by its own."""
+    """Linear about other kicks of both planes, and together with an energy spread."""
     ring = ring_kicking_x("i % 2")
     data = response_data(ring, simulated(ring, [], kick=1e-5, noise=2e-8, engine="ocelot"))
     families = HorizontalKicks(), VerticalKicks()
@@ -169,8 +162,7 @@ def test_patterns_are_read_as_they_were_put(ring_kicking_x, rng):
 
 @pytest.mark.parametrize("plane", [0, 1])
 def test_dispersion_at_correctors_counts_as_that_at_monitors_does(ring_kicking_x, plane):
-    """Against the closed orbits, six coordinates, of a ring whose correctors are powered: all of
-    its maps, without the formula. What its energy is of an orbit stands in the model."""
+    """Against closed orbits, six coordinates, of a ring whose correctors are powered."""
     ring = ring_kicking_x("i % 2")
     rng = np.random.default_rng(0)
     plain = ring.with_elements({
@@ -246,8 +238,7 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
 
 @pytest.mark.parametrize("plane", [0, 1])
 def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_ring, plane):
-    """In a ring that is changed, too: the layers that are made anew have theirs. Slopes against
-    differences, to what these are good for."""
+    """In a ring that is changed, too; slopes against differences."""
     design = ResponseModel(small_ring)
     where = kicking(small_ring, plane)
     orbit_kicks = np.zeros((len(small_ring.magnets), 2))
@@ -278,12 +269,9 @@ def test_a_model_with_kicks_astray_has_their_dispersion_and_its_slopes(small_rin
 
 @pytest.mark.parametrize("family", [HorizontalKicks(), VerticalKicks()])
 def test_the_ring_of_a_change_has_the_dispersion_that_was_fitted(small_ring, family):
-    """To what weak patterns make, which are left out. In its own optics: kicks that make it in the
-    design make two fifths of it too much or too little there, in x."""
+    """In its own optics: kicks of the design's optics make two fifths too much or too little."""
     wrong = np.random.default_rng(2)
-    causes = [Cause("quadrupole_gradient", e.name, 1e-2 * wrong.standard_normal())
-              for e in small_ring.elements if e.kind == "quadrupole"]  # fmt: skip
-    causes.append(Cause("energy_offset", None, 1e-3))
+    causes = [*gradients(small_ring, 1e-2, wrong), Cause("energy_offset", None, 1e-3)]
     data = response_data(small_ring, simulated(small_ring, [], kick=1e-5, noise=2e-8))
     ring = Errors.none(data).with_causes(data, causes)
     values = 1e-3 * wrong.standard_normal(family.size(data))
@@ -307,8 +295,7 @@ def test_the_ring_of_a_change_has_the_dispersion_that_was_fitted(small_ring, fam
 
 @pytest.mark.slow
 def test_a_change_acts_on_the_dispersion_that_kicks_make(plain):
-    """AT's orbits of quadrupoles that are displaced by a millimetre, on both days: 13 % of the RF's
-    orbit. A reference without kicks has another dispersion, of which 8e-4 of scatter was made."""
+    """Quadrupoles displaced by a millimetre on both days: 13 % of the RF's orbit."""
     rng = np.random.default_rng(7)
     both = [Cause("quadrupole_offset_x", e.name, 1e-3 * rng.standard_normal())
             for e in plain.elements if e.kind == "quadrupole"]  # fmt: skip

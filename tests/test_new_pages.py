@@ -1,4 +1,4 @@
-"""The developers' pages on a new kind, reader and check: their examples are run as they stand."""
+"""The developers' pages on a new kind, reader, check and effect: examples run as they stand."""
 
 import json
 import re
@@ -6,17 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from conftest import SMALL
+from shared import run_page
 
 from tmlattice import Cause, diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.cli.command import tmlattice as command
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.diagnosis.kinds import KINDS, Kind
+from tmlattice.effects import CATALOGUE, names
 from tmlattice.errors import MeasurementError
 from tmlattice.importers import write_imported
-from tmlattice.machine import simulate
+from tmlattice.machine import Machine, draw_shots, simulate
 from tmlattice.machine.stored_beam import (
     simulate_dispersion,
     simulate_orbits,
@@ -24,6 +26,7 @@ from tmlattice.machine.stored_beam import (
     simulate_turns,
 )
 from tmlattice.measurement import read_measurement, write_measurement
+from tmlattice.report.plain import report_text
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -33,10 +36,7 @@ WEAK = Cause("quadrupole_gradient", "QD::3", -0.01)
 
 def names_of(page):
     """What the Python of a page defines."""
-    text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
-    names = {"__name__": page}
-    exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), names)
-    return names
+    return run_page(f"{page}.md", __name__=page)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -134,10 +134,55 @@ def test_the_check_of_the_page_finds_clipped_readings_alone(
     readings[..., m, 0] = np.minimum(readings[..., m, 0], end)
     vars(data)["readings"] = readings
     write_measurement(tmp_path / "day", data)
-    arguments = ["check", str(ROOT / "tests/lattices/small_ring.py"), str(tmp_path / "day"),
-                 "--json", str(tmp_path / "check.json")]  # fmt: skip
-    assert CliRunner().invoke(command, arguments).exit_code in (0, 1)
+    done = tmlattice("check", SMALL, "day", "--json", "check.json", cwd=tmp_path)
+    assert done.returncode in (0, 1)
     checks = json.loads((tmp_path / "check.json").read_text())["checks"]
     (own,) = [c for c in checks if c["name"] == "saturated BPMs"]
     assert own["status"] == "note"
     assert "in end_2:" in own["sentence"]
+
+
+# --- the page that tells how to add an effect: its example is run as it stands there --------------
+PAGE = Path(__file__).parent.parent / "docs" / "new_effect.md"
+
+
+@pytest.fixture
+def effect():
+    before = dict(CATALOGUE)
+    run_page(PAGE.name)
+    (added,) = set(CATALOGUE) - set(before)
+    yield CATALOGUE[added]
+    del CATALOGUE[added]
+
+
+def test_example_of_the_page_is_known_everywhere(small_ring, effect, tmp_path):
+    place = effect.places(small_ring)[20]
+    cause = Cause(effect.name, place, effect.largest)
+    shots = draw_shots(small_ring, 2, 3e-4, seed=1)
+    at, ocelot = (
+        Machine(small_ring, [cause], engine=engine).beam(shots.launches)
+        - Machine(small_ring, engine=engine).beam(shots.launches)
+        for engine in ("at", "ocelot")
+    )
+    # the engines differ in the third order of the launch
+    assert np.abs(at - ocelot).max() < 0.01 * np.abs(at).max()
+
+    data = simulate(small_ring, [cause], shots=3, seed=1, amplitude=3e-4, noise=2e-6).measurement()
+    found = diagnose(small_ring, data)
+    assert (found.findings[0].effect, found.findings[0].element) == (effect.name, place)
+    off = found.findings[0].amount - effect.largest
+    assert abs(off) < 4 * found.findings[0].amount_sigma
+    assert effect.words in report_text(found)
+
+    assert effect.name in names()  # the challenge draws from these
+    path = tmp_path / "effects.json"
+    tmlattice("effects", "--json", path, cwd=tmp_path, check=0)
+    rows = {row["effect"]: row for row in json.loads(path.read_text())["effects"]}
+    assert rows[effect.name]["words"] == effect.words
+    assert rows[effect.name]["group"] == effect.group
+
+
+def test_page_names_attributes_that_are_there(effect):
+    page = PAGE.read_text(encoding="utf-8")
+    for attribute in re.findall(r"`([a-z_]+)(?: = \w+)?`", page[page.index("## What else") :]):
+        assert hasattr(effect, attribute), attribute

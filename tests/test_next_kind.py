@@ -1,11 +1,9 @@
 """What to measure next of the kinds that were not taken: it parts what it says it parts."""
 
-import json
 from dataclasses import replace
-from importlib import resources
 
-import jsonschema
 import pytest
+from shared import valid
 
 from tmlattice import Cause, diagnose
 from tmlattice.challenge.kinds import measure
@@ -57,9 +55,7 @@ def test_it_is_told_in_text_and_json(tunes):
     said = next_text(diagnosis)
     assert "minutes) would separate 'quadrupole_gradient QD::3' from" in said
     assert said in to_do(diagnosis)
-    document = json.loads(json.dumps(diagnosis.as_json()))
-    schema = resources.files("tmlattice") / "schemas" / "diagnosis.schema.json"
-    jsonschema.validate(document, json.loads(schema.read_text()))
+    document = valid(diagnosis.as_json(), "diagnosis")
     told = document["next_measurement"]
     assert told["launch"] is None
     assert told["minutes"] == KINDS[told["kind"]].minutes(diagnosis.ring)

@@ -1,13 +1,8 @@
-"""Objects of other packages become rings and rings become objects: the referee is each package's
-own closed orbit, tunes and dispersion.
-
-xtrack and cpymad are no dependencies: what needs them is skipped where they are not installed.
-"""
+"""Objects of other packages as rings and back; referees: their own orbits, tunes, dispersion."""
 
 import functools
 import inspect
 import io
-import os
 import warnings
 from pathlib import Path
 
@@ -15,6 +10,7 @@ import at
 import machine_data
 import numpy as np
 import pytest
+from shared import measured_data
 
 import tmlattice
 from tmlattice import Cause, load_ring, twiss
@@ -305,8 +301,7 @@ def of_madx(ring, start):
 
 
 def differences(ring, package, request):
-    """Largest differences of tunes, closed orbit (m) and dispersion (m) between a package's own
-    figures of a ring and `ring.twiss()`; along the ring where the package has its elements."""
+    """Largest differences of tunes, closed orbit (m), dispersion (m) from `ring.twiss()`."""
     of = {"AT": of_at, "OCELOT": of_ocelot, "xtrack": of_xtrack}
     if package == "MAD-X":
         tunes, orbit, dispersion = of_madx(ring, request.getfixturevalue("madx"))
@@ -345,11 +340,7 @@ TABLE = {
 @functools.cache
 def loaded(name):
     place = RINGS[name]
-    if name == "sps":
-        place = Path(os.environ.get("TMLATTICE_DATA", "nowhere")) / place
-        if not place.is_file():
-            pytest.skip("TMLATTICE_DATA has no real_rings/sps")
-    return quiet(load_ring, place)
+    return quiet(load_ring, measured_data(place) if name == "sps" else place)
 
 
 @pytest.mark.parametrize("name", RINGS)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import parted
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS
@@ -13,12 +14,7 @@ from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
-from tmlattice.diagnosis.response.undetermined import (
-    Blur,
-    Undetermined,
-    and_orbits,
-    undetermined,
-)
+from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import Cause, find
 from tmlattice.inference.judgement import DEFAULT
@@ -48,8 +44,7 @@ def before(small_ring):
 @pytest.fixture(scope="module")
 def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
-    data = response_data(small_ring, before)
-    split = split_columns(data, 0.2, np.random.default_rng(0))
+    data, split = parted(small_ring, before)
     *_, (_, state) = one_by_one(begin(data, split), STEPS)
     return state
 

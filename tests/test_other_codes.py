@@ -1,11 +1,11 @@
 """Rings as other codes keep them: MAD-X's tables, Xsuite's JSON, elegant's lines."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import measured_data
 
 from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
@@ -41,8 +41,7 @@ def madx(tmp_path_factory):
 
 
 def table(ring, folder, centre=0.0, drop=(), drifts=False, **header):
-    """The table that MAD-X's TWISS writes of a ring, with or without drifts; integrated
-    strengths."""
+    """The table that MAD-X's TWISS writes of a ring, with or without drifts."""
     header = {"ENERGY": ring.energy, "MASS": ring.mass, "LENGTH": ring.length, **header}
     kept = [c for c in COLUMNS if c not in drop]
     lines = [f"@ {k} %le {v!r}" for k, v in header.items() if v is not None]
@@ -248,10 +247,7 @@ def test_tables_that_say_too_little(madx, tmp_path):
 
 
 def test_sps_has_the_optics_that_its_header_states():
-    folder = os.environ.get("TMLATTICE_DATA")
-    path = Path(folder or "nowhere") / "real_rings" / "sps" / "twiss_elements.dat"
-    if not path.is_file():
-        pytest.skip("TMLATTICE_DATA has no real_rings/sps/twiss_elements.dat")
+    path = measured_data("real_rings", "sps", "twiss_elements.dat")
     ring = load_ring(path)
     header = dict(line.split()[1::2] for line in path.read_text().splitlines() if line[0] == "@"
                   and line.split()[2] == "%le")  # fmt: skip

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 from command import tmlattice
+from conftest import SMALL
 
 from tmlattice.lattice import save_ring
 
 ROOT = Path(__file__).parent.parent
-SMALL = ROOT / "tests" / "lattices" / "small_ring.py"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 LONGEST = 130  # lines
 HEAVIEST = 150_000  # bytes of a picture
@@ -44,6 +44,7 @@ def tried(reader):
             for line in BLOCKS[number]:
                 program, *words = shlex.split(line)
                 assert program == "tmlattice"
+                words += ["--epochs", "20"] if words == ["tune-fit"] else []  # `test_cli` has more
                 tmlattice(*words, cwd=reader, check=0)
         return BLOCKS[number]
 

@@ -1,7 +1,4 @@
-"""The report in a real browser: Chromium, driven by playwright, without a network.
-
-Debian's package `chromium`, which `.ci/run` installs, and `pip install '.[test]'` are all it takes.
-"""
+"""The report in a real browser: Chromium, driven by playwright, without a network."""
 
 import json
 import shutil

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import small_steps
 
 from tmlattice.diagnosis.families.fields import BendGradient, EdgeFocusing
 from tmlattice.diagnosis.families.steps import STEPS
@@ -43,9 +44,7 @@ def bent(combined):
         *(Cause("bend_gradient", n, GRADIENT * w) for n, w in zip(bends, wrong, strict=True)),
         *(Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()),
     ]
-    measured = simulate_response(
-        combined, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="at", progress=False
-    ).measured
+    measured = small_steps(combined, causes, engine="at")
     return response_data(combined, measured), bends, wrong
 
 
@@ -90,17 +89,14 @@ def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
 def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):
     """Its bends have no gradient."""
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()]
-    measured = simulate_response(
-        small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False
-    ).measured
+    measured = small_steps(small_ring, causes)
     data = response_data(small_ring, measured)
     fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
     assert not any(step.effect == "bend_gradient" for step in (*fit.steps, *fit.rejected_steps))
 
 
 def test_the_scale_of_edges_is_that_of_a_rectangular_magnet(small_ring):
-    """Two edges of half the angle each, each of h tan(edge): far from it no dipole's edges are off.
-    A wiggler's poles, which bend both ways, have theirs too."""
+    """Two edges of half the angle, each of h tan(edge); a wiggler's poles have theirs too."""
     data = response_data(small_ring, simulate_response(small_ring, [], engine="ocelot").measured)
     bends = [e for e in small_ring.elements if e.kind == "bend"]
     expected = {stem(e.name): 2 * e.angle / e.length * np.tan(e.angle / 2) for e in bends}

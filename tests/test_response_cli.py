@@ -2,36 +2,26 @@
 
 import csv
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from conftest import SMALL
 from numpy.testing import assert_allclose
 
 from tmlattice import Cause, load_ring, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.cli.command import tmlattice
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.calibration import (
-    calibrated_response,
-    read_calibration,
-    write_calibration,
-)
+from tmlattice.observe.calibration import calibrated_response, read_calibration, write_calibration
 from tmlattice.observe.compared import OfResponse
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 CAUSES = [
     Cause("monitor_gain_x", "last_a", 0.1),
     Cause("monitor_roll", "end_3", 0.05),
     Cause("corrector_calibration", "v5", -0.2),
     Cause("corrector_roll", "v6", 0.02),
 ]
-
-
-def run(*words):
-    return CliRunner().invoke(tmlattice, [str(w) for w in words], catch_exceptions=False)
 
 
 @pytest.mark.parametrize("engine", ["at", "ocelot"])
@@ -80,12 +70,12 @@ def test_one_sided_steps_have_a_second_order(small_ring):
 
 def test_command_line(tmp_path):
     folder, truth = tmp_path / "response", tmp_path / "truth.json"
-    done = run(
+    tmlattice(
         "simulate", SMALL, "--kind", "orbit-response", "--engine", "ocelot", "--corrector", "v1",
         "--corrector", "generated_a", "--seed", "1", "--out", folder,
         "--truth", truth, "--effect", "quadrupole_gradient QF::3 0.01",
+        cwd=tmp_path, check=0,
     )  # fmt: skip
-    assert done.exit_code == 0, done.output
     measured = read_measurement(folder)
     assert measured.correctors == ("v1", "generated_a")
     assert measured.planes == ("y", "x")
@@ -94,29 +84,12 @@ def test_command_line(tmp_path):
     assert not any("QF" in file.read_text() for file in folder.iterdir())
 
 
-def test_options_of_the_other_kind_are_refused(tmp_path):
-    for words, said in (
-        (["--kind", "orbit-response", "--shots", "3"], "--shots has no meaning"),
-        (["--corrector", "v1"], "--corrector has no meaning for --kind trajectory"),
-    ):
-        done = run_failing("simulate", SMALL, *words, "--out", tmp_path / "no")
-        assert said in done
-    assert not (tmp_path / "no").exists()
-
-
-def run_failing(*words):
-    done = CliRunner().invoke(tmlattice, [str(w) for w in words])
-    assert done.exit_code == 2
-    return done.output
-
-
 def test_predict_with_a_calibration(tmp_path, small_ring):
     file, out = tmp_path / "ring.calibration.json", tmp_path / "predicted.csv"
     write_calibration(file, CAUSES)
     assert read_calibration(file, small_ring) == CAUSES
-    done = run("predict", SMALL, "--calibration", file, "--corrector", "v5", "--corrector", "v6",
-               "--kick", "2e-5", "--out", out)  # fmt: skip
-    assert done.exit_code == 0, done.output
+    tmlattice("predict", SMALL, "--calibration", file, "--corrector", "v5", "--corrector", "v6",
+              "--kick", "2e-5", "--out", out, cwd=tmp_path, check=0)  # fmt: skip
     with out.open(encoding="utf-8") as table:
         rows = list(csv.DictReader(table))
     assert list(rows[0]) == ["corrector", "monitor", "x", "y"]

@@ -2,20 +2,17 @@
 
 import csv
 import json
-import os
 from dataclasses import replace
-from importlib.resources import files
-from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from conftest import SMALL
 from numpy.testing import assert_allclose
+from shared import measured_data, parted, valid
 
 from tmlattice import diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.cli.command import tmlattice
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.stepwise import fit_steps
@@ -33,9 +30,6 @@ from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes, twiss
 from tmlattice.report.plain import report_text
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
-REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"
-real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no PETRA III response")
 CAUSES = [
     Cause("quadrupole_gradient", "QD::5", 0.01),
     Cause("quadrupole_gradient", "QF::9", -0.008),
@@ -280,8 +274,7 @@ def test_tunes_go_with_the_energy_as_ats(small_ring):
 
 
 def test_a_wiggler_that_focuses_is_fitted_and_has_its_amount(small_ring):
-    """Its vertical focusing is a step of the fit, which leaves noise; weighed apart, all of it is
-    seen once more."""
+    """Its vertical focusing is a step of the fit; weighed apart, all of it is seen again."""
     (wiggler,) = (e.name for e in small_ring.elements if e.kind == "wiggler")
     measured = simulate_response(
         small_ring, [Cause("insertion_device_focusing", wiggler, 2e-4)], kick=STEP, noise=1e-9,
@@ -306,9 +299,7 @@ def test_one_sided_steps_are_told_from_two_sided_ones(small_ring):
 
 
 def test_report_and_json(small_ring, result):
-    schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
-    document = result.as_json()
-    jsonschema.validate(json.loads(json.dumps(document)), schema)
+    document = valid(result.as_json(), "diagnosis")
     assert [s["effect"] for s in document["steps"]] == [s.effect for s in result.steps]
     text = report_text(result)
     assert "IDENTIFIED: 5 faults" in text  # and no small errors beside them
@@ -342,26 +333,11 @@ def test_predict_reproduces_the_held_out_figure_with_the_beams_energies(tmp_path
     write_measurement(tmp_path / "m", measured)
     ring, out, told = (tmp_path / name for name in ("ring.json", "predicted.csv", "found.json"))
     calibration = tmp_path / "ring.json.calibration.json"
-    for words in (
-        (
-            "diagnose",
-            SMALL,
-            tmp_path / "m",
-            "--lattice-out",
-            ring,
-            "--json",
-            told,
-            "--out",
-            tmp_path / "out",
-            "--effects",
-            ",".join([*KNOWN, *(cause.effect for cause in beam)]),
-        ),
-        ("predict", ring, "--calibration", calibration, "--out", out, "--kick", "1e-5"),
-    ):
-        done = CliRunner().invoke(tmlattice, [str(word) for word in words], catch_exceptions=False)
-        assert done.exit_code == 0, done.output
-    names = {file.name for file in (tmp_path / "out").iterdir()}
-    assert {"report.html", "report.txt", "diagnosis.json", "maps.png", "steps.png"} <= names
+    effects = ",".join([*KNOWN, *(cause.effect for cause in beam)])
+    tmlattice("diagnose", SMALL, "m", "--lattice-out", ring, "--json", told,
+              "--effects", effects, cwd=tmp_path, check=0)  # fmt: skip
+    tmlattice("predict", ring, "--calibration", calibration, "--out", out, "--kick", "1e-5",
+              cwd=tmp_path, check=0)  # fmt: skip
     written = {
         own["effect"]: own["amount"] for own in json.loads(calibration.read_text())["effects"]
     }
@@ -371,8 +347,7 @@ def test_predict_reproduces_the_held_out_figure_with_the_beams_energies(tmp_path
     with out.open(encoding="utf-8") as table:
         rows = {(row["corrector"], row["monitor"]): row for row in csv.DictReader(table)}
     # the same judges as the diagnosis had: the kick from one half of the monitors
-    data = response_data(small_ring, measured)
-    split = split_columns(data, 0.2, np.random.default_rng(0))
+    data, split = parted(small_ring, measured)
     left = []
     for c in np.flatnonzero(split.held):
         name, plane = data.measured.correctors[c], data.measured.planes[c]
@@ -386,10 +361,8 @@ def test_predict_reproduces_the_held_out_figure_with_the_beams_energies(tmp_path
 
 def test_options_that_have_no_meaning(tmp_path, measured):
     write_measurement(tmp_path / "m", measured)
-    done = CliRunner().invoke(
-        tmlattice, ["diagnose", SMALL, str(tmp_path / "m"), "--radiation"], standalone_mode=False
-    )
-    assert "--radiation has no meaning for an orbit response" in str(done.exception)
+    done = tmlattice("diagnose", SMALL, "m", "--radiation", cwd=tmp_path, check=2)
+    assert "--radiation has no meaning for an orbit response" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -401,19 +374,16 @@ def test_the_lattice_s_place_is_checked_before_the_work(
 ):
     write_measurement(tmp_path / "m", measured)
     monkeypatch.setattr("tmlattice.diagnosis.diagnose", None)  # the work would fail
-    done = CliRunner().invoke(
-        tmlattice, ["diagnose", SMALL, str(tmp_path / "m"), "--lattice-out", str(tmp_path / name)],
-        standalone_mode=False,
-    )  # fmt: skip
-    assert said in str(done.exception)
+    done = tmlattice("diagnose", SMALL, "m", "--lattice-out", name, cwd=tmp_path, check=2)
+    assert said in done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"m"}
 
 
 @pytest.mark.slow
-@real
 def test_measured_petra3():
     """Held-out figures of the measured response; the design's are 164, 120 and 145 µm."""
-    found = diagnose(load_ring(REAL / "p3_low_beta.mat"), read_measurement(REAL))
+    folder = measured_data("petra3_orbit_response")
+    found = diagnose(load_ring(folder / "p3_low_beta.mat"), read_measurement(folder))
     last = found.steps[-1]
     assert last.heldout_rms_in_plane < 7e-6
     assert last.heldout_rms_position < 4.5e-6

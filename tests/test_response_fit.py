@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
+from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.fields import FocusingChange, VerticalFocusing
 from tmlattice.diagnosis.families.steps import STEPS, Trial
@@ -117,8 +118,7 @@ def test_scale_of_the_prior_is_that_of_the_truth(rng, freedom):
 
 
 def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
-    """What the data leave to the priors (the scale of all correctors against that of all monitors)
-    was said to be known, as soon as the one number that taught its size was small."""
+    """The scale of correctors against that of monitors was held known for a small number."""
     alike = np.array([[1.0], [1.0]])  # only the sum of two numbers is read
     there = Normal(1e8 * alike @ alike.T, 1e8 * 0.02 * alike[:, 0])
     groups = [
@@ -129,8 +129,7 @@ def test_a_scale_that_one_number_teaches_does_not_say_that_it_is_zero():
 
 
 def test_a_scale_that_fell_is_found_again(rng):
-    """Each of 40 numbers is known no better than they are large: from a hundredth of that, whither
-    the scale had fallen while another family was missing, EM stood still."""
+    """40 numbers known no better than they are large: EM stood still at a hundredth of that."""
     truth = 0.01 * rng.standard_normal(40)
     there = Normal(1e4 * np.eye(40), 1e4 * truth + 1e2 * rng.standard_normal(40))
     found = [
@@ -142,23 +141,15 @@ def test_a_scale_that_fell_is_found_again(rng):
 
 
 def test_gains_of_little_information_come_in(small_ring):
-    """Gains of 10 % and gradients of 1 % in readings that tell little of each: nothing was kept
-    with most seeds, for the gains' size had fallen to nothing before the gradients came in."""
+    """Gains of 10 %, gradients of 1 %: the gains' scale had fallen before the gradients came."""
     rng = np.random.default_rng(5)
-    causes = [
-        Cause("quadrupole_gradient", own.name, 0.01 * float(rng.standard_normal()))
-        for own in small_ring.elements
-        if own.kind == "quadrupole"
-    ]
+    causes = gradients(small_ring, 0.01, rng)
     causes += [
         Cause(f"monitor_gain_{plane}", own.name, 0.1 * float(rng.standard_normal()))
         for own in small_ring.monitors
         for plane in "xy"
     ]
-    measured = simulate_response(
-        small_ring, causes, kick=1e-5, noise=4e-6, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=3,
-    ).measured  # fmt: skip
+    measured = small_steps(small_ring, causes, noise=4e-6, seed=3)
     data = response_data(small_ring, measured)
     fit = stepwise.fit_steps(data, split_columns(data, 0.2, np.random.default_rng(0)), STEPS[:3])
     assert {step.effect.split(",")[0] for step in fit.steps[1:]} == {
@@ -200,8 +191,7 @@ def test_a_device_focuses_and_a_change_of_one_may_do_less(small_ring):
             small_ring, [Cause("vertical_focusing", "d::95", true)], kick=1e-5, noise=2e-8,
             engine="ocelot", progress=False,
         ).measured  # fmt: skip
-        data = response_data(small_ring, measured)
-        split = split_columns(data, 0.2, np.random.default_rng(1))
+        data, split = parted(small_ring, measured, 1)
         *_, (_, state) = one_by_one(begin(data, split), [STEPS[0], Trial((family,), 2, 0)])
         amounts.append(state.values["device"][family.places(data).index("d::95")])
     assert amounts == pytest.approx([0.0, -0.01, 0.01], rel=0.02, abs=0.0)

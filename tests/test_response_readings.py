@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import parted, small_steps
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
@@ -13,7 +14,6 @@ from tmlattice.diagnosis.response.set_aside import taken_back
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
@@ -26,15 +26,11 @@ GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}
 @pytest.fixture(scope="module")
 def clean(small_ring):
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
-    return simulate_response(
-        small_ring, [*causes, Cause("corrector_calibration", "v2", 0.1)], kick=1e-5, noise=2e-8,
-        rf_step=-3000.0, engine="ocelot", progress=False, seed=3,
-    ).measured  # fmt: skip
+    return small_steps(small_ring, [*causes, Cause("corrector_calibration", "v2", 0.1)], seed=3)
 
 
 def fitted(ring, measured):
-    data = response_data(ring, measured)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
+    data, split = parted(ring, measured, 1)
     return fit_steps(data, split, [STEPS[0], STEPS[2]]).state
 
 
@@ -73,10 +69,7 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     noise = 2e-8
     ring = small_ring if plane == "x" else ring_kicking_x("i")
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in GRADIENTS.items()]
-    measured = simulate_response(
-        ring, causes, kick=1e-5, noise=noise, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=3,
-    ).measured  # fmt: skip
+    measured = small_steps(ring, causes, noise=noise, seed=3)
     moves, rests = "xy".index(plane), "yx".index(plane)
     orbit = measured.response[measured.planes.index(plane), :, moves].copy()
     orbit *= times * noise / np.sqrt(np.mean(orbit**2))
@@ -120,19 +113,14 @@ def swapped(measured, what, pair):
     return replace(measured, response=measured.response[:, order], rf=rf)
 
 
-EXCHANGED = {
-    "neighbours": ("correctors", "v5", "v6"),
-    "monitors": ("monitors", "end_1", "end_14"),
-}
+EXCHANGED = {"neighbours": ("correctors", "v5", "v6"), "monitors": ("monitors", "end_1", "end_14")}
 
 
 @pytest.mark.parametrize("case", EXCHANGED)
 def test_what_is_exchanged_is_the_finding(small_ring, case):
     """A ring without another fault had been told to have no error; whatever effects are asked."""
     what, *pair = EXCHANGED[case]
-    measured = simulate_response(
-        small_ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=3
-    ).measured  # fmt: skip
+    measured = small_steps(small_ring, seed=3)
     wrong = swapped(measured, what, pair)
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient"])
     assert found.verdict == "localised"
@@ -158,8 +146,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
 
 @pytest.mark.parametrize("waves", [0.0, 3.0])
 def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring, clean, waves):
-    """Of real rings gradients scattered by two of their stated errors between seeds of the split,
-    which share four fifths of the readings; two halves of the correctors differed by four."""
+    """Real rings: gradients scattered by two of their stated errors between seeds."""
     rng = np.random.default_rng(5)
     response, planes = clean.response.copy(), np.array(clean.planes)
     for c, plane in enumerate(planes):

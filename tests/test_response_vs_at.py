@@ -1,13 +1,12 @@
 """Orbit responses against AT's closed orbits, finite differences, and the measured PETRA III."""
 
-import os
 import re
-from pathlib import Path
 
 import at
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from shared import measured_data
 
 from tmlattice import Cause, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
@@ -17,9 +16,6 @@ from tmlattice.errors import EffectError, MeasurementError, UnknownNameError
 from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.observe.compared import OfResponse
-
-REAL = Path(os.environ.get("TMLATTICE_DATA", "/nowhere")) / "petra3_orbit_response"
-real = pytest.mark.skipif(not REAL.exists(), reason="TMLATTICE_DATA has no PETRA III response")
 
 
 @pytest.fixture(scope="module")
@@ -151,8 +147,7 @@ def test_derivative_vs_finite_difference(bent, effect):
 
 
 def test_correctors_that_are_not_set_move_no_map_wherever_their_fields_are(bent):
-    """Of a model that is changed, against one that is made anew; two correctors of `bent` are
-    kicks, and their maps do change."""
+    """A changed model against one made anew; two correctors of `bent` are kicks and change."""
     rng = np.random.default_rng(1)
     model = ResponseModel(bent)
     causes = [
@@ -213,13 +208,12 @@ def test_refusals(small_ring):
         derivatives(model, [("monitor_gain_x", "last_a")])
 
 
-@real
 def test_design_vs_measured_petra3():
     """The README of the data: 160.8 micrometres, all blocks and monitors, by another code."""
     from tmlattice import load_ring
 
-    ring = load_ring(REAL / "p3_low_beta.mat")
-    measured = read_measurement(REAL)
+    folder = measured_data("petra3_orbit_response")
+    ring, measured = load_ring(folder / "p3_low_beta.mat"), read_measurement(folder)
     *_, design = OfResponse(ring, measured).pairs(measured)[:2]
     difference = measured.response - design[:-1]
     assert_allclose(np.sqrt(np.nanmean(difference**2)), 160.8e-6, rtol=1e-3)

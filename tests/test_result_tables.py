@@ -1,4 +1,4 @@
-"""Tables of the results' pages are those of the stored JSON; what a benchmark prints is stored."""
+"""Tables of the results' pages are those of the stored JSON; benchmarks find their imports."""
 
 import json
 import re
@@ -70,3 +70,13 @@ def test_a_benchmark_that_fails_stores_nothing(tmp_path):
     with pytest.raises(SystemExit, match="3: nothing is stored"):
         TABLES["store"]("tried", [sys.executable, "-c", "raise SystemExit(3)"], tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+# --- what `benchmarks/` imports is there: nobody else runs them between two studies ---------------
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.py")))
+def test_a_benchmark_finds_what_it_imports(name, monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
+    assert "__name__" in runpy.run_path(str(FOLDER / f"{name}.py"), run_name="imported")

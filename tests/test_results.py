@@ -6,13 +6,12 @@ import inspect
 import json
 import pickle
 import re
-from importlib.resources import files
 
-import jsonschema
 import numpy as np
 import pytest
 from command import tmlattice as command
 from conftest import SMALL
+from shared import valid
 
 import tmlattice
 from tmlattice import Cause, Diagnosis
@@ -26,7 +25,6 @@ from tmlattice.report.speaking import render
 
 FAULT = Cause("quadrupole_gradient", "QD::5", -0.05)
 ALL = {"all": None}
-SCHEMA = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
 
 
 def shots(ring, causes, seed=2):
@@ -160,8 +158,7 @@ def test_a_table_that_is_not_there_is_a_sentence(diagnoses):
 def test_a_diagnosis_is_loaded_as_it_was_saved(diagnoses, kind, tmp_path):
     found = diagnoses[kind]
     saved(found, tmp_path / "result", figures=kind in FIGURES)
-    document = json.loads((tmp_path / "result" / "diagnosis.json").read_text(encoding="utf-8"))
-    jsonschema.validate(document, SCHEMA)
+    document = valid(tmp_path / "result" / "diagnosis.json", "diagnosis")
     again = Diagnosis.load(tmp_path / "result")
     assert Diagnosis.load(tmp_path / "result" / "diagnosis.json").report() == again.report()
     assert again.report() == found.report()
@@ -304,8 +301,7 @@ def test_two_lattices_differ_by_what_was_changed(small_ring):
 
 
 def test_two_responses_differ_by_calibrations(small_ring):
-    """One corrector gives 10 % more; the kicks of the second are half as large. All others agree
-    within the noise."""
+    """One corrector gives 10 % more; the kicks of the second are half as large."""
     one = response(small_ring)
     strong = Cause("corrector_calibration", "v3", 0.1)
     other = response(small_ring, [strong], seed=9, kick=5e-5)
@@ -331,9 +327,7 @@ def test_commands_render_and_compare(diagnoses, small_ring, tmp_path):
     done = command("compare", "a", "b", "--json", "c.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "quadrupole_gradient" in done.stdout
-    document = json.loads((tmp_path / "c.json").read_text())
-    comparison = files("tmlattice") / "schemas" / "comparison.schema.json"
-    jsonschema.validate(document, json.loads(comparison.read_text()))
+    document = valid(tmp_path / "c.json", "comparison")
     assert document["rows"][0]["unit"] == "relative"
     write_measurement(tmp_path / "m", response(small_ring))
     write_measurement(tmp_path / "t", shots(small_ring, []))

@@ -31,8 +31,7 @@ def measured(small_ring):
 def test_products_through_factors_equal_those_of_signatures(
     small_ring, measured, causes, rng, monkeypatch
 ):
-    """About an orbit, beside wrong monitors and correctors, with monitors that were not read and
-    readings that are missing; kicks too."""
+    """About an orbit, with wrong monitors and correctors and missing readings; kicks too."""
     monitors = [m for m in measured.monitors if m not in ("bpm::2", "last_a")]
     data = response_data(small_ring, measured.select(monitors=monitors if causes else None))
     base = Predicted(data, Errors.none(data)).with_causes(causes)
@@ -63,8 +62,7 @@ def alike(mine, theirs):
 
 
 def test_products_through_modes_equal_those_of_signatures(small_ring, rng):
-    """Shots of two beams, one monitor a turn late, another with a wrong gain; some lines are not
-    used, of some the real part alone."""
+    """Two beams, one monitor a turn late, one with a wrong gain, lines that are not used."""
     settings = ({}, {}, {"v3": {"kick": 2e-4}})
     turns = simulate_turns(small_ring, SICK, shots=3, turns=64, seed=1, settings=settings).measured
     late = Cause("monitor_turn_offset", "end_2", 1.0)

@@ -1,7 +1,4 @@
-"""What lives beside the program: another user, his files, the working directory, ports.
-
-The sentences of SECURITY.md on these, each with a test of its name.
-"""
+"""Sentences of SECURITY.md on other users, their files, the working directory and ports."""
 
 import contextlib
 import os
@@ -284,8 +281,7 @@ MODULES = (
 SIMULATE = ("simulate", "ring.json", "--shots", "66", "--engine", "ocelot", "--jobs", "2", "-q")
 STUDY = ("dev", "study", "tune-fit", "ring.json", "--magnets", "2", "--methods", "sparse", "-q")
 COMMANDS = {
-    "info": ("info", "ring.py"),
-    "diagnose": ("diagnose", "ring.json", "M", "--out", "R"),
+    "diagnose": ("diagnose", "ring.py", "M", "--out", "R"),
     "simulate": (*SIMULATE, "--out", "N", "--force"),
     "challenge run": ("dev", "challenge", "run", "set", "--jobs", "2", "-q"),
     "study": (*STUDY, "--jobs", "2", "--out", "study"),
@@ -312,11 +308,10 @@ def slow(*names):
 
 
 @pytest.mark.parametrize(
-    "name", ["info", "diagnose", "simulate", "study", *slow("challenge run", "challenge score")]
+    "name", ["diagnose", "simulate", "study", *slow("challenge run", "challenge score")]
 )
 def test_no_module_of_the_working_directory_is_loaded_and_no_port_is_open(beside, name):
-    """By no command, in no process of it; nor by `python -m tmlattice`. Nothing listens, on no
-    address and on no Unix socket."""
+    """By no process of a command; nothing listens, on no address and no Unix socket."""
     (beside / "MARK").unlink(missing_ok=True)
     words = [sys.executable, "-m", "tmlattice", *COMMANDS[name]]
     process = psutil.Popen(words, cwd=beside, stdout=subprocess.DEVNULL)
@@ -328,6 +323,7 @@ def test_no_module_of_the_working_directory_is_loaded_and_no_port_is_open(beside
                 sockets = one.net_connections("all")
                 assert not [s for s in sockets if s.status == psutil.CONN_LISTEN]
                 assert not [s for s in sockets if s.type == socket.SOCK_DGRAM]
+                assert not [s for s in sockets if s.family == socket.AF_UNIX and one != process]
         time.sleep(0.05)
     assert not (beside / "MARK").exists(), (beside / "MARK").read_text()
     assert process.returncode == 0

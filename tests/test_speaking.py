@@ -1,19 +1,17 @@
 """Objects that speak: short in a line, whole in a report; names and paths where objects go."""
 
 import importlib
-import json
 import pkgutil
 import subprocess
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 
-import jsonschema
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from conftest import SMALL
-from test_cli import schema
+from shared import valid
 
 import tmlattice
 from tmlattice.effects import CATALOGUE
@@ -116,8 +114,7 @@ def test_a_diagnosis_writes_what_the_command_writes(diagnosis, tmp_path):
     assert diagnosis.save(tmp_path / "out") == tmp_path / "out" / "report.html"
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names >= {"report.html", "report.txt", "diagnosis.json", "scan.png", "gap.png"}
-    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    jsonschema.validate(document, schema("diagnosis"))
+    valid(tmp_path / "out" / "diagnosis.json", "diagnosis")
     assert (tmp_path / "out" / "report.txt").read_text() == diagnosis.report() + "\n"
     assert "QD::5" in diagnosis.report(80)
     assert max(map(len, diagnosis.report(80).splitlines())) <= 80

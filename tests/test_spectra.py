@@ -18,10 +18,7 @@ TURNS, MONITORS, SHOTS = 600, 40, 3
 def signal(
     rng, turns=TURNS, monitors=MONITORS, tunes=Q, size=(1e-3, 5e-4), noise=NOISE, envelopes=None
 ):
-    """Turns [shot, turn, monitor, 2] of two modes, and their amplitudes [shot, monitor, 2, mode].
-
-    Written as sums of sine and cosine, monitors of different beta, coupling of 10 % of any phase.
-    """
+    """Turns [shot, turn, monitor, 2] of two coupled modes, and [shot, monitor, 2, mode]."""
     turn = np.arange(turns)
     phase = 2 * np.pi * np.outer(np.arange(monitors) / monitors, (7.1, 5.3))
     amplitude = np.empty((SHOTS, monitors, 2, 2), dtype=complex)

@@ -8,10 +8,10 @@ import subprocess
 import sys
 import threading
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import SMALL
 from scipy import stats
 
 from tmlattice import cache, load_ring
@@ -19,8 +19,6 @@ from tmlattice.inference import chi2
 from tmlattice.lattice import save_ring, stored
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import element_map, ring_maps
-
-SMALL = Path(__file__).parent / "lattices" / "small_ring.py"
 
 
 def python(code, folder, *arguments, **environment):

@@ -5,10 +5,10 @@ from functools import partial
 import at
 import numpy as np
 import pytest
-from conftest import SMALL
 from numpy.testing import assert_allclose
 
-from tmlattice import Cause, diagnose, load_ring
+from tests.scenarios import ring_of
+from tmlattice import Cause, diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.effects import CATALOGUE, RingEffect, apply, find
@@ -36,16 +36,13 @@ def wrong(small_ring):
 
 
 @pytest.fixture(scope="module")
-def with_cavities(tmp_path_factory):
+def with_cavities():
     """The small ring with two cavities of its own, where the dispersion is not zero."""
-    text = SMALL.read_text()
-    for behind, name in (("[d, generated_b", "last"), ('    Monitor(eid="bpm_start")', "first")):
-        cavity = f"Cavity(l=0.3, v=2.5e-3, freq=5e8, eid='{name}'), "
-        at = text.index(behind) + behind.index(behind.strip()) + (behind[0] == "[")
-        text = text[:at] + cavity + text[at:]
-    path = tmp_path_factory.mktemp("cavities") / "ring.py"
-    path.write_text(text)
-    return load_ring(path)
+    first, last = (
+        f"Cavity(l=0.3, v=2.5e-3, freq=5e8, eid='{name}'), " for name in ("first", "last")
+    )
+    start = '    Monitor(eid="bpm_start")'
+    return ring_of("small", (("[d, generated_b", f"[{last}d, generated_b"), (start, first + start)))
 
 
 def _apart(a, b):
@@ -119,8 +116,7 @@ def test_tunes_and_modes_vs_at(small_ring):
 
 @pytest.mark.parametrize("which", ["small_ring", "with_cavities"])
 def test_tunes_and_modes_with_rf_vs_at(request, which):
-    """A cavity where the dispersion is not zero beats the modes by a hundredth; the model did not
-    know it, and took the loss of energy, with which the RF comes on, for many small errors."""
+    """A cavity where the dispersion is not zero beats the modes by a hundredth."""
     ring = request.getfixturevalue(which)
     causes = [WRONG[0], LOSS]
     model = ResponseModel(apply(ring, causes))

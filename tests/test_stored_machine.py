@@ -1,16 +1,14 @@
-"""A stored beam of the virtual machine: turns, closed orbits, dispersion, tunes, against AT's own
-tools and against one another."""
-
-from pathlib import Path
+"""Turns, closed orbits, dispersion, tunes of the virtual machine against AT's own tools."""
 
 import at
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from conftest import SMALL
 from numpy.testing import assert_allclose
 
-from tmlattice import Cause, load_ring, read_measurement
-from tmlattice.cli.command import tmlattice
+from tests.scenarios import ring_of
+from tmlattice import Cause, read_measurement
 from tmlattice.errors import LatticeError, TmlatticeError, UnstableRingError
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
@@ -33,31 +31,22 @@ UPRIGHT = CAUSES[:2]
 FREQUENCY = {"rf": {"frequency_relative": 1e-5}}
 
 
-def tiny_ring(folder, cavity=False):
+def tiny_ring(*edits):
     """Six of the small ring's cells, 1 GeV, with weak sextupoles: chromaticities 6 and 3."""
-    from conftest import SMALL
-
-    text = SMALL.read_text()
-    changes = {"cells = 16": "cells = 6", "energy = 3.0": "energy = 1.0", "k2=6.0": "k2=1.5",
-               "k2=-9.0": "k2=-1.5"}  # fmt: skip
-    if cavity:
-        changes["ring = [\n"] = "ring = [\n    Cavity(l=0.3, v=2e-4, freq=5e8, eid='first'),\n"
-    for old, new in changes.items():
-        assert old in text
-        text = text.replace(old, new)
-    path = folder / "ring.py"
-    path.write_text(text)
-    return load_ring(path)
+    tiny = (("cells = 16", "cells = 6"), ("energy = 3.0", "energy = 1.0"), ("k2=6.0", "k2=1.5"),
+            ("k2=-9.0", "k2=-1.5"))  # fmt: skip
+    return ring_of("small", (*tiny, *edits))
 
 
 @pytest.fixture(scope="module")
-def tiny(tmp_path_factory):
-    return tiny_ring(tmp_path_factory.mktemp("tiny"))
+def tiny():
+    return tiny_ring()
 
 
 @pytest.fixture(scope="module")
-def with_cavity(tmp_path_factory):
-    return tiny_ring(tmp_path_factory.mktemp("cavity"), cavity=True)
+def with_cavity():
+    cavity = "ring = [\n    Cavity(l=0.3, v=2e-4, freq=5e8, eid='first'),\n"
+    return tiny_ring(("ring = [\n", cavity))
 
 
 def at_modes(ring, causes=()):
@@ -116,8 +105,7 @@ def test_lines_of_a_thousand_particles_that_decohere_are_at_modes(tiny):
 
 @pytest.mark.parametrize("cavity", [False, True])
 def test_a_beam_in_the_network_decoheres_as_in_at(tiny, with_cavity, cavity):
-    """With the cavity at the end of a turn instead of its start, other particles are ahead: the
-    spread, times the dispersion, is small there."""
+    """With the cavity at a turn's end other particles are ahead: the spread is small there."""
     options = {"turns": 64, "amplitude": 3e-4, "particles": 300, "noise": 0.0, "seed": 2}
     options |= {"emittance": (1e-9, 1e-10), "spread": 1e-5 if cavity else 1e-3}
     by_at, by_network = (
@@ -274,13 +262,6 @@ def test_what_cannot_be_is_a_sentence(tiny, run, error, words):
         run(tiny)
 
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
-
-
-def command(*words):
-    return CliRunner().invoke(tmlattice, ["simulate", SMALL, *map(str, words)])
-
-
 @pytest.mark.parametrize(
     ("kind", "words", "table", "record"),
     [
@@ -293,10 +274,10 @@ def command(*words):
 )  # fmt: skip
 def test_command_writes_each_kind(tmp_path, kind, words, table, record):
     folder, truth = tmp_path / "m", tmp_path / "truth.json"
-    done = command("--kind", kind, *words, "--effect", "quadrupole_gradient QF::3 0.01",
-                   "--seed", "3", "--out", folder, "--truth", truth)  # fmt: skip
-    assert done.exit_code == 0, done.output
-    assert table in done.output
+    done = tmlattice("simulate", SMALL, "--kind", kind, *words, "--seed", 3, "--out", folder,
+                     "--effect", "quadrupole_gradient QF::3 0.01", "--truth", truth, cwd=tmp_path,
+                     check=0)  # fmt: skip
+    assert table in done.stdout
     measured = read_measurement(folder)
     assert type(measured) is record
     assert read_truth(truth).effects[0]["amount"] == 0.01
@@ -304,10 +285,10 @@ def test_command_writes_each_kind(tmp_path, kind, words, table, record):
 
 
 def test_command_has_the_kinds_own_defaults(tmp_path, small_ring):
-    done = command("--kind", "turn-by-turn", "--amplitude", "1e-4", "--out", tmp_path / "m")
-    assert done.exit_code == 0, done.output
+    tmlattice("simulate", SMALL, "--kind", "turn-by-turn", "--amplitude", "1e-4", "--out", "m",
+              cwd=tmp_path, check=0)  # fmt: skip
     assert read_measurement(tmp_path / "m").readings.shape == (1, 1000, 35, 2)
-    done = command("--kind", "tunes", "--noise", "3e-4", "--out", tmp_path / "t")
+    tmlattice("simulate", SMALL, "--kind", "tunes", "--noise", "3e-4", "--out", "t", cwd=tmp_path)
     measured = read_measurement(tmp_path / "t")
     assert measured.tune_error.tolist() == [[3e-4, 3e-4]]
     assert_allclose(
@@ -322,10 +303,11 @@ def test_command_has_the_kinds_own_defaults(tmp_path, small_ring):
         (["--kind", "closed-orbit", "--engine", "ocelot"], "--engine has no meaning"),
         (["--particles", "10"], "take it out, or give --kind turn-by-turn"),
         (["--kind", "dispersion", "--corrector", "v1"], "or give --kind orbit-response"),
+        (["--kind", "orbit-response", "--shots", "3"], "--shots has no meaning"),
+        (["--corrector", "v1"], "--corrector has no meaning for --kind trajectory"),
     ],
 )
 def test_options_of_other_kinds_are_refused(tmp_path, words, said):
-    done = command(*words, "--out", tmp_path / "m")
-    assert done.exit_code == 2
-    assert said in " ".join(done.output.replace("│", " ").split())
+    done = tmlattice("simulate", SMALL, *words, "--out", "m", cwd=tmp_path, check=2)
+    assert said in done.stderr
     assert not (tmp_path / "m").exists()

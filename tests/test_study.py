@@ -1,24 +1,15 @@
-"""The study over many magnets as a user runs it: resumed, on a cluster, with cases that fail."""
+"""`dev study` and `dev reproduce` as a user runs them: resumed, on a cluster, cases that fail."""
 
 import json
-from importlib.resources import files
-from pathlib import Path
 
-import jsonschema
 import pytest
 from command import tmlattice
+from conftest import SMALL
+from shared import valid
 
 from tmlattice.errors import TmlatticeError
-from tmlattice.fitting.study import (
-    UNSTABLE,
-    Case,
-    faults,
-    run_case,
-    study_tune_fit,
-    summarise,
-)
+from tmlattice.fitting.study import UNSTABLE, Case, faults, run_case, study_tune_fit, summarise
 
-SMALL = str(Path(__file__).parent / "lattices" / "small_ring.py")
 QUICK = {"launch": (1e-4, 0.0, 1e-4, 0.0), "change": -0.02, "noise": 1e-6}
 
 
@@ -28,9 +19,7 @@ def test_study_prints_writes_and_goes_on(tmp_path):
         "--change", "-0.02", "--epochs", "20", "--methods", "adam,map,sparse", "--jobs", "1",
     ]  # fmt: skip
     done = tmlattice(*command, cwd=tmp_path, check=0)
-    result = json.loads((tmp_path / "study-tune-fit" / "study.json").read_text())
-    schema = (files("tmlattice") / "schemas" / "study-tune-fit.schema.json").read_text()
-    jsonschema.validate(result, json.loads(schema))
+    result = valid(tmp_path / "study-tune-fit" / "study.json", "study-tune-fit")
     assert list(result["methods"]) == ["adam", "map", "sparse"]
     assert result["cases"] == 2
     assert result["methods"]["sparse"]["right"] == 1.0
@@ -51,7 +40,7 @@ def test_study_prints_writes_and_goes_on(tmp_path):
     again = json.loads((tmp_path / "study-tune-fit" / "study.json").read_text())
     assert [r["abs_dq"] for r in again["results"]] == [r["abs_dq"] for r in result["results"]]
     with pytest.raises(TmlatticeError, match="other options"):
-        study_tune_fit(SMALL, ["sparse"], 2, shots=2, folder=folder)
+        study_tune_fit(str(SMALL), ["sparse"], 2, shots=2, folder=folder)
 
 
 def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(monkeypatch):
@@ -114,3 +103,29 @@ def test_summary_counts_coverage_and_right_magnets():
     assert entry["coverage"]["x"] == pytest.approx(2 / 3)
     assert entry["right"] == pytest.approx(2 / 3)
     assert entry["abs_dq"]["x"]["worst"] == 3.0
+
+
+# --- `tmlattice dev reproduce` as a user runs it --------------------------------------------------
+@pytest.mark.parametrize(
+    "system",
+    [
+        "free-fall",
+        "pendulum",
+        "magnets",
+        "lotka-volterra",
+        pytest.param("cavitation", marks=pytest.mark.slow),
+    ],
+)
+def test_table_json_and_figure(system, tmp_path):
+    out = tmp_path / "out"
+    done = tmlattice("dev", "reproduce", system, "--small", "--out", out, cwd=tmp_path, check=0)
+    assert "why they differ" in done.stdout
+    assert sorted(p.name for p in out.iterdir()) == sorted([f"{system}.png", "reproduction.json"])
+    assert (out / f"{system}.png").read_bytes().startswith(b"\x89PNG")
+    result = valid(out / "reproduction.json", "reproduction")
+    assert [entry["system"] for entry in result["systems"]] == [system]
+
+
+def test_an_unknown_system_is_refused(tmp_path):
+    done = tmlattice("dev", "reproduce", "pendulums", cwd=tmp_path, check=2)
+    assert "pendulum" in done.stderr

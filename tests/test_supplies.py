@@ -1,24 +1,25 @@
-"""Quadrupoles that share no name, and that the design has alike: one supply, wherever it is asked.
-
-As at BESSY II and MLS (q1m1t1r, q1m2t1r, ...); a change by such a one is in `test_before_after`.
-"""
+"""Quadrupoles that are alike in the design are one supply; pieces that are one magnet."""
 
 import json
 import pickle
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
+import at
+import machine_data
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from shared import gradients
 
 from tmlattice import load_ring
 from tmlattice.beam.assembly import Group, assembly
-from tmlattice.cli.command import tmlattice
 from tmlattice.effects import Cause, apply, find
 from tmlattice.effects.directions import directions, directions_nearby
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import save_ring
+from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.lattice.marked import marked
 from tmlattice.maps import LayerMaps
 
@@ -58,9 +59,7 @@ def test_it_is_a_place_of_what_a_supply_has(ring, small_ring):
 
 def test_a_changed_ring_has_those_of_its_design(ring, tmp_path):
     rng = np.random.default_rng(1)
-    wrong = [Cause("quadrupole_gradient", e.name, 1e-3 * rng.standard_normal())
-             for e in ring.elements if e.kind == "quadrupole"]  # fmt: skip
-    changed = apply(ring, wrong)
+    changed = apply(ring, gradients(ring, 1e-3, rng))
     assert replace(changed, known_supplies=None).supplies == {}  # by its strengths none
     save_ring(changed, tmp_path / "as_found.json")
     for same in (changed, pickle.loads(pickle.dumps(changed)),
@@ -99,11 +98,9 @@ def test_a_supply_of_what_is_no_element(ring, tmp_path):
 
 def test_a_place_with_blanks_on_the_command_line(ring, tmp_path):
     save_ring(ring, tmp_path / "ring.json")
-    found = CliRunner().invoke(tmlattice, [
-        "simulate", str(tmp_path / "ring.json"), "--shots", "1", "--out", str(tmp_path / "out"),
-        "--effect", f"family_gradient {SUPPLY} 0.01", "--truth", str(tmp_path / "truth.json"),
-    ])  # fmt: skip
-    assert found.exit_code == 0, found.output
+    tmlattice("simulate", "ring.json", "--shots", 1, "--out", "out", "--effect",
+              f"family_gradient {SUPPLY} 0.01", "--truth", "truth.json", cwd=tmp_path,
+              check=0)  # fmt: skip
     truth = json.loads((tmp_path / "truth.json").read_text())
     assert [cause["element"] for cause in truth["effects"]] == [SUPPLY]
 
@@ -120,8 +117,7 @@ def by_hypothesis(found):
 
 @pytest.mark.parametrize("k1", [1.17, 0.0])
 def test_derivatives_of_a_changed_ring(ring, k1):
-    """Those that are kept of the ring before, and those that a shot's settings change: as worked
-    out anew. A magnet that is off has none."""
+    """Kept ones, and those that a shot's settings change, are as worked out anew."""
     layers = LayerMaps(ring, 6)
     directions_nearby(layers, HYPOTHESES)
     there = ring.with_changed("QFm3r", k1=k1)
@@ -136,3 +132,49 @@ def test_derivatives_of_a_changed_ring(ring, k1):
             for a, b in zip(found[hypothesis], fresh[hypothesis], strict=True):
                 assert a.shape == b.shape, hypothesis
                 np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12 * np.abs(b).max(initial=1))
+
+
+# --- which elements are pieces of one magnet ------------------------------------------------------
+def ring_of(*elements):
+    return ring_from_at(at.Lattice(elements, energy=1e9, periodicity=1), "x")
+
+
+WAY = at.Drift("d", 0.1)
+
+
+def test_halves_around_a_monitor_or_a_corrector_are_one_magnet():
+    half = at.Quadrupole("Q", 0.2, 1.0)
+    coil = at.Corrector("COR", 0.0, [0, 0])
+    ring = ring_of(half, at.Monitor("M"), half, WAY, half, coil, half, WAY, half)
+    assert ring.pieces("q::0") == ring.pieces("q::1") == ("q::0", "q::1")
+    assert ring.pieces("q::3") == ("q::2", "q::3")
+    assert ring.pieces("q::4") == ("q::4",)
+    assert ring.pieces("cor_h") == ("cor_h",)
+
+
+def test_magnets_of_two_supplies_that_touch_are_two():
+    ring = ring_of(
+        at.Quadrupole("QA", 0.2, 1.0), at.Quadrupole("QB", 0.2, 1.1), at.Sextupole("QB", 0.2, 1.1)
+    )
+    assert ring.slices == {}
+
+
+def test_slices_of_a_dipole_and_its_edges_are_the_dipole():
+    bend = [at.Dipole(f"DL_{i}", 0.3 + 0.01 * i, 0.02 + 0.01 * i, 0.0) for i in range(3)]
+    edge = at.Multipole("CROSSTALK", 0.001, [0, 0], [0, 3.0])
+    ring = ring_of(
+        edge, *bend, edge, WAY, edge, at.Sextupole("S", 0.2, 30.0), WAY,
+        at.Dipole("B", 0.3, 0.1, 0.0), at.Dipole("BACK", 0.3, -0.1, 0.0),
+    )  # fmt: skip
+    assert ring.pieces("dl_1") == ("crosstalk::0", "dl_0", "dl_1", "dl_2", "crosstalk::1")
+    assert ring.pieces("crosstalk::2") == ("crosstalk::2", "s")
+    assert ring.pieces("b") == ("b",)  # the next one bends back
+    assert [ring.elements[i].name for i in ring.slices] == ["dl_2", "s"]
+
+
+def test_a_sextupole_cut_for_a_coil_stays_one_magnet():
+    ring = load_ring(Path(machine_data.__file__).parent / "dba.mat", correctors="SF")
+    for i in range(8):
+        assert ring.pieces(f"sf_2::{i}") == (f"sf::{i}", f"sf_2::{i}")
+        assert np.isclose(ring[f"sf_2::{i}"].s - ring[f"sf::{i}"].s, 0.05)
+        assert ring.pieces(f"qfm::{i}") == (f"qfm::{i // 2 * 2}", f"qfm::{i // 2 * 2 + 1}")

@@ -94,15 +94,8 @@ def test_action_does_not_drift_in_5000_turns(petra3_network):
 
 
 @pytest.mark.parametrize("batch", [1, 3])
-def test_gradients_match_finite_differences(tmp_path, rng, batch):
-    (tmp_path / "short.py").write_text(
-        "from ocelot import *\nenergy = 1.0\n"
-        "q = Quadrupole(l=0.3, k1=1.2, eid='q')\ns = Sextupole(l=0.1, k2=20.0, eid='s')\n"
-        "cell = [Monitor(eid='a'), q, Drift(l=0.5, eid='d'), s, Monitor(eid='b'), Monitor(eid='c')]"
-    )
-    from tmlattice import load_ring
-
-    network = disturbed(TaylorNetwork.from_ring(load_ring(tmp_path / "short.py")).symplectic(), rng)
+def test_gradients_match_finite_differences(short_ring, rng, batch):
+    network = disturbed(TaylorNetwork.from_ring(short_ring).symplectic(), rng)
     launch = torch.from_numpy(0.1 * rng.standard_normal((batch, 4))).requires_grad_()
 
     def readings(launch, W0, generator):

@@ -116,16 +116,6 @@ def test_design_ring_tunes_match_ocelot_matrix(petra3, petra3_network):
     np.testing.assert_allclose(tunes(states, optics, "fft").fraction[0], exact, atol=1e-6)
 
 
-def families(ring):
-    """The middle quadrupole of each of the seven largest families."""
-    by_family = {}
-    for element in ring.magnets:
-        if element.kind == "quadrupole" and element.k1 != 0:
-            by_family.setdefault(element.family, []).append(element)
-    largest = sorted(by_family.values(), key=len)[-7:]
-    return [family[len(family) // 2].name for family in largest]
-
-
 def test_coupled_ring_has_the_tunes_of_its_normal_modes(small_ring):
     coupled = small_ring.with_changed("QF::3", tilt=0.05)
     matrix = ring_matrix(coupled)

@@ -6,9 +6,9 @@ from pathlib import Path
 import machine_data
 import numpy as np
 import pytest
-from conftest import SMALL
 from numpy.testing import assert_allclose
 
+from tests.scenarios import ring_of
 from tmlattice import Cause, diagnose, load_ring
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.nonlinear import nonlinear_turn, track
@@ -28,17 +28,15 @@ OCTUPOLES = 'Octupole(l=0.3, k3=4e3, tilt=0.3, eid="oct"), d, generated_b'
 
 
 @pytest.fixture(scope="module")
-def small_with_octupole(tmp_path_factory):
+def small_with_octupole():
     """The small ring with a tilted octupole, a tilted sextupole and two cavities."""
-    text = SMALL.read_text().replace("[d, generated_b", f"[d, {OCTUPOLES}")
-    text = text.replace('k2=-9.0, eid="sd")', 'k2=-9.0, tilt=0.05, eid="sd")')
-    text = text.replace(
-        "back, wiggler", "back, Cavity(l=0.3, v=2.5e-3, freq=5e8, eid='rf'), wiggler"
-    )
-    path = tmp_path_factory.mktemp("octupole") / "ring.py"
-    path.write_text(text)
+    cavity = "back, Cavity(l=0.3, v=2.5e-3, freq=5e8, eid='rf'), wiggler"
+    edits = (
+        ("[d, generated_b", f"[d, {OCTUPOLES}"), ("back, wiggler", cavity),
+        ('k2=-9.0, eid="sd")', 'k2=-9.0, tilt=0.05, eid="sd")'),
+    )  # fmt: skip
     with pytest.warns(UserWarning, match="octupoles"):
-        return load_ring(path)
+        return ring_of("small", edits)
 
 
 def tracked(ring, launch, turns):
@@ -144,7 +142,7 @@ def test_a_steady_line_knows_its_energy(small_ring):
 
 def test_what_decoheres_has_an_imaginary_energy(small_ring):
     """Of Gaussian phases 2 pi xi delta n: by the mean turn of its power, sigma / sqrt(pi)."""
-    beam = {"particles": 20_000, "turns": 100, "engine": "network", "amplitude": 5e-4}
+    beam = {"particles": 5_000, "turns": 100, "engine": "network", "amplitude": 5e-4}
     weak = Cause("quadrupole_gradient", "QD::3", 0.01)
     turns = simulate_turns(small_ring, **beam, noise=2e-6).measured
     problem = many_turns(small_ring, turns, {})

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tmlattice import Cause, diagnose, load_ring, simulate
+from tests.scenarios import ring_of
+from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam import Model
 from tmlattice.beam.rf import rf_of
 from tmlattice.machine import Machine, draw_shots
@@ -14,20 +15,11 @@ TURNS = 3
 
 
 @pytest.fixture(scope="module")
-def with_cavities(tmp_path_factory, small_ring):
+def with_cavities():
     """The small ring with two cavities of its own, one before its first magnet."""
-    from conftest import SMALL
-
-    text = SMALL.read_text()
-    text = text.replace(
-        "ring = [\n", "ring = [\n    Cavity(l=0.3, v=1e-3, freq=5e8, eid='first'),\n"
-    )
-    text = text.replace(
-        "[d, generated_b", "[Cavity(l=0.4, v=1e-3, freq=5e8, eid='last'), generated_b"
-    )
-    path = tmp_path_factory.mktemp("cavities") / "ring.py"
-    path.write_text(text)
-    ring = load_ring(path)
+    first = "ring = [\n    Cavity(l=0.3, v=1e-3, freq=5e8, eid='first'),\n"
+    last = "[Cavity(l=0.4, v=1e-3, freq=5e8, eid='last'), generated_b"
+    ring = ring_of("small", (("ring = [\n", first), ("[d, generated_b", last)))
     assert ring.counts()["cavity"] == 2
     return ring
 

@@ -1,8 +1,4 @@
-"""The package as it is meant: imports run one way.
-
-The order is that of CONTRIBUTING.md; what is not in the table may be imported by all (errors,
-files, ...) or stands above all (the package's own `__init__`).
-"""
+"""Imports run one way: the order of CONTRIBUTING.md, and modules that everybody may use."""
 
 import ast
 import subprocess

@@ -124,8 +124,7 @@ def test_a_symplectic_change_without_a_name_is_symplectic(
 def test_a_change_that_is_not_symplectic_is_the_rest(
     small_ring, small_network, measurement, effects
 ):
-    """x and px both grow with y: no H does that. A symplectic change comes nearest to three
-    quarters of it, in what monitors see, and no effect to any."""
+    """x and px both grow with y: no H does that, and a symplectic change comes near alone."""
     layer = layer_of(small_ring, "QF::5")
     own = TaylorMap([w[layer] for w in small_network.weights()])
     bends = np.zeros((4, 10))

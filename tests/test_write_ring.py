@@ -130,10 +130,7 @@ def test_errors_that_a_format_can_say_are_written(small_ring, file, tmp_path):
 
 @pytest.mark.parametrize("file", FOREIGN)
 def test_errors_that_a_format_has_no_place_for_are_told(small_ring, file, tmp_path):
-    causes = [
-        Cause("corrector_position", "v5", 0.02),
-        Cause("gradient_absolute", "QD::5", 4e-3),
-    ]
+    causes = [Cause("corrector_position", "v5", 0.02), Cause("gradient_absolute", "QD::5", 4e-3)]
     told = save_ring(apply(small_ring, causes), tmp_path / file)
     assert any("ds of v5 cannot be written" in sentence for sentence in told)
     assert any("thin gradients in the middle of QD::5" in sentence for sentence in told)

@@ -64,9 +64,7 @@ def matrix(ring, *causes):
     ids=str,
 )
 def test_remedy_of_another_effect_takes_this_one_away(small_ring, cause):
-    """The leading cause's amount does to the one-turn matrix what the cause does: a wrong sign, or
-    a factor of two, leaves as much as there was. Thin and thick, or the middle and the entrance of
-    an element, differ by some per cent."""
+    """The leading cause changes the one-turn matrix as the cause does, to some per cent."""
     lead = leading(small_ring, cause)
     assert lead.effect != cause.effect
     assert recommended_action(small_ring, cause) == recommended_action(small_ring, lead)

@@ -11,11 +11,13 @@ import pytest
 
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.diagnosis.assessment import STATEMENTS, Assessment, Block, compared_of
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.effects import background_rms
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.machine.response import simulate_response
 from tmlattice.report.page import page
 from tmlattice.report.plain import report_text
+from tmlattice.report.tables import optics_rows
 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
 USUAL = background_rms({"all": None})
@@ -174,6 +176,39 @@ def test_a_closed_orbit_that_was_not_measured_has_no_number(results):
     for said in outputs(found)[:2]:
         assert "closed orbit, rms" not in said
         assert "beta beating, rms" in said
+
+
+def test_a_named_verdict_has_no_suspects(results):
+    found = results["turns, weak quadrupole"]
+    assert (found.verdict, found.suspects) == ("identified", ())
+
+
+def noise_of(ring, data):
+    return {check.name: check for check in check_data(ring, data).checks}["noise"]
+
+
+def test_a_noise_far_below_what_neighbours_leave_is_not_just_ok(small_ring):
+    """Two shots do not tell noise from errors of the machine; eight do, from shot to shot."""
+    usual = {"background": {"all": None}, "seed": 1, "machine_seed": 5}
+    data = simulate(small_ring, shots=6, **usual).measurement()
+    data = replace(data, noise=np.full((35, 2), 2e-6))
+    two = noise_of(small_ring, data.select(shots=[0, 1]))
+    assert two.status == "note"
+    assert "2 shots do not show which" in two.sentence
+    exact = simulate(small_ring, shots=8, noise=2e-6, **usual).measurement()
+    eight = noise_of(small_ring, exact)
+    assert eight.status == "fine"
+    assert "errors of the machine" in eight.sentence
+
+
+def test_a_closed_orbit_stands_where_an_error_makes_one(small_ring):
+    def names(cause):
+        found = diagnose(small_ring, simulate(small_ring, [cause], shots=4, seed=1).measurement())
+        assert found.causes
+        return [name for name, *_ in optics_rows(found)]
+
+    assert not any("orbit" in n for n in names(Cause("quadrupole_gradient", "QD::5", -0.1)))
+    assert any("orbit" in n for n in names(Cause("corrector_kick_y", "v5", 1e-4)))
 
 
 # --- the table of sentences -----------------------------------------------------------------------

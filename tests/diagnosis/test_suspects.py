@@ -75,10 +75,3 @@ def test_small_errors_that_explain_all_leave_suspects(small_ring):
     assert result.verdict == "distributed"
     assert result.suspects
     assert all(one.statistic >= 9 for one in result.suspects)  # three sigma, looked at alone
-
-
-def test_named_verdict_has_no_suspects(small_ring):
-    data = simulate(small_ring, [Cause("quadrupole_gradient", "QD::5", -0.05)], **SHOTS)
-    result = diagnose(small_ring, data.measurement())
-    assert result.verdict == "identified"
-    assert result.suspects == ()

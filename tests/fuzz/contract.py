@@ -203,8 +203,7 @@ def limit_memory():
 
 
 def forked(command, **options):
-    """In place of `subprocess.run` for the process that reads a file: a copy of this one, which
-    has its libraries already."""
+    """In place of `subprocess.run` for a process that reads a file: a fork of this one."""
     from tmlattice.lattice import binary_files
 
     if "input" not in options:  # another library's

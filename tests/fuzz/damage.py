@@ -1,5 +1,4 @@
-"""Damage to a file, by a seed: bytes, lines, sizes, names; types and values of JSON, YAML, MATLAB
-and HDF5; the structure of HDF5."""
+"""Damage to a file, by a seed: bytes, lines, sizes, names, types, values, structure."""
 
 import contextlib
 import io

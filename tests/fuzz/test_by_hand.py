@@ -273,7 +273,9 @@ def test_a_table_that_never_ends_is_not_read(folder, place, sealed):
 
 
 def test_streams_that_are_closed_take_no_file_s_place(folder):
-    command = f"'{sys.executable}' -P -m tmlattice simulate ring.json --shots 2 --out"
+    command = (
+        f"'{sys.executable}' -P -m tmlattice simulate ring.json --shots 2 --engine ocelot --out"
+    )
     for number, closed in enumerate((">&-", "<&- >&- 2>&-")):
         words = ["sh", "-c", f"{command} D{number} {closed}"]
         done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)

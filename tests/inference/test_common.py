@@ -1,10 +1,19 @@
-"""Patterns that the readings of a column have in common, against dense covariances."""
+"""Patterns in common, triangular factors and whitening, against dense algebra."""
 
 import numpy as np
 import pytest
 
 from tmlattice.inference.errors import LinearFit, Rows, cluster_robust_errors
-from tmlattice.inference.normal import amounts, common, normal_equations, times_precision
+from tmlattice.inference.normal import (
+    MAX_LAPACK,
+    amounts,
+    common,
+    inverse_of_lower,
+    lower_factor,
+    normal_equations,
+    times_precision,
+)
+from tmlattice.inference.whitening import inverse_root
 
 COLUMNS, MONITORS, ERRORS, PATTERNS = 6, 9, 3, 2
 
@@ -66,8 +75,7 @@ def test_most_probable_amounts(problem):
 
 
 def test_errors_of_clusters_are_those_of_fits_without_them(problem):
-    """Each column, and each monitor, is left out of a fit with dense covariances; the errors are
-    widened by how far these fits are from that of all, over what is expected of that."""
+    """Each column, and each monitor, is left out of a fit with dense covariances."""
     rows, weight, patterns, left = problem
     J, V, seen = dense(rows, weight, patterns)
     prior = np.eye(J.shape[1])
@@ -98,3 +106,45 @@ def test_errors_of_clusters_are_those_of_fits_without_them(problem):
         expected += np.maximum((shares * mismatch).sum(axis=0) / shares.sum(axis=0) - 1, 0)
     told = np.diag(covariance @ matrix @ covariance)
     np.testing.assert_allclose(sigma, np.sqrt(np.diag(covariance) + told * expected), rtol=1e-6)
+
+
+# --- triangular factors and their inverses, against numpy's ---------------------------------------
+@pytest.mark.parametrize("n", [1, 7, MAX_LAPACK, MAX_LAPACK + 1, 3 * MAX_LAPACK + 5, 431])
+def test_factor_and_inverse_are_numpys(n: int) -> None:
+    rows = np.random.default_rng(n).normal(size=(n, n + 20))
+    matrix = rows @ rows.T
+    factor = lower_factor(matrix.copy())
+    assert np.allclose(factor, np.linalg.cholesky(matrix), rtol=0, atol=1e-10 * n)
+    inverse = inverse_of_lower(factor)
+    assert (np.triu(inverse, 1) == 0).all()
+    assert np.allclose(inverse @ factor, np.eye(n), rtol=0, atol=1e-9)
+    assert np.allclose(inverse.T @ inverse, np.linalg.inv(matrix), rtol=0, atol=1e-9)
+
+
+def test_a_matrix_that_is_not_positive_is_an_error() -> None:
+    with pytest.raises(np.linalg.LinAlgError, match="not positive"):
+        lower_factor(np.diag([1.0, -1.0]))
+
+
+# --- the inverse root of a covariance: either way it is one, and both say the same ----------------
+@pytest.mark.parametrize("errors", [0, 1, 12, 40, 55])
+def test_a_root_whitens_its_covariance(errors):
+    rng = np.random.default_rng(errors)
+    spread = rng.normal(size=(errors, 40)) * 10.0 ** rng.uniform(-3, 3, (errors, 1))
+    covariance = np.eye(40) + spread.T @ spread
+    root = inverse_root(spread)
+
+    W = root.white(np.eye(40)).T
+    # the rounding of a covariance whose largest variance is 1e8
+    assert W @ covariance @ W.T == pytest.approx(np.eye(40), abs=1e-6)
+    rows = rng.normal(size=(3, 40))
+    assert root.back(rows) == pytest.approx(rows @ W)
+    assert root.log_scale == pytest.approx(-0.5 * np.linalg.slogdet(covariance)[1], rel=1e-9)
+
+
+def test_errors_that_repeat_one_another_are_one_direction():
+    one = np.random.default_rng(3).normal(size=30)
+    root = inverse_root(np.stack([one, one, -one]) * 100)
+    assert root.white(one) @ root.white(one) == pytest.approx(
+        one @ one / (1 + 3e4 * (one @ one)), rel=1e-6
+    )

@@ -1,5 +1,4 @@
-"""What readings leave known of small errors, from sums over rows: the same as with all signatures
-written out."""
+"""The posterior of small errors from sums over rows, as with all signatures written out."""
 
 import numpy as np
 import pytest
@@ -8,11 +7,7 @@ from numpy.testing import assert_allclose
 from tmlattice import Cause, simulate
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import background_rms, find
-from tmlattice.inference.distributed import (
-    DistributedErrors,
-    fit_distributed_errors,
-    posterior,
-)
+from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors, posterior
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe import response_problem
@@ -85,8 +80,7 @@ def test_sums_give_the_posterior_of_all_signatures(response, everywhere, monkeyp
 
 
 def test_nuisances_are_projected_out(small_ring, everywhere):
-    """First turns have a launch each; linear about the same launches, which the two ways settle
-    each in its own noise."""
+    """First turns have a launch each, which the two ways settle each in its own noise."""
     measured = simulate(small_ring, background=USUAL, machine_seed=5, shots=3, seed=3).measurement()
     turns = prepare(small_ring, measured, None, False, None, DEFAULT).problem
     usual = DistributedErrors.usual(everywhere, USUAL)

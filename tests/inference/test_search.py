@@ -46,8 +46,7 @@ def looks(monkeypatch):
 
 @pytest.mark.parametrize(("shot", "monitor"), [(1, 1), (0, 2), (2, 0)])
 def test_a_reading_of_a_metre_is_rejected_and_is_no_finding(ring, measured, looks, shot, monitor):
-    """Launches are spoilt by it, so that a scan about their fit takes it for a gain or a magnet; to
-    set the monitor aside and to name its gain took turns for ever."""
+    """It spoils launches, so that a scan takes it for a gain or a magnet, in turns for ever."""
     readings = measured.readings.copy()
     readings[shot, 0, monitor, 0] = 1.0
     found = diagnose(ring, replace(measured, readings=readings), holdout=0)

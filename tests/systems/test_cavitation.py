@@ -8,15 +8,7 @@ from scipy.integrate import solve_ivp
 
 from tmlattice.maps import right_hand_side, taylor_map_of_ode
 from tmlattice.maps.ode import OdeError
-from tmlattice.systems.cavitation import (
-    GENTLE,
-    READING,
-    STEPS,
-    Bubble,
-    damping_of,
-    ladder,
-    learn,
-)
+from tmlattice.systems.cavitation import GENTLE, READING, STEPS, Bubble, damping_of, ladder, learn
 
 
 def test_the_polynomial_form_is_rayleigh_plesset():

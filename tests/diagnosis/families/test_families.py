@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shared import small_steps
 
 from tmlattice.diagnosis.families.fields import (
     CorrectorPosition,
@@ -125,14 +126,11 @@ def test_straights_are_the_same_wherever_the_lattice_begins():
 
 
 def test_fields_that_the_iron_beside_them_draws_away_come_out_where_at_has_them(small_ring):
-    """v1 to v15 stand between a bend and QF, and are moved by 15 mm in AT, up or down; v0, between
-    a wiggler and QF, and the horizontal one stand so alone, have no number, and stay."""
+    """v1 to v15, between a bend and QF, are moved by 15 mm in AT; v0 stands alone and stays."""
     family, names = CorrectorPosition(), [f"v{i}" for i in range(1, 16)]
     for by in (0.015, -0.015):
-        measured = simulate_response(
-            small_ring, [Cause("corrector_position", name, by) for name in names],
-            kick=1e-5, noise=2e-8, rf_step=-3000.0, progress=False, seed=2,
-        ).measured  # fmt: skip
+        causes = [Cause("corrector_position", name, by) for name in names]
+        measured = small_steps(small_ring, causes, seed=2, engine="at")
         data = response_data(small_ring, measured)
         assert [list(own) for own in family.shares(data)] == [names]
         state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
@@ -143,10 +141,7 @@ def test_fields_that_the_iron_beside_them_draws_away_come_out_where_at_has_them(
 @pytest.mark.parametrize("by", [1.5e-3, -1.5e-3])
 def test_the_beams_energy_comes_out_as_at_has_it(small_ring, by):
     """AT's closed orbits at the RF frequency of that energy."""
-    measured = simulate_response(
-        small_ring, [Cause("energy_offset", None, by)],
-        kick=1e-5, noise=2e-8, rf_step=-3000.0, progress=False, seed=2,
-    ).measured  # fmt: skip
+    measured = small_steps(small_ring, [Cause("energy_offset", None, by)], seed=2, engine="at")
     data = response_data(small_ring, measured)
     state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
     (found,) = settle(allow(state, [EnergyOffset()])).values["energy"]
@@ -155,8 +150,7 @@ def test_the_beams_energy_comes_out_as_at_has_it(small_ring, by):
 
 @pytest.mark.parametrize("own", [0.0, 0.6, -0.6, -0.9])
 def test_a_corrector_that_kicks_across_is_turned(data, own):
-    """By a right angle where nothing is left in its plane, by more where less than nothing is; one
-    that kicks the other way, and mostly so in its plane, is reversed."""
+    """By a right angle where nothing is left in its plane, by more where the sign is reversed."""
     turned = CorrectorRoll()
     values = {CALIBRATION: np.zeros(18), turned: np.zeros(18)}
     values[CALIBRATION][4], values[turned][4] = own - 1, 0.8

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from shared import small_steps
 
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.diagnosis.families.steps import STEPS
@@ -12,7 +13,6 @@ from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.compared import ANOTHER, OfResponse
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
@@ -28,10 +28,7 @@ def measured(ring, focusing, defocusing=0.0):
               (focusing if e.k1 > 0 else defocusing) + 3e-3 * rng.standard_normal())
         for e in ring.elements if e.kind == "quadrupole"
     ]  # fmt: skip
-    return simulate_response(
-        ring, causes, kick=1e-5, noise=NOISE, rf_step=-3000.0, engine="ocelot", progress=False,
-        seed=1,
-    ).measured  # fmt: skip
+    return small_steps(ring, causes, noise=NOISE, seed=1)
 
 
 def begun(ring, data):

@@ -4,20 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import small_steps
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CorrectorCalibration, MonitorGain
-from tmlattice.diagnosis.response.common_factors import (
-    explain_gradients,
-    weighed,
-)
+from tmlattice.diagnosis.response.common_factors import explain_gradients, weighed
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
 from tmlattice.lattice.alike import families
 from tmlattice.lattice.supplies import magnets, supplied_alike
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -32,10 +29,7 @@ def explained(ring, shared, extra=(), seed=1):
         for name in ("QF", "QD")
         for i in range(16)
     ]
-    measured = simulate_response(
-        ring, [*causes, *extra], kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=seed,
-    ).measured  # fmt: skip
+    measured = small_steps(ring, [*causes, *extra], seed=seed)
     data = response_data(ring, measured)
     state = begin(data, split_columns(data, 0.2, np.random.default_rng(0)))
     return explain_gradients(settle(allow(state, [CorrectorCalibration(), MonitorGain(), SINGLE])))

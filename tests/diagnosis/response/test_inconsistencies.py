@@ -26,8 +26,7 @@ def gradients():
 
 
 def measured(ring, kicks, rf_step=-3000.0):
-    """Of a ring with gradient errors; kicks that add to the RF's orbit, and to the correctors' by
-    the energy, so many times the usual."""
+    """With gradient errors, and kicks that add to the RF's orbit so many times the usual."""
     read = simulate_response(
         ring, gradients(), kick=1e-5, noise=2e-8, rf_step=rf_step, engine="ocelot", progress=False
     ).measured

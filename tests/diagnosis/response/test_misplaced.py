@@ -1,16 +1,14 @@
 """Correctors that stand elsewhere than in the lattice."""
 
 import json
-from importlib.resources import files
 
-import jsonschema
 import numpy as np
 import pytest
+from shared import small_steps, valid
 
 from tmlattice import diagnose, load_ring
 from tmlattice.effects import Cause
 from tmlattice.lattice import save_ring
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -18,8 +16,7 @@ BY = 0.2
 
 
 def moved(ring, folder, name):
-    """The ring with a corrector that many metres further up, in the drift before the monitors
-    before it; that of v0 ends the ring."""
+    """The ring with a corrector BY metres upstream, in the drift before two monitors."""
     path = folder / f"{name}.json"
     save_ring(ring, path)
     content = json.loads(path.read_text())
@@ -43,9 +40,7 @@ def further_up(small_ring, tmp_path_factory):
 
 
 def measured_with(ring):
-    return simulate_response(
-        ring, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot", progress=False, seed=1
-    ).measured
+    return small_steps(ring, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -54,9 +49,7 @@ def measured_with(ring):
 def test_it_is_the_finding_whether_it_was_fitted_or_held_out(
     small_ring, further_up, name, by, held
 ):
-    """BPMs between the two places, and the lattice's first place. As a jump in its place the
-    corrector had left more than another kick elsewhere would, at the BPM between. Its step is
-    neither fitted nor used for validation."""
+    """BPMs stand between the two places; its step is neither fitted nor used for validation."""
     lattice, machine = small_ring, further_up[name]
     if by > 0:
         lattice, machine = machine, lattice
@@ -79,9 +72,7 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(
     assert one.s == lattice[name].s
     if name == "v5":  # the region of v0 goes over the ring's end
         assert one.where[0] < one.s < one.where[1]
-    document = found.as_json()
-    schema = json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
-    jsonschema.validate(json.loads(json.dumps(document)), schema)
+    document = valid(found.as_json(), "diagnosis")
     assert document["findings"][0]["to_check"].startswith("Check its position")
     assert f"LOCALISED: {one.words[0].upper()}{one.words[1:]}." in " ".join(found.report().split())
     assert not any("spurious kick" in message for message in found.warnings)
@@ -95,10 +86,9 @@ def test_it_is_the_finding_whether_it_was_fitted_or_held_out(
 def test_small_errors_beside_it_are_told_too_and_it_takes_nobody_s_place(small_ring, further_up):
     """Its statistic is large; `max_effects` counts what is fitted."""
     causes = [Cause("quadrupole_gradient", "QD::5", 0.03)]
-    measured = simulate_response(
-        further_up["v5"], causes, background={"quadrupole_gradient": 1e-3}, kick=1e-5, noise=2e-8,
-        rf_step=-3000.0, engine="ocelot", progress=False, seed=1,
-    ).measured  # fmt: skip
+    measured = small_steps(
+        further_up["v5"], causes, background={"quadrupole_gradient": 1e-3}, seed=1
+    )
     found = diagnose(small_ring, measured, max_effects=1, effects=["quadrupole_gradient"])
     assert found.verdict == "localised"
     assert [own.elements for own in found.findings if own.words] == [("v5",)]

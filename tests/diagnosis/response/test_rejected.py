@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import tmlattice
+from shared import gradients, small_steps
 
 from tmlattice import Cause, write_measurement
-from tmlattice.cli.command import tmlattice
 from tmlattice.lattice import save_ring
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.split import split_columns
 
@@ -21,21 +20,14 @@ BOTH, ONE, SWAPPED, CORRECTOR = "end_3", "end_8", "end_11", "v6"
 
 @pytest.fixture(scope="module")
 def day(ring_kicking_x, tmp_path_factory):
-    """A BPM that reads noise in both planes, one in y alone, one whose planes are swapped, and a
-    corrector whose orbit is noise, among usual errors."""
+    """A noisy BPM, one noisy in y alone, one with swapped planes, and a noisy corrector."""
     rng = np.random.default_rng(5)
     ring = ring_kicking_x("i % 2")
-    causes = [
-        Cause("quadrupole_gradient", e.name, 2e-3 * rng.standard_normal())
-        for e in ring.elements if e.kind == "quadrupole"
-    ]  # fmt: skip
+    causes = gradients(ring, 2e-3, rng)
     causes += [Cause("monitor_gain_x", m.name, 0.02 * rng.standard_normal()) for m in ring.monitors]
     causes += [Cause("monitor_gain_y", m.name, 0.02 * rng.standard_normal()) for m in ring.monitors]
     causes += [Cause("monitor_swap", SWAPPED, 1.0)]
-    measured = simulate_response(
-        ring, causes, kick=KICK, noise=1e-7, rf_step=-3000.0, engine="ocelot", progress=False,
-        seed=3,
-    ).measured  # fmt: skip
+    measured = small_steps(ring, causes, kick=KICK, noise=1e-7, seed=3)
     response, at = measured.response.copy(), measured.monitors.index
 
     def noise(part):
@@ -51,8 +43,7 @@ def day(ring_kicking_x, tmp_path_factory):
     words = ["diagnose", folder / "ring.json", folder / "day", "--lattice-out",
              folder / "found.json", "--json", folder / "found.diagnosis.json", "--effects",
              "quadrupole_gradient,monitor_gain_x,monitor_gain_y,monitor_swap"]  # fmt: skip
-    done = CliRunner().invoke(tmlattice, [str(word) for word in words])
-    assert done.exit_code == 0, done.output
+    tmlattice(*words, cwd=folder, check=0)
     return ring, measured, folder
 
 
@@ -60,8 +51,7 @@ def predicted(folder, name="found.json.calibration.json"):
     """{corrector: {monitor: (x, y)}}, m for KICK; NaN of empty fields."""
     words = ["predict", folder / "found.json", "--calibration", folder / name, "--kick", KICK,
              "--out", folder / "predicted.csv"]  # fmt: skip
-    done = CliRunner().invoke(tmlattice, [str(word) for word in words])
-    assert done.exit_code == 0, done.output
+    tmlattice(*words, cwd=folder, check=0)
     table = {}
     with (folder / "predicted.csv").open() as file:
         for row in csv.DictReader(file):
@@ -71,8 +61,7 @@ def predicted(folder, name="found.json.calibration.json"):
 
 
 def left(table, measured, columns):
-    """rms of what the prediction leaves of correctors in their plane, m; the kick of each is fitted
-    to every other BPM."""
+    """rms of in-plane residuals, m, after the kick of each is fitted to every other BPM."""
     squares = []
     for k in columns:
         p = "xy".index(measured.planes[k])

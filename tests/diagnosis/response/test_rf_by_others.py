@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.linear import linear
@@ -12,27 +13,16 @@ from tmlattice.diagnosis.response.rf_by_others import rf_by_others
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.diagnosis.response.weights import taken, weight
-from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
-from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Predicted
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
 
 
 @pytest.fixture(scope="module")
 def settled(small_ring):
     rng = np.random.default_rng(4)
-    causes = [
-        Cause("quadrupole_gradient", e.name, 3e-3 * rng.standard_normal())
-        for e in small_ring.elements if e.kind == "quadrupole"
-    ]  # fmt: skip
-    measured = simulate_response(
-        small_ring, causes, kick=1e-5, noise=2e-8, rf_step=-3000.0, engine="ocelot",
-        progress=False, seed=1,
-    ).measured  # fmt: skip
-    data = response_data(small_ring, measured)
-    split = split_columns(data, 0.2, np.random.default_rng(1))
+    causes = gradients(small_ring, 3e-3, rng)
+    measured = small_steps(small_ring, causes, seed=1)
+    data, split = parted(small_ring, measured, 1)
     *_, (_, state) = one_by_one(begin(data, split), STEPS[:3])
     return state
 

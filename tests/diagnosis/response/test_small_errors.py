@@ -1,12 +1,12 @@
 """Among small errors that nobody has stated a fault is named, and without one none is."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import machine_data
 import numpy as np
 import pytest
+from shared import measured_data
 
 from tmlattice import diagnose, load_ring
 from tmlattice.challenge.make import evenly
@@ -43,8 +43,7 @@ def test_a_fault_is_named_although_nobody_states_the_small_errors(small_ring, fa
 
 
 def test_rivals_are_weighed_among_small_errors_without_the_fault(small_ring):
-    """What small errors took up of the fault before it was found made the magnet beside the
-    sextupole lead (14 to 1); about what they are beside it the sextupole leads."""
+    """Small errors fitted before the fault had made a neighbouring magnet lead, 14 to 1."""
     fault = Cause("gradient_absolute", "sf::6", 0.03)
     (finding,) = diagnose(small_ring, measured(small_ring, [fault], seed=3)).findings
     assert (finding.effect, finding.element) == (fault.effect, fault.element)
@@ -61,8 +60,7 @@ def test_an_exchanged_monitor_has_no_small_errors_of_what_it_exchanged(small_rin
 
 @pytest.mark.parametrize("amount", [-1.0, 2.0])
 def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_ring, amount):
-    """Four are set: the one that is far off made their family as large as itself, and one that does
-    not kick left nothing about which its error was linear."""
+    """Four are set: the one that is far off had made their scale as large as itself."""
     fault = Cause("corrector_calibration", "v5", amount)
     settings = [{name: {"kick": 3e-4} for name in ("v2", "v5", "v9", "v12")}, {}] * 3
     found = diagnose(small_ring, measured(small_ring, [fault], settings=settings))
@@ -73,8 +71,7 @@ def test_one_of_few_correctors_does_not_hide_in_the_size_that_it_makes(small_rin
 
 
 def test_noise_that_nobody_states_is_not_taken_for_what_neighbours_leave(small_ring):
-    """Errors between neighbouring monitors are alike in all shots, noise is not: neighbours leave 8
-    to 14 times the noise here, from four shots 1 to 4 times of it is learnt."""
+    """Neighbours leave 8 to 14 times the noise, alike in all shots; up to 5 may be estimated."""
     known = measured(small_ring, [])
     found = diagnose(small_ring, replace(known, noise=None))
     assert found.priors
@@ -85,15 +82,10 @@ def test_noise_that_nobody_states_is_not_taken_for_what_neighbours_leave(small_r
     assert any(told in warning for warning in found.warnings)
 
 
-@pytest.mark.parametrize(
-    ("deck", "options", "seed"),
-    [("thomx.m", {}, 0), ("dba.mat", {"monitors": "M,DR_03*", "correctors": "DR_04,SF"}, 1)],
-)
-def test_orbits_far_off_in_sextupoles_are_no_fault(deck, options, seed):
-    """Millimetres: the model is linear only about the errors that there are, not about the first
-    estimate of them. Rolls of bends were named, at 0.24 and 0.99."""
-    ring = load_ring(Path(machine_data.__file__).parent / deck, **options)
-    found = diagnose(ring, simulate_turns(ring, background=ALL, amplitude=1e-3, seed=seed).measured)
+def test_orbits_far_off_in_sextupoles_are_no_fault():
+    """Orbits of millimetres: the model is linear only about the errors that there are."""
+    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
+    found = diagnose(ring, simulate_turns(ring, background=ALL, amplitude=1e-3, seed=0).measured)
     assert (found.verdict, found.findings) == ("distributed", ())
 
 
@@ -128,15 +120,11 @@ def test_a_fault_of_a_response_is_named_among_usual_errors(small_ring, fault):
     assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
 
 
-DECK = Path(os.environ.get("TMLATTICE_DATA") or "nowhere") / "public_decks" / "elena_m.madx"
-
-
-@pytest.mark.skipif(not DECK.is_file(), reason="TMLATTICE_DATA has no public_decks/elena_m.madx")
 @pytest.mark.filterwarnings("ignore:.*have no value")
 def test_a_usual_error_of_an_effect_without_a_family_is_no_fault():
-    """The six bends of 60 degrees focus by their fields' errors: one of 1.3 of their scatter was
-    named at 0.999."""
-    ring = load_ring(DECK, monitors="lnr.mccay.*_half::0")
+    """Six bends of 60 degrees focus by their fields' errors: 1.3 of the scatter was named."""
+    deck = measured_data("public_decks", "elena_m.madx")
+    ring = load_ring(deck, monitors="lnr.mccay.*_half::0")
     data = simulate_response(ring, background=ALL, seed=1, progress=False).measured
     found = diagnose(ring, data)
     assert (found.verdict, found.findings) == ("distributed", ())

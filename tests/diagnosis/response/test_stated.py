@@ -1,12 +1,10 @@
-"""What a prior knows of a number is no measurement of it: ThomX, where single magnets are weak."""
+"""What a prior knows of a number is no measurement of it; remainders have chi-square 1."""
 
-import json
-from importlib.resources import files
 from pathlib import Path
 
-import jsonschema
 import machine_data
 import pytest
+from shared import valid
 
 from tmlattice import Cause, diagnose, load_ring
 from tmlattice.machine import draw_background
@@ -59,9 +57,7 @@ def test_what_is_not_determined_is_printed_as_that_and_not_as_a_value(found):
 
 
 def test_shares_are_beside_every_amount_of_the_json(found):
-    document = json.loads(json.dumps(found.as_json()))
-    schema = json.loads(files("tmlattice").joinpath("schemas/diagnosis.schema.json").read_text())
-    jsonschema.validate(document, schema)
+    document = valid(found.as_json(), "diagnosis")
     shares = {(own["effect"], own["element"]): own["share_from_data"] for own in document["errors"]}
     assert all(0 <= share <= 1 for share in shares.values())
     # monitors' gains are measured by every corrector; a corrector that is held out by none
@@ -81,3 +77,35 @@ def test_pulls_of_gradients_are_of_order_one(found, causes):
     ]
     assert len(pulls) == 24
     assert max(map(abs, pulls)) < 4
+
+
+# --- the remainder of a fit of an orbit response against what the fit predicts of the readings ----
+SMALL = {"quadrupole_gradient": 2e-3, "monitor_gain_x": 0.02, "monitor_gain_y": 0.02,
+         "corrector_calibration": 0.04}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def remainders(small_ring):
+    """Blocks of three machines whose errors are all of families that are fitted."""
+    found = []
+    for seed in (1, 2, 3):
+        data = simulate_response(
+            small_ring, background=SMALL, engine="ocelot", progress=False, seed=seed
+        ).measured
+        found.append(diagnose(small_ring, data, effects=list(SMALL)).compared)
+    return found
+
+
+@pytest.mark.parametrize("name", ["fitted, in-plane", "held-out, in-plane", "held-out, RF"])
+def test_chi_square_per_degree_of_freedom_is_one(remainders, name):
+    """In all about 1100, 300 and 50 degrees of freedom: 1 within four standard errors."""
+    own = [block for blocks in remainders for block in blocks if block.name == name]
+    chi2, freedom = sum(block.chi2 for block in own), sum(block.freedom for block in own)
+    assert chi2 / freedom == pytest.approx(1, abs=4 * (2 / freedom) ** 0.5)
+
+
+def test_fitted_numbers_are_no_degrees_of_freedom(remainders):
+    for blocks in remainders:
+        fitted = next(block for block in blocks if block.name == "fitted, in-plane")
+        readings = 14 * 35
+        assert 0.5 * readings < fitted.freedom < readings - 30
