@@ -50,12 +50,7 @@ def is_private(state: os.stat_result) -> bool:
 
 
 def private_or_warn(place: Path, variable: str = "TMLATTICE_CACHE") -> bool:
-    """`is_private`, of a folder that is there and no link; a warning where it is not.
-
-    Args:
-        place: the folder.
-        variable: of the environment, which names another one.
-    """
+    """`is_private`, of a folder that is there and no link; a warning where it is not."""
     state = os.lstat(place)
     if stat.S_ISDIR(state.st_mode) and is_private(state):
         return True
@@ -128,10 +123,6 @@ def key(*parts: object) -> str:
 
 def load(name: str, read: Callable[[bytes], Value]) -> Value | None:
     """The entry of a key, as `read` makes it of its bytes.
-
-    Args:
-        name: of `key`.
-        read: raises where the bytes are not what it expects.
 
     Returns:
         None where there is no entry, or a damaged one.

@@ -92,11 +92,6 @@ def zip_of(path: Path, error: type[TmlatticeError], wanted: str) -> BytesIO:
     """The content of a ZIP archive (NumPy's and torch's arrays) whose parts are not compressed,
     so that together they are as large as the file.
 
-    Args:
-        path: the file.
-        error: raised.
-        wanted: what it should hold, and where that is from.
-
     Raises:
         error: as of `content_of`, no archive, or compressed parts.
     """
@@ -117,12 +112,6 @@ def zip_of(path: Path, error: type[TmlatticeError], wanted: str) -> BytesIO:
 
 def check_no_code(file: Path, lattice: str, error: type[TmlatticeError], instead: str) -> None:
     """Whether a lattice that a file of data names is data too.
-
-    Args:
-        file: names it.
-        lattice: a built-in name or a path.
-        error: raised.
-        instead: how a user who trusts it has it run.
 
     Raises:
         error: it is Python code.
@@ -151,8 +140,6 @@ def json_of(path: Path, error: type[TmlatticeError], finite: bool = True) -> Any
     """The value of a JSON file.
 
     Args:
-        path: the file.
-        error: raised.
         finite: whether NaN and Infinity, which are no JSON, are refused.
 
     Raises:
@@ -205,11 +192,7 @@ def _whole(digits: str) -> int:
 
 
 def number(text: str) -> float:
-    """A number of a table, also one with an exponent of Fortran, such as `1.5D-3`.
-
-    Raises:
-        ValueError: it is none; `1_000`, which Python takes for one, is none either.
-    """
+    """A number of a table, also one with an exponent of Fortran, such as `1.5D-3`."""
     return float(_FORTRAN.sub("e", text.replace("_", "?")))
 
 

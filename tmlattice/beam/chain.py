@@ -52,8 +52,6 @@ def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Arra
 
     Args:
         turn: one-turn matrix, [n, n].
-        free: free coordinates of the start.
-        rows: coordinates that should repeat, as many.
 
     Raises:
         UnstableRingError: the matrix is singular.
@@ -69,11 +67,7 @@ def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Arra
 def first_pass(
     weights: tuple[Array, Array, Array], maps: RingMaps, start: Array
 ) -> tuple[Array, Array]:
-    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane] of a pass.
-
-    Raises:
-        BeamLostError: names the layer where a trajectory was lost.
-    """
+    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane] of a pass."""
     W0, W1, W2 = weights
     size = sweeps.size_of(start.shape[1], len(start))
     packed = sweeps.pack(start, len(size[1]))
@@ -251,9 +245,6 @@ class Chain(LayerChain):
     Layer k sends the state x at the exit of magnet k - 1 to W0[k] + W1[k] x + W2[k] x^[2] at the
     exit of magnet k. States are OCELOT's (x, px, y, py), or (x, px, y, py, tau, p), in m and units
     of the reference momentum.
-
-    Args:
-        maps: weights and read-outs of a ring.
     """
 
     def __init__(self, maps: RingMaps) -> None:
@@ -277,12 +268,7 @@ class Chain(LayerChain):
         return self.maps.W0, self.maps.W1, self.maps.W2
 
     def readings(self, launch: ArrayLike) -> Array:
-        """Return (x, y) at every monitor on one pass, [batch, monitor, 2], m.
-
-        Raises:
-            BeamLostError: names the layer where a trajectory was lost.
-            ValueError: a launch of another shape.
-        """
+        """Return (x, y) at every monitor on one pass, [batch, monitor, 2], m."""
         start = self._start(launch)
         _, readings = first_pass(self.weights(), self.maps, start)
         return sweeps.unpack(readings, len(start))

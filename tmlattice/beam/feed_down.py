@@ -18,7 +18,6 @@ def feed_down(
     exit, [layer + 2, n, n, n], da the last axis.
 
     Args:
-        model: closed orbit, maps and matrices.
         back, into: matrices from the layers' exits to the start and from there into the layers, of
             the motion around the closed orbit, [layer + 2, n, n].
     """

@@ -31,11 +31,8 @@ def orbits_of_kicks(
     """Closed orbit for a kick of 1 rad behind each of some magnets, m, [place, source].
 
     Args:
-        model: of the ring.
-        sources: magnets.
         exits: number of magnets before each place, [place].
         rows: d orbit / d state there, [place, n].
-        plane: of the kicks.
     """
     behind = np.asarray(sources) + 1
     kick = np.zeros((len(behind), model.dimension))
@@ -53,8 +50,6 @@ def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
     share, which changes the energy of the step.
 
     Args:
-        model: of the ring, six coordinates.
-        step: relative, of the frequency.
         plane: 0 or 1.
     """
     rows = model.reading_slopes[:, plane]
@@ -70,8 +65,6 @@ def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, pla
     in a plane, m per relative energy, [layer, source].
 
     Args:
-        model: of the ring, six coordinates.
-        layers: indices.
         plane: 0 or 1.
     """
     behind = np.asarray(layers) + 1
@@ -108,8 +101,6 @@ def by_energy(
     monitors.
 
     Args:
-        model: of the ring, six coordinates.
-        names: of the correctors.
         at: indices of the monitors among the ring's, [monitor].
         at_monitors: the RF's orbit over the energy of its step in the model, m, [monitor, 2].
         at_correctors: in the plane of each, m per relative energy, [corrector].

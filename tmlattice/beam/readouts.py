@@ -61,7 +61,6 @@ def positions(
     Args:
         launches: [shot, n].
         turns: at least 1.
-        layers: of the turn.
         cavities: in six coordinates; none on a single turn.
         aperture: m.
     """

@@ -51,10 +51,6 @@ def derivatives(
     Yields:
         For each hypothesis [corrector + 1, monitor, 2]: m/rad per unit for the correctors; and in
         the last row the RF's, m per relative step per unit, 0 in four coordinates.
-
-    Raises:
-        EffectError: an effect that does not act on the ring.
-        UnknownNameError, MeasurementError: see `ResponseModel.columns`.
     """
     slopes = ResponseSlopes(model, correctors)
     return map(slopes.whole, slopes.factors(hypotheses))
@@ -122,7 +118,6 @@ class ResponseSlopes:
 
         Args:
             hypotheses: see `factors`.
-            at: indices of the monitors.
             plane: of each column's readings, the RF's last, [column].
         """
         parts = []

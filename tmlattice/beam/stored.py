@@ -79,9 +79,6 @@ class StoredBeam:
         tunes: Q of the modes that are nearer to x and to y, in [0, 1).
         modes: their vectors at the monitors, [monitor, 2, mode]: the beam is at
             Re(sum_mode a E exp(2 pi i Q turn)), a any complex number.
-
-    Raises:
-        UnstableRingError: the beam does not oscillate.
     """
 
     def __init__(self, model: ResponseModel, rf: Cavities = NO_RF) -> None:

@@ -73,9 +73,6 @@ class TrackedShots:
     sets the frequency: see `rf`. On one turn cavities are drifts.
 
     Args:
-        ring: the design.
-        settings: of each shot.
-        turns: of each shot.
         known: causes that are no hypotheses (radiation, if asked for).
         dimension: 6; 4 if no cause changes the energy.
         active: shots in which causes act; the others are of the ring without, [shot].
@@ -85,9 +82,6 @@ class TrackedShots:
         groups: shots with equal settings.
         steps: of a turn.
         where: index of the state of each reading, [reading].
-
-    Raises:
-        LatticeError: an RF that cannot replace the loss.
     """
 
     def __init__(
@@ -211,7 +205,6 @@ class TrackedShots:
 
         Args:
             launches: (x, px, y, py, delta), [shot, 5].
-            causes: of all three kinds.
             kicks: by layer, in the middle of its magnet, for each shot, [shot, 2], rad.
         """
         return self._read(self.beam(launches, causes, kicks), self._monitors(causes))

@@ -213,11 +213,6 @@ def case_names(folder: Path) -> list[str]:
 def check_lattice(place: Path, lattice: Any, trusted: str | None) -> str:
     """Return a challenge's lattice, if loading it runs only code that the caller trusts.
 
-    Args:
-        place: file with the name, for the error.
-        lattice: a built-in name or a path.
-        trusted: the lattice whose code may be run.
-
     Raises:
         TmlatticeError: Python code that is not trusted, or no name.
     """

@@ -271,13 +271,7 @@ def _seed(folder: Path) -> int | None:
 
 
 class CaseDraw:
-    """One case, drawn from its own random numbers.
-
-    Args:
-        asked: settings of the challenge.
-        number: of the case.
-        reference: with a measurement from before the fault.
-    """
+    """One case, drawn from its own random numbers."""
 
     def __init__(self, asked: CaseSettings, number: int, reference: bool = False) -> None:
         self.asked, self.ring, self.number = asked, asked.ring, number

@@ -80,12 +80,7 @@ def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
 
 
 def refitted(case: Case, truth: Truth, given: Sequence[Cause] = ()) -> Refitted:
-    """Return the hypotheses about a case, the leading ones refitted.
-
-    Args:
-        case, truth: both parts of it.
-        given: known causes.
-    """
+    """Return the hypotheses about a case, the leading ones refitted."""
     problem = problem_of_case(_without_dead(case, truth), truth.background, given)
     start = fit(problem, (), problem.first)
     hypotheses = hypotheses_of(case, problem)

@@ -247,8 +247,7 @@ def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
 
 def _class(result: Mapping[str, Any]) -> Row | None:
     """Equivalent explanations of a single finding: effects, number of elements, and the proposed
-    next shot: whether it changes a setting, and its separation.
-    """
+    next shot: whether it changes a setting, and its separation."""
     if len(result["findings"]) != 1 or len(result["findings"][0]["credible_set"]) < 2:
         return None
     members = result["findings"][0]["credible_set"]

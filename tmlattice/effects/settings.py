@@ -15,7 +15,6 @@ def groups(
 
     Args:
         settings: one for each shot; None or empty: the design's for all.
-        shots: number of shots.
 
     Raises:
         ValueError: the numbers of settings and shots differ.

@@ -174,10 +174,8 @@ def first_turn_of(
     """Return the first turn of a ring with noise, its launches exact.
 
     Args:
-        machine: the ring.
         launches: [shot, 4], m and rad.
         noise: rms of a reading, m; at least `NOISE_FLOOR` is stated.
-        random: of the noise.
     """
     truth = TaylorNetwork.from_ring(machine)
     readings = truth.readings(launches)
@@ -310,16 +308,7 @@ def fit_and_track(
     shown: int = 0,
     **options: Any,
 ) -> MethodFit:
-    """Return one method's fit, its tunes, and its residual.
-
-    Args:
-        name: of the method.
-        network: the design.
-        measurement: in the order of its monitors, with noise.
-        turns: tracked for the tunes.
-        shown: the shot whose readings are kept.
-        options: of `fine_tune`.
-    """
+    """Return one method's fit, its tunes, and its residual."""
     read, noise = measurement.readings[:, 0], measurement.noise
     assert noise is not None
     begun = time.perf_counter()
@@ -364,10 +353,6 @@ def network_tunes(network: NetworkChain, launch: Array, turns: int) -> tuple[Arr
     Returns:
         Fractions (x, y) [2]; the states they come from, [1, turns + 1, n], fewer where the motion
         grew; the growth of the amplitude in a turn, 1 for a symplectic network.
-
-    Raises:
-        UnstableRingError: no closed orbit, or no tune.
-        TooFewTurnsError: the motion grew too fast.
     """
     optics = one_turn_optics(network)
     first = (optics.closed_orbit + TUNE_AMPLITUDE * launch)[None]

@@ -40,8 +40,6 @@ def with_noise(
     """Return the first turn with noise for every reading, and whether some of it is estimated.
 
     Args:
-        ring: the design.
-        measurement: in the order of its monitors.
         dimension: 4 or 6.
 
     Raises:
@@ -113,11 +111,7 @@ class FreeLaunches:
         return step
 
     def fitted(self, network: NetworkChain, start: Array | None = None, steps: int = 4) -> Array:
-        """Return the best launches for a network, [shot, n].
-
-        Raises:
-            BeamLostError: the beam is lost in it.
-        """
+        """Return the best launches for a network, [shot, n]."""
         launches = self.nominal if start is None else start
         if not self.sigma.any():
             return launches

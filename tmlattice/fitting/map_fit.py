@@ -83,11 +83,9 @@ def most_probable(
     """Return the most probable changes, and their covariance.
 
     Args:
-        problem: of the design.
         hypotheses: (effect, magnet).
         amounts: first guess, [magnet].
         rms: of the prior, [magnet].
-        learn: multiply it by the factor of the largest marginal likelihood.
     """
     chi2, nuisances = list[float](), problem.first
     while True:
@@ -130,17 +128,13 @@ def fit_map(
     """Fit a measurement's first turn by the most probable changes under a prior.
 
     Args:
-        network: the design.
-        measurement: at least one shot.
         ring: of the network; None: the network's own `ring`.
         prior: of the changes, see `Prior`.
-        kinds: of magnets that may have changed.
         scale: rms of the prior, in %; None: 0.01 % for faults, else that of the largest marginal
             likelihood.
         noise: rms of one reading, m; else the measurement's.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
             exact; inf: unknown; None: the measurement's own.
-        progress: ignored, as in every method.
 
     Returns:
         The network of the most probable ring, its tunes, and their standard error by the posterior

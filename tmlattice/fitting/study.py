@@ -147,17 +147,9 @@ def run_case(
     """Return one case; a failed fit has its error message in the case.
 
     Args:
-        ring: the design.
-        magnet: name, or name+name.
-        method: one of `METHODS`.
-        change: relative, of each magnet.
         launch: of the first shot; the others are the same turned by pi / shots each, in both
             planes.
-        shots: trajectories.
         noise: rms of one reading, m.
-        turns: tracked for Adam's tunes.
-        seed: of the noise.
-        recipe: options of Adam.
     """
     names = magnet.split("+")
     s = ring[names[0]].s
@@ -303,17 +295,12 @@ def study_tune_fit(
 
     Args:
         lattice: name or path; every worker loads it.
-        methods: some of `METHODS`.
         magnets: number of magnets, evenly spread; None: all.
         kind: quadrupole, sextupole, or pair (of quadrupoles).
         seeds: noises for each magnet and method, seed, seed + 1, ...
-        seed: the first.
         scheduler: address of a Dask scheduler; None: local processes.
         jobs: local processes; 1: this one; else one a core.
-        folder: where every case is written as it ends, and read from when the study goes on.
         sequence, energy, monitors, correctors, particle: see `load_ring`.
-        progress: show a bar on a terminal.
-        options: of `run_case`.
 
     Returns:
         The cases. A failed one has its error message; one whose worker failed is tried again when

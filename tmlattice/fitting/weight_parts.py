@@ -65,7 +65,6 @@ def layer_effects(ring: Ring, dimension: int = 4) -> LayerEffects:
     """Return directions of all usual effects that act through one layer and change no read-out.
 
     Args:
-        ring: the design.
         dimension: of the network, 4 or 6.
     """
     chosen = [name for name in names() if isinstance(CATALOGUE[name], RingEffect)]

@@ -64,7 +64,6 @@ class AtEngine:
     magnet.
 
     Args:
-        ring: the design.
         causes: errors; those on readings (`monitor_*`) and on the beam (`energy_offset`,
             `energy_spread`) are ignored here.
         radiation_bends, radiation_wigglers: scale of the expected energy loss, 0: none, 1: as
@@ -210,15 +209,8 @@ class AtEngine:
         at non-zero dispersion shifts it. The ring's loss is replaced at its end. Broyden's method
         starts from the unset ring's Jacobian.
 
-        Args:
-            settings: one mapping an orbit, as in `track`.
-
         Returns:
             (x, y) in m, [orbit, monitor, 2].
-
-        Raises:
-            LatticeError, UnknownNameError: see `track`.
-            UnstableRingError: no closed orbit is found.
         """
         start, solve = self._stored
         readings = np.empty((len(settings), len(self._monitors), 2))
@@ -266,9 +258,7 @@ class AtEngine:
         lost, [monitor].
 
         Args:
-            line: of `stored_line`.
             beam: the particles, [6, particle]; they are moved.
-            turns: number of turns.
         """
         block = max(TURNS_AT_ONCE // (beam.shape[1] * len(self._monitors)), 1)
         for turn in range(0, turns, block):
@@ -371,8 +361,6 @@ def to_at(launches: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> 
 
     Args:
         launches: [..., 6].
-        energy: of the reference particle, GeV.
-        mass: its rest energy, GeV.
     """
     launches = np.asarray(launches, dtype=float)
     rest = 1e9 * mass

@@ -34,7 +34,6 @@ def closed(turn: Turn, start: Array, free: Sequence[int], late: float = 0.0) -> 
     """Find the state that returns to itself: free coordinates by Newton's method, others given.
 
     Args:
-        turn: of the line.
         start: near it, [6].
         free: free coordinates, which return: (0, 1, 2, 3) at a given energy, all six with the RF.
         late: excess of a turn over the RF's, m.

@@ -49,15 +49,7 @@ def turns_of(
     it. Lost particles no longer count; the beam is lost (NaN) with half of them.
 
     Args:
-        engine: the ring.
         kicked: change of x, px, y, py by the kick at the start of the ring, m and rad, [4].
-        turns: number of turns.
-        settings: of the shot.
-        beam: its particles.
-        random: of the particles.
-
-    Raises:
-        UnstableRingError: no closed orbit, or no stable motion.
     """
     line, with_rf, late = engine.stored_line(settings)
     state = _orbit(engine, line, late)
@@ -74,11 +66,7 @@ def turns_of(
 
 
 def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
-    """Return tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode].
-
-    Raises:
-        UnstableRingError: no closed orbit, or no tune.
-    """
+    """Return tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode]."""
     line, _, late = engine.stored_line(settings)
     state = _orbit(engine, line, late)
     turn = functools.partial(engine.one_pass, line)

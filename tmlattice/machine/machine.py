@@ -49,12 +49,7 @@ class Errors:
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def every(self) -> list[Cause]:
-        """Return all errors, those of the background first.
-
-        Raises:
-            EffectError, UnknownNameError: an error that the ring cannot have.
-            LatticeError: a ring without monitors.
-        """
+        """Return all errors, those of the background first."""
         causes = [*draw_background(self.ring, self.background, self.machine_seed), *self.causes]
         need_monitors(self.ring)
         check(self.ring, causes)
@@ -92,11 +87,7 @@ def errors(
     machine_seed: int | None,
     **more: Any,
 ) -> Errors:
-    """Return the errors of a machine, as the arguments of a simulation state them.
-
-    Raises:
-        EffectError, UnknownNameError: a background that is unknown.
-    """
+    """Return the errors of a machine, as the arguments of a simulation state them."""
     return Errors(
         ring=ring,
         causes=tuple(causes),

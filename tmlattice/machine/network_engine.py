@@ -24,10 +24,6 @@ class NetworkEngine:
 
     States are AT's (x, px, y, py, delta, ct), as `AtEngine`'s. The RF acts once a turn, at its end.
 
-    Args:
-        ring: the design.
-        causes: those on readings or on the launch are ignored here.
-
     Raises:
         EffectError: a cause by which the beam loses energy.
     """

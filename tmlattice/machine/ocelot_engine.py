@@ -22,13 +22,7 @@ class OcelotEngine:
     Over many turns the RF replaces the design orbit's loss: see `beam.rf`.
 
     Args:
-        ring: the design.
-        causes: those on readings or on the launch are ignored here.
-        radiation_bends, radiation_wigglers: scale of the expected energy loss.
         voltage, harmonic: of the RF, see `rf_of`.
-
-    Raises:
-        LatticeError: an RF too weak for the loss.
     """
 
     name = "ocelot"

@@ -73,8 +73,6 @@ def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> T
     """Return the second-order map of elements in beam order: a layer, with the drifts before it.
 
     Args:
-        elements: any, in beam order.
-        energy: GeV.
         dimension: 4 or 6.
     """
     way = identity(dimension)

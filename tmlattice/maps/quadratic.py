@@ -79,12 +79,7 @@ def _stacked(maps: Sequence[Quadratic], n: int) -> tuple[Array, Array, Array]:
 
 
 def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
-    """Return the sum of maps with signs, over a step: a derivative by differences.
-
-    Args:
-        ends: signs and maps, at least one.
-        step: distance of the ends.
-    """
+    """Return the sum of maps with signs, over a step: a derivative by differences."""
     signs, maps = zip(*ends, strict=True)
 
     def total(arrays: Iterable[Array | None]) -> Array | None:
@@ -342,7 +337,6 @@ def halves_without_sextupole(element: Element, energy: float, n: int) -> list[Qu
 
     Args:
         element: with a length; its `errors` are ignored.
-        energy: GeV.
         n: coordinates, 4 or 6.
     """
     from tmlattice.lattice.ocelot import SecondTM, TMTypes

@@ -45,9 +45,6 @@ def readings_of(
 
     Args:
         x, y: [*axes, monitor], of which the first axes may be absent; None: not read.
-        monitors: names.
-        axes: of the result, before the monitor.
-        unit: of x and y.
 
     Raises:
         MeasurementError: another shape, another number of monitors, or neither x nor y.

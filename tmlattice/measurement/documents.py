@@ -23,13 +23,6 @@ def read_document(
 ) -> dict[str, Any]:
     """A JSON file of the format `name`, as its schema has it.
 
-    Args:
-        path: the file.
-        schema: file name in `tmlattice/schemas`, without `.schema.json`.
-        name: what `format` has to be.
-        version: the one that can be read.
-        first: looks before the schema does, which takes its time over long lists.
-
     Raises:
         MeasurementError: no such file, not UTF-8, not JSON (with the line), another format or
             version, or not as the schema has it (with the place).

@@ -35,9 +35,6 @@ def to_dataframe(measured: AnyMeasurement) -> Any:
     a closed orbit; step, monitor, x, y of a dispersion measurement; corrector, monitor, x, y, kick
     (rad; Hz of the rows of "rf"), plane of an orbit response; shot, quantity, value, error of
     tunes. The rest stands in `attrs`: `from_dataframe` reads an equal measurement back.
-
-    Raises:
-        MeasurementError: a reading above 0.2 m.
     """
     import pandas as pd
 

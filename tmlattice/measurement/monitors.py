@@ -32,10 +32,6 @@ HIGHEST_ENERGY = 1e6
 class Names:
     """Places by name.
 
-    Args:
-        kind: what they are names of, for the errors.
-        names: each once.
-
     Raises:
         MeasurementError: an empty name, one with a line break, or the same name twice.
     """
@@ -94,7 +90,6 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
     Args:
         noise: a pair (x, y) for all monitors, an array [monitor, 2], a mapping of pairs by
             monitor, or None; m, NaN where unknown.
-        monitors: their names.
 
     Returns:
         [monitor, 2], m, NaN where unknown; None where nothing is.
@@ -229,11 +224,7 @@ def shot_places(shots: Sequence[int], wanted: Sequence[int]) -> list[int]:
 
 
 def places_of(kind: str, known: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Where the wanted monitors, or correctors, stand among the known ones.
-
-    Raises:
-        UnknownNameError: one that is not there.
-    """
+    """Where the wanted monitors, or correctors, stand among the known ones."""
     names = Names(kind, known)
     return [names[name] for name in wanted]
 

@@ -54,10 +54,6 @@ class Rows:
     def check(self, *keys: str, metres: bool = True) -> None:
         """No row stands twice, no turn is negative, no reading is in millimetres.
 
-        Args:
-            keys: the columns by which a row is known.
-            metres: the numbers are readings.
-
         Raises:
             MeasurementError: with the line.
         """
@@ -92,7 +88,6 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
 
     Args:
         path: a CSV file in UTF-8.
-        header: names of its columns, in their order.
         optional: where given, the columns may be in any order and case, those named here may be
             absent, and others are passed over.
 

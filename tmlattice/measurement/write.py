@@ -127,12 +127,7 @@ def write_response_table(
     """Write orbit changes as the table of an orbit response's folder.
 
     Args:
-        path: the file.
-        monitors: names.
         orbits: a corrector's name, or "rf", and its orbit change, m, [monitor, 2].
-
-    Raises:
-        MeasurementError: an orbit change that no reader would take (above 0.2 m).
     """
     with path.open("w", encoding="utf-8", newline="") as file:
         write = csv.writer(file, lineterminator="\n").writerow

@@ -60,11 +60,6 @@ class NetworkChain(torch.nn.Module, LayerChain):
         return np.asarray(self._launch(launch).detach().cpu().numpy())
 
     def readings(self, launch: ArrayLike | Tensor) -> Array:
-        """Return (x, y) at every monitor on one pass as an array, [batch, monitor, 2], m.
-
-        Raises:
-            BeamLostError: names the layer where a trajectory was lost.
-            ValueError: a launch of another shape.
-        """
+        """Return (x, y) at every monitor on one pass as an array, [batch, monitor, 2], m."""
         with torch.no_grad():
             return np.asarray(self(launch).cpu().numpy())

@@ -58,8 +58,6 @@ def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
     """Return states [batch, turns + 1, n] at the start of every turn, from launch [batch, n].
 
     Args:
-        launch: on the card.
-        w: all layers of the turn, as `reference.packed`.
         turns: at least 1.
     """
     n = launch.shape[1]

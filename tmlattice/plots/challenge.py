@@ -15,7 +15,6 @@ def plot_confusion(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:
     """Draw the confusion matrix: the share of each first effect of the diagnosis, by true effect.
 
     Args:
-        result: of `score`, tier A or B.
         ax: where to draw; else a new one.
     """
     table = result["confusion"]

@@ -17,7 +17,6 @@ def plot_correction(correction: Correction, figure: Figure | None = None) -> Fig
     below.
 
     Args:
-        correction: of `correct`.
         figure: an empty one; else a new one.
     """
     if figure is None:

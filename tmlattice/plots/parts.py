@@ -13,7 +13,6 @@ def plot_parts(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
     """Draw the rms residual at each BPM in units of the noise, a panel a measurement.
 
     Args:
-        diagnosis: with parts.
         figure: an empty one; else a new one.
     """
     shown = [part for part in diagnosis.parts if np.isfinite(part.left).any()]

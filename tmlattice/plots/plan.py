@@ -115,7 +115,6 @@ def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     marked.
 
     Args:
-        diagnosis: of `diagnose`.
         ax: where to draw; else a new one.
     """
     if ax is None:

@@ -35,11 +35,7 @@ def plot_ring(ring: Ring, span: tuple[float, float] | None = None) -> Figure:
     """Draw betas along the ring, with its lattice below.
 
     Args:
-        ring: with a closed orbit and tunes.
         span: from and to which s, m; else the whole ring.
-
-    Raises:
-        UnstableRingError: it has no betas.
     """
     figure = plot_betas(ring, twiss(ring), span=span)
     figure.axes[0].set_title(ring.name, loc="right", fontsize="medium")
@@ -50,7 +46,6 @@ def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
     """Draw one of the figures of the report.
 
     Args:
-        diagnosis: of `diagnose`.
         name: of the figure, such as "scan", "readings" or "gap"; else the scan along the ring, or
             the maps of an orbit response.
 
@@ -77,7 +72,6 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
     """Draw the readings, x above y.
 
     Args:
-        measured: of any kind.
         ring: along which, with its lattice below (all that `load_ring` takes); else by the number
             of the monitor.
     """

@@ -306,7 +306,6 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
     """The gain in chi-square of each hypothesis alone, before any finding.
 
     Args:
-        diagnosis: with a scan.
         span: from and to which s, m: then linear, to separate neighbours.
     """
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks

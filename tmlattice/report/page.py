@@ -179,14 +179,7 @@ def page(
     provenance: dict[str, Any] | None = None,
     correction: Correction | None = None,
 ) -> str:
-    """The report as HTML.
-
-    Args:
-        diagnosis: of `diagnose`.
-        pictures: of `draw`.
-        provenance: where it should state more than the diagnosis' own.
-        correction: of the diagnosis, where there is one.
-    """
+    """The report as HTML."""
     parts = files("tmlattice.report")
     stated = diagnosis.provenance if provenance is None else provenance
     return render(

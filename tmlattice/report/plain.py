@@ -43,8 +43,6 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH, most: int | None = Non
     """Return the report as plain text.
 
     Args:
-        diagnosis: of `diagnose`.
-        width: columns.
         most: lines at most, as on a terminal: the least important parts are left out, and the last
             line names them. None: the whole report.
     """
