@@ -3,6 +3,10 @@
 import difflib
 import unicodedata
 from collections.abc import Iterable, Sequence
+from enum import StrEnum
+from typing import TypeVar
+
+Choice = TypeVar("Choice", bound=StrEnum)
 
 
 def harmless(text: str) -> str:
@@ -105,6 +109,14 @@ def missing_package(
 def unknown_choice(kind: str, name: object, known: Iterable[str]) -> ChoiceError:
     """The error for a word that is none of a short list; all of them are named."""
     return ChoiceError(f"no {kind} '{name}'; there are {', '.join(known)}")
+
+
+def choice(kind: str, name: object, known: type[Choice]) -> Choice:
+    """The member of an enumeration; a `ChoiceError` names all of them."""
+    try:
+        return known(name)
+    except ValueError:
+        raise unknown_choice(kind, name, known) from None
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:

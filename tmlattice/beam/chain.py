@@ -67,7 +67,7 @@ def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Arra
 def first_pass(
     weights: tuple[Array, Array, Array], maps: RingMaps, start: Array
 ) -> tuple[Array, Array]:
-    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane] of a pass."""
+    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane]."""
     W0, W1, W2 = weights
     size = sweeps.size_of(start.shape[1], len(start))
     packed = sweeps.pack(start, len(size[1]))

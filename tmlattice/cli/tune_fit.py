@@ -222,12 +222,12 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
         f"noise {noise} µm{estimated}"
     )
     screen.print(_columns(outcome))
-    growth = outcome.growth
+    growth = outcome.methods[0].growth
     if growth is not None and abs(growth - 1) > 1e-3:
         screen.print(
             f"the network of {outcome.methods[0].method} is not symplectic: amplitudes change by "
             f"up to {100 * abs(growth - 1):.1f} % a turn; its tunes are from the first "
-            f"{outcome.turns_alive} turns"
+            f"{outcome.methods[0].turns_alive} turns"
         )
     for method in outcome.methods:
         if method.problem:

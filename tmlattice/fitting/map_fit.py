@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
 from tmlattice.effects import Cause
-from tmlattice.errors import UnstableRingError, unknown_choice
+from tmlattice.errors import UnstableRingError, choice
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.sparse import FAULT, first_turns, fitted, searched, warn_of_launches
 from tmlattice.inference.distributed import components_of_rows
@@ -148,10 +148,7 @@ def fit_map(
         ChoiceError: an unknown prior.
     """
     begun = time.perf_counter()
-    try:
-        prior = Prior(prior)
-    except ValueError:
-        raise unknown_choice("prior", prior, Prior) from None
+    prior = choice("prior", prior, Prior)
     sparse = searched(network, measurement, ring, kinds, noise, launch_sigma)
     hypotheses = sparse.first.hypotheses
     start = np.zeros(len(hypotheses))

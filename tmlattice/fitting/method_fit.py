@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.sparse import MAX_MISFIT
-from tmlattice.network.network import TaylorNetwork
+from tmlattice.optics import short_way
 from tmlattice.speaks import Speaks
 
 Array = NDArray[np.float64]
@@ -71,6 +71,11 @@ class MethodFit(Speaks):
         return self.fit.changes if self.fit is not None and self.method in SPARSE_METHODS else {}
 
     @property
+    def turns_alive(self) -> int:
+        """Number of turns of the tunes: fewer than requested if the motion grew."""
+        return 0 if self.signal is None else self.signal.shape[1] - 1
+
+    @property
     def explains(self) -> bool:
         """Whether the residual is compatible with the noise of the readings."""
         if self.chi2 is None:
@@ -108,7 +113,7 @@ def errors(tunes: Array | None, true: Array | None) -> tuple[Array | None, Array
     """Return errors, absolute (the short way round the circle) and relative, [2] each."""
     if tunes is None or true is None:
         return None, None
-    absolute = np.abs((tunes - true + 0.5) % 1.0 - 0.5)
+    absolute = np.abs(short_way(tunes - true))
     return absolute, absolute / true
 
 
@@ -126,10 +131,10 @@ def advice(methods: Sequence[MethodFit]) -> str:
     best = trusted(methods)
     sentences = [_recommended(methods, best)]
     for method in methods:
-        if method.method != "adam" and method is not best and best is not None:
-            sentences.append(_compared(method, best))
-        elif method.method == "adam":
+        if method.method == "adam":
             sentences.append(_recipe(method))
+        elif method is not best and best is not None:
+            sentences.append(_compared(method, best))
     return " ".join(one for one in sentences if one)
 
 
@@ -143,8 +148,11 @@ def _recommended(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
                 f"Trust {best.method}: {why} without any changed magnet, so that no fault is seen; "
                 "the effect of a smaller fault on the tunes is unknown."
             )
-        who = f"Trust {best.method}: {why} with {changes(best)} alone"
-        return f"{who}, and states the error of its tunes."
+        named = ", ".join(
+            f"{name} by {100 * amount:+.2f} ± {100 * error:.2f} %"
+            for name, (amount, error) in best.named.items()
+        )
+        return f"Trust {best.method}: {why} with {named} alone, and states the error of its tunes."
     others = [m for m in methods if m.method != "adam" and m.fit is not None]
     if not others:
         return "No method here is reliable: add --method sparse, which identifies magnets."
@@ -163,7 +171,7 @@ def _compared(method: MethodFit, best: MethodFit) -> str:
         return f"{method.method.capitalize()} {_residual(method)}."
     if best.tunes is None or best.tune_sigma is None or method.tune_sigma is None:
         return ""
-    away = np.abs((method.tunes - best.tunes + 0.5) % 1.0 - 0.5)
+    away = np.abs(short_way(method.tunes - best.tunes))
     same = bool((away <= ALIKE * np.hypot(method.tune_sigma, best.tune_sigma)).all())
     name = method.method.capitalize()
     if same:
@@ -172,7 +180,10 @@ def _compared(method: MethodFit, best: MethodFit) -> str:
 
 
 def _recipe(method: MethodFit) -> str:
-    weights = free_weights(method)
+    assert method.fit is not None
+    free = set(method.fit.options["free"])
+    parameters = method.fit.network.named_parameters()
+    weights = sum(own.numel() for name, own in parameters if name in free)
     why = (
         f"The recipe (adam) cannot do it: {method.readings} readings do not determine {weights:,} "
         "free weights, nor which change is the ring's, and they have no error"
@@ -187,19 +198,3 @@ def _residual(method: MethodFit) -> str:
     if method.explains:
         return f"leaves the readings' noise ({1e6 * method.rms:.3g} of {1e6 * method.noise:.3g} µm)"
     return f"leaves {1e6 * method.rms:.3g} µm, more than the noise of {1e6 * method.noise:.3g} µm"
-
-
-def changes(method: MethodFit) -> str:
-    """Return the magnets that a method identifies, each with its change and its error."""
-    return ", ".join(
-        f"{name} by {100 * amount:+.2f} ± {100 * error:.2f} %"
-        for name, (amount, error) in method.named.items()
-    )
-
-
-def free_weights(method: MethodFit) -> int:
-    """Return the number of weights that the recipe changed."""
-    assert method.fit is not None
-    network, free = method.fit.network, set(method.fit.options["free"])
-    assert isinstance(network, TaylorNetwork)
-    return sum(p.numel() for name, p in network.named_parameters() if name in free)

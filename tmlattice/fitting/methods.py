@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tmlattice.by_name import by_name
-from tmlattice.errors import unknown_choice
+from tmlattice.errors import choice
 from tmlattice.fitting.adam import FitResult, Regularization, fit_adam
 from tmlattice.fitting.map_fit import Prior, fit_map
 from tmlattice.fitting.sparse import (
@@ -66,7 +66,6 @@ def fine_tune(
     """Fit a network to the first turn of a measurement; the given network is not changed.
 
     Args:
-        network: the design.
         measurement: launches and readings; a path or a DataFrame is taken too.
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
@@ -76,10 +75,8 @@ def fine_tune(
             tunes.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n], m and
             rad; 0: exact; inf: unknown; None: the measurement's own.
-        progress: show a bar where there is a terminal.
-        epochs, learning_rate, regularization, regularization_rate: of "adam", see
-            `fitting.adam.fit_adam`.
-        relative_to_design, free, clip, patience: of the same.
+        epochs, learning_rate, regularization, regularization_rate, relative_to_design, free, clip,
+            patience: of "adam", see `fitting.adam.fit_adam`.
         ring, kinds, noise: of the others: the ring whose magnets change (None: the network's own),
             the kinds of magnets, and the rms of one reading, m (None: the measurement's).
         fault, largest_number, refined: of "sparse" and "known".
@@ -89,15 +86,12 @@ def fine_tune(
     A warning reports readings that contradict the stated errors of the launches.
 
     Raises:
-        ChoiceError: an unknown method; it is a ValueError too.
-        ValueError: an option's value, or an option without meaning for the method.
+        ValueError: an unknown method, an option's value, or an option without meaning for the
+            method.
         TmlatticeError: a measurement that cannot be fitted, see the methods.
     """
     given = dict(locals())
-    try:
-        chosen = Method(method)
-    except ValueError:
-        raise unknown_choice("method", method, Method) from None
+    chosen = choice("method", method, Method)
     fit = _FITS[chosen]
     options = _options_of(fit, given, chosen)
     if chosen is Method.KNOWN and not candidates:

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 class TuneFit(Speaks):
     """The result of `tune_fit`. Tunes are fractions (x, y), or None.
 
-    `fit`, `network_tunes`, `tune_signal`, `growth`, `after`, `orbit_rms` and `problem` are those of
-    the first of the methods: the paper's recipe, if it was used.
+    `fit`, `network_tunes` and `problem` are those of the first of the methods: the paper's recipe,
+    if it was used.
 
     Attributes:
         ring: the design.
@@ -80,66 +80,28 @@ class TuneFit(Speaks):
         return f"of {last_part(self.ring.name)}, {what}", rows
 
     @property
-    def _first(self) -> MethodFit:
-        return self.methods[0]
-
-    @property
     def fit(self) -> FitResult:
         """First method's network and its history."""
-        assert self._first.fit is not None
-        return self._first.fit
+        assert self.methods[0].fit is not None
+        return self.methods[0].fit
 
     @property
     def network_tunes(self) -> Array | None:
         """First method's tunes, [2]."""
-        return self._first.tunes
-
-    @property
-    def tune_signal(self) -> Array | None:
-        """States of the first method's tracking, [1, turns + 1, n]; fewer if the motion grew."""
-        return self._first.signal
-
-    @property
-    def growth(self) -> float | None:
-        """Growth per turn of the first method's network, 1 if it is symplectic."""
-        return self._first.growth
-
-    @property
-    def after(self) -> Array:
-        """Readings of the shot shown by the first method's network, [monitor, 2], m."""
-        return self._first.after
-
-    @property
-    def orbit_rms(self) -> tuple[float, float]:
-        """rms of the first turn's residual, before and after the first method, all shots, m."""
-        return self.rms_before, self._first.rms
+        return self.methods[0].tunes
 
     @property
     def problem(self) -> str | None:
         """Why the first method has no tunes, or None."""
-        return self._first.problem
-
-    @property
-    def turns_alive(self) -> int:
-        """Number of turns of the tunes: fewer than requested if the motion grew."""
-        return 0 if self.tune_signal is None else self.tune_signal.shape[1] - 1
+        return self.methods[0].problem
 
     @property
     def absolute_error(self) -> Array | None:
         """|network tune - true tune| of the first method, the short way round the circle, [2]."""
         return errors(self.network_tunes, self.true_tunes)[0]
 
-    @property
-    def relative_error(self) -> Array | None:
-        """The absolute error over the true fraction, [2]."""
-        return errors(self.network_tunes, self.true_tunes)[1]
-
     def method(self, name: str) -> MethodFit:
-        """Return the fit of one method.
-
-        Raises:
-            KeyError: the method was not used.
-        """
+        """Return the fit of one method; a KeyError if it was not used."""
         return {m.method: m for m in self.methods}[name]
 
     @property
@@ -163,7 +125,8 @@ class TuneFit(Speaks):
         """Return the result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""
         from tmlattice import __version__
 
-        before, after = self.orbit_rms
+        first = self.methods[0]
+        absolute, relative = errors(first.tunes, self.true_tunes)
         return {
             "format": "tmlattice-tune-fit",
             "version": 1,
@@ -177,13 +140,10 @@ class TuneFit(Speaks):
             "tunes": {
                 "design": pair(self.design_tunes),
                 "true": pair(self.true_tunes),
-                "network": pair(self.network_tunes),
+                "network": pair(first.tunes),
             },
-            "error": {
-                "absolute": pair(self.absolute_error),
-                "relative": pair(self.relative_error),
-            },
-            "orbit_rms": {"before": before, "after": after},
+            "error": {"absolute": pair(absolute), "relative": pair(relative)},
+            "orbit_rms": {"before": self.rms_before, "after": first.rms},
             "noise": self.noise,
             "noise_estimated": self.noise_estimated,
             "loss": self.fit.loss,
@@ -192,8 +152,8 @@ class TuneFit(Speaks):
             "regularization": self.fit.options.get("regularization"),
             "seed": self.seed,
             "turns": self.turns,
-            "turns_alive": self.turns_alive,
-            "growth": self.growth,
+            "turns_alive": first.turns_alive,
+            "growth": first.growth,
             "options": self.fit.options,
             "problem": self.problem,
             "shots": self.shots,

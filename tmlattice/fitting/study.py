@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -210,7 +210,6 @@ def _pair(values: Array) -> Pair:
 
 
 _networks: dict[int, tuple[Ring, TaylorNetwork]] = {}
-_rings: dict[tuple[Any, ...], Ring] = {}
 
 
 def _network_of(ring: Ring) -> TaylorNetwork:
@@ -220,12 +219,15 @@ def _network_of(ring: Ring) -> TaylorNetwork:
     return _networks[id(ring)][1]
 
 
+@cache
+def _ring(*lattice: Any) -> Ring:
+    return load_ring(*lattice)
+
+
 def _work(task: tuple[tuple[Any, ...], tuple[str, str, int], dict[str, Any]]) -> dict[str, Any]:
     """A worker's task: plain data in and out, the ring loaded once."""
     lattice, (magnet, method, seed), options = task
-    if lattice not in _rings:
-        _rings[lattice] = load_ring(*lattice)
-    return dataclasses.asdict(run_case(_rings[lattice], magnet, method, seed=seed, **options))
+    return dataclasses.asdict(run_case(_ring(*lattice), magnet, method, seed=seed, **options))
 
 
 def _name_of(job: tuple[str, str, int]) -> str:
