@@ -125,7 +125,7 @@ def response():
 def together():
     """Turns, dispersion and tunes of one machine: readings, and the residuals of each."""
     from tmlattice.machine.stored_beam import simulate_dispersion, simulate_tunes, simulate_turns
-    from tmlattice.plots.parts import plot_parts
+    from tmlattice.plots.readings import plot_parts
 
     ring, weak = tmlattice.load_ring(SMALL), [Cause("quadrupole_gradient", "QD::5", -0.02)]
     read = {

@@ -1,27 +1,20 @@
 """The beta beating, or the first turns, of a ring now and after a correction."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
 from tmlattice.correction.result import Correction
 from tmlattice.correction.targets import TARGETS
 from tmlattice.plots.readings import AFTER, BEFORE
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import above_strip
 
 CAPTION = "At the BPMs now, and expected after the correction, with 68 % intervals."
 
 
-def plot_correction(correction: Correction, figure: Figure | None = None) -> Figure:
+def plot_correction(correction: Correction) -> Figure:
     """The errors of the shown target at the BPMs now and expected, a panel a plane, the lattice
-    below.
-
-    Args:
-        figure: an empty one; else a new one.
-    """
-    if figure is None:
-        figure = plt.figure(figsize=(11, 5.2), layout="constrained")
-    *axes, strip = figure.subplots(3, 1, sharex=True, height_ratios=[3, 3, 1])
+    below."""
+    figure, axes = above_strip(correction.ring, (11, 5.2), [3, 3])
     target = TARGETS[correction.shown]
     scale, unit = (100.0, "%") if target.unit == "relative" else (1e3, "mm")
     shown = [(correction.profile[0], BEFORE, "now")]
@@ -38,5 +31,4 @@ def plot_correction(correction: Correction, figure: Figure | None = None) -> Fig
         ax.set_ylabel(f"{target.words} {'xy'[plane]} [{unit}]", fontsize="small")
         ax.grid(alpha=0.25)
     axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
-    lattice_strip(correction.ring, strip)
     return figure

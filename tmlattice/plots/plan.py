@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.lattice.survey import Survey, survey
-from tmlattice.plots.names import brief, plural
 from tmlattice.plots.strip import COLOURS
 
 Array = NDArray[np.float64]
@@ -34,6 +33,21 @@ LETTER, LINE, BESIDE = 0.022, 0.06, 0.06
 size."""
 
 CULPRIT, SUSPECT = "#d1105a", "#c58a00"
+
+
+LONGEST = 22
+"""Letters of a name that fit."""
+
+
+def brief(name: str) -> str:
+    """A name; of a long one the end, which is where names differ."""
+    return name if len(name) <= LONGEST else f"…{name[-LONGEST:]}"
+
+
+def plural(kind: str) -> str:
+    """Of a kind of elements."""
+    kind = "BPM" if kind == "monitor" else kind
+    return f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
 
 
 def groups(diagnosis: Diagnosis) -> dict[str, list[int]]:
@@ -112,11 +126,7 @@ def label(number: int, finding: Finding) -> str:
 
 def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw the ring from above: magnets along the orbit, BPMs and correctors small, findings
-    marked.
-
-    Args:
-        ax: where to draw; else a new one.
-    """
+    marked."""
     if ax is None:
         _, ax = plt.subplots(figsize=(6.5, 6.5), layout="constrained")
     plan = survey(diagnosis.ring)

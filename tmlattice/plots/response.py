@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.optics import twiss
-from tmlattice.plots.strip import lattice_strip, plain_log
+from tmlattice.plots.strip import above_strip, plain_log
 
 
 def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
@@ -122,8 +122,7 @@ def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
 
 def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Relative gradient errors with their errors, above the lattice."""
-    figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
-    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
+    figure, (ax,) = above_strip(result.ring, (11, 4), [5], figure)
     rows = [
         (result.ring[c.element or ""].s, c.amount, sigma)
         for c, sigma in zip(result.causes, result.errors, strict=True)
@@ -137,14 +136,12 @@ def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
     ax.axhline(0, color="0.4", linewidth=0.5)
     ax.set_ylabel("gradient error [%]")
     ax.grid(alpha=0.25)
-    lattice_strip(result.ring, strip)
     return figure
 
 
-def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
+def plot_beta_beat(result: Diagnosis) -> Figure:
     """Beta of the result relative to the design, above the lattice."""
-    figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
-    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
+    figure, (ax,) = above_strip(result.ring, (11, 4), [5])
     (s, before), (_, after) = (twiss(r).along() for r in (result.ring, result.corrected))
     for plane, colour in enumerate(("C0", "C3")):
         beat = 100 * (after[:, plane] / before[:, plane] - 1)
@@ -152,5 +149,4 @@ def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
     ax.set_ylabel(f"beta / {result.starting_model} - 1 [%]")
     ax.grid(alpha=0.25)
     ax.legend(frameon=False)
-    lattice_strip(result.ring, strip)
     return figure

@@ -32,7 +32,6 @@ from tmlattice.plots.diagnosis import (
     over_decades,
     thresholds,
 )
-from tmlattice.plots.names import plural
 from tmlattice.plots.readings import AFTER, BEFORE, design_readings
 from tmlattice.report.amounts import amount_text, words
 from tmlattice.speaks import micrometres
@@ -190,7 +189,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
         colour = plan_view.SMALL[kind].colour if small else strip_view.COLOURS[kind]
         at = plan_view.beside(view, kind, places)
         own = [ring.elements[i] for i in places]
-        trace = _trace(at[:, 0], at[:, 1], plural(kind), colour, mode="markers",
+        trace = _trace(at[:, 0], at[:, 1], plan_view.plural(kind), colour, mode="markers",
                        size=3 if small else 4, hover=f"<br>{kind}",
                        text=[f"{e.name}\ns = {e.s:.2f} m" for e in own])  # fmt: skip
         trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
