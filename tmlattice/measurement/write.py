@@ -1,6 +1,5 @@
 """Writing the measurement folder, format version 1: see `measurement.folder`."""
 
-import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -13,19 +12,10 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
 from tmlattice.measurement.documents import Digest
-from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
+from tmlattice.measurement.folder import AnyMeasurement
 from tmlattice.measurement.header import finite, header
+from tmlattice.measurement.kinds import KINDS, TURNS, plain_settings, quoted, reading_lines
 from tmlattice.measurement.monitors import Names, Settings, check_settings, check_size, noise_table
-from tmlattice.measurement.orbit_response import OrbitResponse
-from tmlattice.measurement.stored_files import (
-    KINDS,
-    TURNS,
-    check_readable,
-    fields,
-    plain_settings,
-    quoted,
-    reading_lines,
-)
 from tmlattice.measurement.trajectory import COORDINATES, Measurement
 
 Array = NDArray[np.float64]
@@ -44,19 +34,20 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
         MeasurementError: a reading that no reader would take (above 0.2 m), or a folder that
             holds a measurement.
     """
-    if isinstance(measurement, OrbitResponse):
-        check_free(folder, force)
-        _write_response(Path(folder), measurement)
-        return
     if not isinstance(measurement, Measurement):
         check_free(folder, force)
-        check_readable(measurement)
         (kind,) = (kind for kind in KINDS.values() if kind.record is type(measurement))
         with output_folder(Path(folder)) as temporary:
             table = temporary / kind.table
+            assert kind.write is not None
             with table.open("w", encoding="utf-8", newline="") as file:
                 document = kind.write(file, measurement)
-            _write_signed(temporary, document, table)
+            digest = Digest()
+            with table.open("rb") as written:
+                while part := written.read(1 << 20):
+                    digest.add(part)
+            signed = {**document, "table_sha256": digest.told()}
+            write_json(temporary / "measurement.json", signed)
         return
     m = measurement
     with measurement_writer(
@@ -86,56 +77,6 @@ def check_free(folder: str | Path, force: bool = False) -> None:
                 f"'{folder}' holds a measurement already ({name}); name another folder, or replace "
                 "it with --force (in Python: force=True)"
             )
-
-
-def _write_response(folder: Path, response: OrbitResponse) -> None:
-    orbits = [(name, response.response[i]) for i, name in enumerate(response.correctors)]
-    document = header("orbit_response", response)
-    document["columns"] = [
-        {"corrector": name, "plane": plane, "kick": float(kick)}
-        for name, plane, kick in zip(
-            response.correctors, response.planes, response.kicks, strict=True
-        )
-    ]
-    if response.rf is not None:
-        document["rf"] = {
-            "frequency_hz": float(response.rf.frequency),
-            "harmonic": int(response.rf.harmonic),
-            "step_hz": float(response.rf.step),
-        }
-        if response.rf.orbit is not None:
-            document["dispersion"] = True
-            orbits.append((RF, response.rf.orbit))
-    with output_folder(folder) as temporary:
-        table = temporary / "response.csv"
-        write_response_table(table, response.monitors, orbits)
-        _write_signed(temporary, document, table)
-
-
-def _write_signed(folder: Path, document: dict[str, Any], table: Path) -> None:
-    """measurement.json next to its table, with the digest that links them."""
-    digest = Digest()
-    with table.open("rb") as file:
-        while part := file.read(1 << 20):
-            digest.add(part)
-    write_json(folder / "measurement.json", {**document, "table_sha256": digest.told()})
-
-
-def write_response_table(
-    path: Path, monitors: Sequence[str], orbits: Sequence[tuple[str, Array]]
-) -> None:
-    """Write orbit changes as the table of an orbit response's folder.
-
-    Args:
-        orbits: a corrector's name, or "rf", and its orbit change, m, [monitor, 2].
-    """
-    with path.open("w", encoding="utf-8", newline="") as file:
-        write = csv.writer(file, lineterminator="\n").writerow
-        write(RESPONSE)
-        for name, orbit in orbits:
-            check_size(orbit, monitors)
-            for monitor, xy in zip(monitors, orbit.tolist(), strict=True):
-                write((name, monitor, *fields(xy)))
 
 
 class MeasurementWriter:
