@@ -120,7 +120,6 @@ def finished(folder: Path, keep: Iterable[str] | None = None) -> dict[str, dict[
     """The results that are there, by case; failed ones have a key "error".
 
     Args:
-        folder: of the results.
         keep: keys to keep of each; None: all.
     """
     results = {}
@@ -153,7 +152,6 @@ def run_batch(
         work: takes what a case needs and returns its result; importable by other processes.
         cases: by name, which is the file's: a function that loads what the case needs. It is
             called here, shortly before the case runs: the workers need no files of ours.
-        folder: of the results.
         jobs: local processes, one thread each; 1: this process; None: one a core.
         scheduler: address of a Dask scheduler, instead of local processes.
         progress: show a bar where there is a terminal.

@@ -26,7 +26,6 @@ def plain(text: str, longest: int | None = None) -> str:
     """A text from a file as it may be shown: in one line, `harmless`.
 
     Args:
-        text: as it stands in the file.
         longest: characters; what is beyond is left out.
     """
     shown = harmless(" ".join(text.split()))
@@ -94,7 +93,6 @@ def missing_package(
     """The error for a package of an extra.
 
     Args:
-        error: of the import.
         what: needs it, as the subject of the sentence.
         extra: brings it.
         instead: another way, if there is one.

@@ -216,7 +216,6 @@ def ring_tunes(ring: Ring, energy: float = 0.0) -> list[float] | None:
     there are none.
 
     Args:
-        ring: with its errors.
         energy: relative deviation of the beam's.
     """
     try:

@@ -29,7 +29,7 @@ from tmlattice.effects import (
     find,
     monitors_with,
 )
-from tmlattice.effects.settings import groups
+from tmlattice.effects.apply import groups
 from tmlattice.lattice import Ring
 
 Array = NDArray[np.float64]

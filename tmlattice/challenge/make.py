@@ -95,10 +95,6 @@ def make(
             catalogue does not contain; E none. Those are in first turns; R is one effect in an
             orbit response, T in turns of a stored beam, M in two or three kinds together, P a
             change between two measurements of one machine.
-        cases: number of cases.
-        seed: of all random numbers.
-        folder: for the challenge.
-        lattice: argument of `load_ring`.
         reference: tier B, with a measurement from before the fault.
         learnt: tier B, with an orbit response from before the fault, whose diagnosis is the prior
             of the case's. A machine that stores no beam has none, and is diagnosed without.
@@ -106,12 +102,10 @@ def make(
         shots: of first turns and kicks of a stored beam; of the fit, two more are held out.
         effects: draw from these alone.
         amount: of the effect, of random sign, instead of a random signal to noise.
-        signal: smallest and largest signal to noise.
         background: tiers of kinds and tier B, rms of the distributed errors by effect (None: the
             catalogue's); default in tiers B and P: every usual one.
         known_rms: the diagnosis is given these rms; else it estimates them.
         kinds: of measurement, for tiers E, M and P; of M two or three are drawn.
-        progress: show a bar on a terminal.
 
     Returns:
         How often each effect was drawn without reaching the smallest signal to noise.

@@ -128,19 +128,15 @@ def tune_fit(
     """Perturb one magnet, measure one first turn, fine-tune the design's network, predict tunes.
 
     Args:
-        ring: the design.
         magnet: a quadrupole or sextupole; else the one that `middle_of_first_arc` names.
         change: relative change of its strength; None: -20 %, or less where that is unstable.
         launch: x, px, y, py at the start of the ring, m and rad.
         noise: rms of a reading, m; drawn from the seed.
         turns: tracked for the tunes, at a vanishing amplitude.
-        seed: of the noise.
         methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map"; or "known".
         candidates: names of the only magnets that may have changed, of "known".
-        epochs, learning_rate, regularization, regularization_rate: of "adam", see
-            `fitting.adam.fit_adam`.
-        relative_to_design, free, clip, patience: of the same.
-        progress: show a bar where there is a terminal.
+        epochs, learning_rate, regularization, regularization_rate, relative_to_design, free, clip,
+            patience: of "adam", see `fitting.adam.fit_adam`.
 
     Raises:
         UnstableRingError: the design or the perturbed ring has no tune.
@@ -204,14 +200,11 @@ def tune_fit_measurement(
     those at the nominal energy.
 
     Args:
-        ring: the design.
         measurement: of one shot or more; an unstated noise is estimated.
         turns: tracked for the tunes, at a vanishing amplitude.
         methods: some of `METHODS`, or "known".
         candidates: names of the only magnets that may have changed, of "known".
         source: where the data are from, for the report.
-        progress: show a bar where there is a terminal.
-        recipe: options of `fitting.adam.fit_adam`.
 
     Raises:
         MeasurementError: no reading of the first turn, every launch on the axis exactly, or shots

@@ -27,6 +27,7 @@ from scipy.constants import c as SPEED_OF_LIGHT
 
 from tmlattice.beam.rf import RELATIVISTIC, Rf, rf_of, stable_phase
 from tmlattice.effects import Cause, RingEffect, check, find
+from tmlattice.effects.apply import groups
 from tmlattice.effects.build import Build
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import NO_ERRORS, Ring
@@ -278,17 +279,12 @@ class AtEngine:
 
     def _groups(
         self, settings: Sequence[Settings]
-    ) -> Iterable[tuple[list[int], dict[int, Mapping[str, float]], float]]:
+    ) -> Iterable[tuple[NDArray[np.intp], dict[int, Mapping[str, float]], float]]:
         """(shots, settings by index in the ring, relative RF frequency) of equal shots."""
-        groups: dict[Any, list[int]] = defaultdict(list)
-        for shot, setting in enumerate(settings):
-            groups[
-                frozenset((name, frozenset(what.items())) for name, what in setting.items())
-            ].append(shot)
-        for shots in groups.values():
+        for shots, setting in groups(settings, len(settings)):
             changed: dict[int, Mapping[str, float]] = {}
             frequency = 0.0
-            for name, what in settings[shots[0]].items():
+            for name, what in setting.items():
                 if name.casefold() == "rf":
                     _check_setting("rf", what, ("frequency_relative",))
                     frequency = what.get("frequency_relative", 0.0)

@@ -150,8 +150,6 @@ class Machine:
     """A ring with known causes.
 
     Args:
-        ring: the design.
-        causes: of all three kinds.
         engine: "at": thick symplectic tracking by accelerator-toolbox; "ocelot": second-order maps.
         radiation: bends and wigglers radiate as expected.
         noise: rms of one reading, m, one number or (x, y).
@@ -191,7 +189,6 @@ class Machine:
         Args:
             launches: OCELOT's six coordinates, [shot, 6].
             turns: at least 1.
-            settings: of each shot.
         """
         weights, nodes = beams(launches, self.causes)
         flat = nodes.reshape(-1, 6)
@@ -221,9 +218,6 @@ class Machine:
 
         Args:
             shots: see `draw_shots`.
-            turns: of each shot.
-            seed: of the noise.
-            jobs: processes.
         """
         frozen = self.monitors.frozen
         first: Array | None = None

@@ -10,7 +10,7 @@ from tmlattice.beam.assembly import Group, assembly
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.rf import NO_RF, rf_of
 from tmlattice.effects import Cause, Settings
-from tmlattice.effects.settings import groups
+from tmlattice.effects.apply import groups
 from tmlattice.lattice import Ring
 
 Array = NDArray[np.float64]

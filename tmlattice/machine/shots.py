@@ -65,13 +65,10 @@ def draw_shots(
 
     Args:
         ring: the design; the amplitude is that of its own first turn.
-        shots: number of shots.
         amplitude: rms orbit over monitors and planes, m; both planes have the same rms on average
             over phases.
         sigma: rms of x, px, y, py, delta about the nominal launch.
         kicks: rms of random settings of all correctors, rad, on top of `settings`' own.
-        settings: of each shot.
-        seed: of launches and kicks.
 
     Raises:
         TmlatticeError: no shot, an amplitude that is not positive, or a sigma that is no rms.
@@ -145,7 +142,6 @@ def draw_background(ring: Ring, rms: Mapping[str, float], seed: int = 0) -> list
     """Return random distributed errors: every effect at every possible place, Gaussian.
 
     Args:
-        ring: the design.
         rms: by effect, see `background_rms`.
         seed: each effect has its own random stream.
     """

@@ -53,7 +53,6 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
     """Return the second-order map of one element from OCELOT, its parts composed.
 
     Args:
-        element: of a ring.
         energy: GeV.
         dimension: 4 for (x, px, y, py), 6 for OCELOT's (x, px, y, py, tau, p).
     """
@@ -312,7 +311,6 @@ def changed_maps(maps: RingMaps, layers: LayerMaps, touched: Sequence[int]) -> R
 
     Args:
         maps: of a ring that differs from that of `layers` in the touched layers alone.
-        layers: of the ring.
         touched: layers, up to their number, which means the drift from the last magnet to the end.
     """
     arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2", "R0", "R1", "R2")}

@@ -59,8 +59,6 @@ def assume(data: Data, names: Iterable[str], ring_monitors: Sequence[str]) -> Da
     """The data with what is assumed undone, one after another.
 
     Args:
-        data: a measurement of any kind.
-        names: of `ASSUMPTIONS`.
         ring_monitors: names of the ring's monitors, in beam order.
 
     Raises:

@@ -67,8 +67,6 @@ class Dispersion(Shown):
             step: of the frequency, Hz; one number, or one a step.
             frequency: of the RF, Hz.
             harmonic: number of RF periods in a turn.
-            unit: of x and y.
-            noise: see the attributes.
 
         Raises:
             MeasurementError: shapes that do not fit, or numbers that cannot be.

@@ -115,8 +115,6 @@ class OrbitResponse(Shown):
             monitors, correctors: names, or elements of a ring.
             kicks: rad, one for all or one a corrector.
             planes: "x" or "y" for all, or one a corrector; None: as the elements' kinds state.
-            unit: of x and y.
-            noise, rf: see the attributes.
 
         Raises:
             MeasurementError: shapes that do not fit, or planes that are unknown.

@@ -54,8 +54,6 @@ class Shots(Shown):
             x, y: turns [shot, turn, monitor], closed orbits [shot, monitor], or without their first
                 axes; NaN where missing; None: not read.
             monitors: names, or elements of a ring.
-            unit: of x and y.
-            noise, settings, shots: see the attributes.
 
         Raises:
             MeasurementError: shapes that do not fit, or numbers that cannot be.

@@ -26,7 +26,6 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
 
     Args:
         folder: made where it is not there.
-        measurement: of any kind.
         force: a measurement that is there already is replaced.
 
     Raises:
@@ -123,7 +122,6 @@ class MeasurementWriter:
         """Write one shot; nothing of it is kept but its id.
 
         Args:
-            shot: its id.
             launch: nominal x, px, y, py, delta, [5] (or [4], delta 0).
             launch_sigma: their rms, [5] (or [4], delta exact); None: unknown.
             settings: see `Measurement`; None or {} for the design's.

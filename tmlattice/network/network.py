@@ -87,9 +87,6 @@ class TaylorNetwork(NetworkChain, Chain):
 
     `network.to("cuda")` moves it, and all its computations, to a graphics card.
 
-    Args:
-        maps: weights and read-outs of a ring.
-
     Attributes:
         W0: [layer, n], parameter.
         W1: [layer, n, n], parameter.

@@ -21,8 +21,6 @@ def plot_betas(
 
     Args:
         ring: whose magnets are drawn.
-        twiss: of `twiss`.
-        dispersion: of `off_momentum`.
         span: from and to which s, m; else the whole ring.
     """
     figure, (ax,) = above_strip(ring, (11, 4.2), [5])

@@ -123,7 +123,6 @@ def predicted_masses(masses: Sequence[float], forest: bool = True, seed: int = 0
     Args:
         masses: kg.
         forest: whether to train one; it needs scikit-learn, and is skipped without it.
-        seed: of the forest.
     """
     truth = velocity(FALL, np.array(masses)[:, None])
     starts = np.stack([np.zeros(len(masses)), 100 / np.array(masses)], axis=1)

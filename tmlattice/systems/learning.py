@@ -90,7 +90,6 @@ def fit_step_by_step(solution: ArrayLike, order: int) -> TaylorMap:
 
     Args:
         solution: [step, n], or several solutions of one length [solution, step, n].
-        order: of the map.
     """
     solution = np.asarray(solution, dtype=float)
     n = solution.shape[-1]

@@ -119,7 +119,6 @@ def race(
         epochs: rows of the table; the last is how long all train.
         cells: of the LSTMs; the perceptron has 64 hidden values.
         regularizations: of "none", "L2", "dropout".
-        seed: of the first weights and of dropout.
         progress: whether to show a bar.
     """
     try:

@@ -205,7 +205,6 @@ def third_order_turn(ring: "Ring", launch: ArrayLike) -> ThirdOrderTurn:
     """Return one turn of a launch (x, px, y, py) by maps of second and third order.
 
     Args:
-        ring: with monitors.
         launch: [4], m and rad.
 
     Raises:
