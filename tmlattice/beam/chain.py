@@ -14,7 +14,7 @@ from tmlattice.beam import sweeps
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.aperture import APERTURE, check_alive, lost
 from tmlattice.beam.layers import Layers
-from tmlattice.beam.rf import NO_RF, Cavities
+from tmlattice.beam.rf import NO_RF
 from tmlattice.beam.sweeps import curved
 from tmlattice.by_name import by_name
 from tmlattice.errors import BeamLostError, UnstableRingError
@@ -288,23 +288,10 @@ class Chain(LayerChain):
     def tangents(self, x: Array) -> tuple[Array, Array]:
         """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state /
         d launch there, [layer + 2, n, n]."""
-        return self.trajectory(x)
-
-    def trajectory(
-        self, x: ArrayLike, turns: int = 1, cavities: Cavities = NO_RF
-    ) -> tuple[Array, Array]:
-        """Return the same over many turns, with the RF: [step + 1, n] and [step + 1, n, n], a turn
-        of layer + 1 steps.
-
-        Args:
-            x: launch, [n].
-            turns: at least 1.
-            cavities: in six coordinates; see `beam.rf`.
-        """
         turn, n = self.turn(), self.dimension
-        states = np.empty((1, turns * turn.steps + 1, n))
+        states = np.empty((1, turn.steps + 1, n))
         tangents = np.empty((*states.shape, n))
         states[0, 0], tangents[0, 0] = x, np.eye(n)
-        rf = cavities.exits, cavities.values
+        rf = NO_RF.exits, NO_RF.values
         kernels.trajectories(0, 1, *turn.W, turn.curved, *rf, states, tangents)
         return states[0], tangents[0]

@@ -20,8 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import KICK, ResponseModel
-from tmlattice.beam.feed_down import feed_down
+from tmlattice.beam.closed_orbit import KICK, ResponseModel, feed_down
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions, ring_effect
 from tmlattice.errors import EffectError
@@ -44,8 +43,6 @@ def derivatives(
     """Yield d (orbit response) / d amount of effects.
 
     Args:
-        model: the ring of the linearisation; its monitors read without errors.
-        hypotheses: (effect, place) of the catalogue, of effects on the ring.
         correctors: names; None: all of the ring, in beam order.
 
     Yields:

@@ -25,8 +25,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.feed_down import feed_down
+from tmlattice.beam.closed_orbit import ResponseModel, feed_down
 from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.effects.directions import Directions, directions_nearby
 from tmlattice.errors import UnstableRingError
