@@ -292,11 +292,8 @@ class _Cluster:
         return future
 
     def check(self) -> None:
-        """See to it that somebody is at work.
-
-        Raises:
-            TmlatticeError: the scheduler is gone, or there has been no worker for long.
-        """
+        """See to it that somebody is at work; TmlatticeError: the scheduler is gone, or there has
+        been no worker for long."""
         if self._client.status != "running":
             raise TmlatticeError(
                 f"the Dask scheduler at '{self._address}' is gone; start it and run this again: "

@@ -62,11 +62,7 @@ def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
 
 def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, plane: int) -> Array:
     """Change of the dispersion behind some layers by a kick of 1 rad behind each magnet that kicks
-    in a plane, m per relative energy, [layer, source].
-
-    Args:
-        plane: 0 or 1.
-    """
+    in a plane, m per relative energy, [layer, source] (plane: 0 or 1)."""
     behind = np.asarray(layers) + 1
     rows = model.tangents[behind][:, 2 * plane]
     orbits = orbits_of_kicks(model, kicking(model.ring, plane), behind, rows, plane)

@@ -132,11 +132,8 @@ class ResponseSlopes:
             yield out
 
     def factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
-        """Yield the derivative by each hypothesis, in factors.
-
-        Raises:
-            EffectError: an effect that does not act on the ring.
-        """
+        """Yield the derivative by each hypothesis, in factors; EffectError: an effect that does not
+        act on the ring."""
         for name, _ in hypotheses:
             if not isinstance(find(name), RingEffect):
                 raise EffectError(f"'{name}' does not act on the ring; it has no such derivative")

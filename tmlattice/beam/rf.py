@@ -128,11 +128,7 @@ def cavities(
     ring: Ring, rf: Rf, layer_of: Sequence[int] | NDArray[np.intp], loss: float, frequency: float
 ) -> Cavities:
     """Return thin cavities behind the magnets before them; the drift between commutes with a gain
-    of energy to second order.
-
-    Raises:
-        LatticeError: a voltage below the loss.
-    """
+    of energy to second order; LatticeError: a voltage below the loss."""
     if not rf.on(loss, frequency) or rf.voltage == 0:
         return NO_RF
     crest = rf.voltage / (ring.energy * 1e9 * ring.beta)

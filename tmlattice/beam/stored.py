@@ -101,11 +101,8 @@ class StoredBeam:
         self.modes: ComplexArray = self._G @ self._U
 
     def launched(self, amplitude: ComplexArray) -> Array:
-        """State at the start of the ring after a kick, [..., n].
-
-        Args:
-            amplitude: of the modes at turn 0, [..., mode].
-        """
+        """State at the start of the ring after a kick, [..., n] (amplitude: of the modes at turn 0,
+        [..., mode])."""
         kicked = np.real(amplitude @ self._U.T)
         kicked[..., TRANSVERSE:] = 0.0  # a kick changes neither energy nor time
         return np.asarray(self.model.state + kicked)
@@ -116,11 +113,8 @@ class StoredBeam:
         return Moved(self.model.readings, self.tunes, self.modes)
 
     def moved(self, hypotheses: Sequence[Hypothesis]) -> Moved:
-        """Return the derivatives by effects on the ring.
-
-        Args:
-            hypotheses: (effect, place), of effects on the ring.
-        """
+        """Return the derivatives by effects on the ring (hypotheses: (effect, place), of effects on
+        the ring)."""
         model, count = self.model, len(hypotheses)
         monitors = len(model.maps.at)
         moved = Moved(
@@ -230,11 +224,7 @@ def _nearest(
     turn: Array, tunes: ComplexArray, modes: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """Eigenvalues and vectors of a turn with RF: first the two nearest to those of the transverse
-    motion alone, then the others.
-
-    Raises:
-        UnstableRingError: the RF makes one of them grow.
-    """
+    motion alone, then the others; UnstableRingError: the RF makes one of them grow."""
     values, vectors = np.linalg.eig(turn)
     chosen: list[int] = []
     for mode in (0, 1):

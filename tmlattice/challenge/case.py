@@ -193,11 +193,8 @@ def _write_truth(folder: Path, truth: Truth) -> None:
 
 
 def read_set(folder: Path) -> dict[str, Any]:
-    """Return the public description of a challenge.
-
-    Raises:
-        TmlatticeError: no challenge in the folder, or a damaged description.
-    """
+    """Return the public description of a challenge; TmlatticeError: no challenge in the folder, or
+    a damaged description."""
     path = folder / "challenge.json"
     found = _read(path, SET)
     if found["tier"] not in TIERS:
@@ -211,11 +208,8 @@ def case_names(folder: Path) -> list[str]:
 
 
 def check_lattice(place: Path, lattice: Any, trusted: str | None) -> str:
-    """Return a challenge's lattice, if loading it runs only code that the caller trusts.
-
-    Raises:
-        TmlatticeError: Python code that is not trusted, or no name.
-    """
+    """Return a challenge's lattice, if loading it runs only code that the caller trusts;
+    TmlatticeError: Python code that is not trusted, or no name."""
     if not isinstance(lattice, str) or not lattice:
         raise TmlatticeError(f"{place}: its lattice is {lattice!r:.40}; it should be a name")
     if lattice != trusted:
@@ -229,11 +223,8 @@ CONTENTS = "lattice_contents"
 
 
 def check_contents(folder: Path, described: Mapping[str, Any]) -> None:
-    """Raise if the lattice differs from the one of the challenge, where that is recorded.
-
-    Raises:
-        TmlatticeError: it differs.
-    """
+    """Raise if the lattice differs from the one of the challenge, where that is recorded;
+    TmlatticeError: it differs."""
     known = described.get(CONTENTS)
     if known not in (None, fingerprint(contents(ring_of(described["lattice"])))):
         raise TmlatticeError(

@@ -52,11 +52,8 @@ class Draw:
         effects: Sequence[str],
         places_of: Callable[[Effect], Sequence[str | None]],
     ) -> Cause:
-        """Return one cause, up to the largest amount of its effect.
-
-        Raises:
-            TmlatticeError: no effect is visible.
-        """
+        """Return one cause, up to the largest amount of its effect; TmlatticeError: no effect is
+        visible."""
         for _ in range(TRIES):
             name = effects[int(self.random.integers(len(effects)))]
             effect = find(name)

@@ -211,11 +211,8 @@ def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Cas
 
 
 def evenly(ring: Ring, count: int) -> list[str]:
-    """Return correctors of a ring, evenly along it in each plane, half of each if possible.
-
-    Raises:
-        TmlatticeError: the ring has fewer.
-    """
+    """Return correctors of a ring, evenly along it in each plane, half of each if possible;
+    TmlatticeError: the ring has fewer."""
     planes = [[e.name for e in ring.elements if e.kind == kind]
               for kind in ("hcorrector", "vcorrector")]  # fmt: skip
     first, second = (len(own) for own in planes)

@@ -114,11 +114,7 @@ class Careful(click.Command):
     """A command that does not write over what it reads, nor twice into one file."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run it, unless an output is an input or another output.
-
-        Raises:
-            OutputError: it is.
-        """
+        """Run it, unless an output is an input or another output; OutputError: it is."""
         from tmlattice.files import OutputError
 
         values = [ctx.params.get(name) for name in INPUTS]

@@ -84,11 +84,8 @@ def perturbed_ring(ring: Ring, magnet: str, change: float) -> Ring:
 
 
 def changed_ring(ring: Ring, magnet: str, change: float | None) -> tuple[Ring, Array, float]:
-    """Return the perturbed ring, its tunes [2] and the change: by default the largest usual one.
-
-    Raises:
-        UnstableRingError: the ring has no tunes with this change, or with any.
-    """
+    """Return the perturbed ring, its tunes [2] and the change: by default the largest usual one;
+    UnstableRingError: the ring has no tunes with this change, or with any."""
     tried = CHANGES if change is None else (change,)
     for amount in tried:
         machine = perturbed_ring(ring, magnet, amount)

@@ -114,11 +114,7 @@ _FITS: dict[Method, Callable[..., FitResult]] = {
 
 
 def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: Method) -> dict[str, Any]:
-    """Those of the arguments that the method has.
-
-    Raises:
-        ValueError: another one was given.
-    """
+    """Those of the arguments that the method has; ValueError: another one was given."""
     own = signature(fit).parameters
     options = {}
     for name, parameter in signature(fine_tune).parameters.items():

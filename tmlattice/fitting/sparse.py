@@ -158,11 +158,7 @@ def fitted(
     chi2: Sequence[float],
     **result: Any,
 ) -> FitResult:
-    """Return the ring with these changes as a fitted network.
-
-    Args:
-        launches: as fitted, [shot, 5].
-    """
+    """Return the ring with these changes as a fitted network (launches: as fitted, [shot, 5])."""
     problem = first_turns(found)
     model, data = problem.model, problem.data
     n = model.dimension

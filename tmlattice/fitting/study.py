@@ -95,11 +95,8 @@ class Case:
 def spread_magnets(
     ring: Ring, number: int | None = None, kind: str = "quadrupole"
 ) -> list[Element]:
-    """Return `number` powered magnets of a kind, evenly in beam order; None, or more: all.
-
-    Raises:
-        TmlatticeError: the ring has none.
-    """
+    """Return `number` powered magnets of a kind, evenly in beam order; None, or more: all;
+    TmlatticeError: the ring has none."""
     attribute = {"quadrupole": "k1", "sextupole": "k2"}[kind]
     powered = [e for e in ring.magnets if e.kind == kind and getattr(e, attribute) != 0]
     if not powered:
@@ -236,11 +233,8 @@ def _name_of(job: tuple[str, str, int]) -> str:
 
 
 def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
-    """Make the folder of a study, or check that it is this study's.
-
-    Raises:
-        TmlatticeError: it contains the cases of another study, or cannot be written.
-    """
+    """Make the folder of a study, or check that it is this study's; TmlatticeError: it contains the
+    cases of another study, or cannot be written."""
     stated = folder / "options.json"
     text = json.loads(json.dumps(identity))
     if stated.exists():

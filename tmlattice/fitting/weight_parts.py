@@ -62,11 +62,8 @@ class LayerEffects:
 
 
 def layer_effects(ring: Ring, dimension: int = 4) -> LayerEffects:
-    """Return directions of all usual effects that act through one layer and change no read-out.
-
-    Args:
-        dimension: of the network, 4 or 6.
-    """
+    """Return directions of all usual effects that act through one layer and change no read-out
+    (dimension: of the network, 4 or 6)."""
     chosen = [name for name in names() if isinstance(CATALOGUE[name], RingEffect)]
     if dimension == 4:
         chosen = [name for name in chosen if not CATALOGUE[name].energy]
@@ -210,11 +207,8 @@ def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
 
 
 def split(seen: Trajectories, effects: LayerEffects, weights: Array) -> Split:
-    """Return the parts: effects, other symplectic changes, the rest.
-
-    Args:
-        weights: change, [layer, n, P].
-    """
+    """Return the parts: effects, other symplectic changes, the rest (weights: change, [layer, n,
+    P])."""
     maps = seen.model.maps
     kicked, trajectory = seen.roots(), seen.ensemble()
     rows = stacked((effects.D0, effects.D1, effects.D2))

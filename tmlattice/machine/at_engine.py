@@ -256,11 +256,7 @@ class AtEngine:
 
     def centroids(self, line: list[Any], beam: Array, turns: int) -> Iterator[tuple[Array, Array]]:
         """Yield of each turn the mean of the particles, [monitor, 2], and their part that is not
-        lost, [monitor].
-
-        Args:
-            beam: the particles, [6, particle]; they are moved.
-        """
+        lost, [monitor] (beam: the particles, [6, particle]; they are moved)."""
         block = max(TURNS_AT_ONCE // (beam.shape[1] * len(self._monitors)), 1)
         for turn in range(0, turns, block):
             seen = self.run(line, beam.T, min(block, turns - turn), beam, turn)
@@ -353,11 +349,8 @@ class AtEngine:
 
 
 def to_at(launches: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> Array:
-    """Return AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6].
-
-    Args:
-        launches: [..., 6].
-    """
+    """Return AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6] (launches:
+    [..., 6])."""
     launches = np.asarray(launches, dtype=float)
     rest = 1e9 * mass
     reference = np.sqrt((energy * 1e9) ** 2 - rest**2)

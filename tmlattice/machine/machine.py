@@ -99,11 +99,8 @@ def errors(
 
 
 def rms_of(noise: float | Sequence[float]) -> Array:
-    """Return the rms of a reading in x and y, m, [2].
-
-    Raises:
-        TmlatticeError: neither one number nor two, or a negative one.
-    """
+    """Return the rms of a reading in x and y, m, [2]; TmlatticeError: neither one number nor two,
+    or a negative one."""
     rms = np.asarray(noise, dtype=float)
     if rms.shape not in ((), (2,)) or not ((rms >= 0) & (rms < np.inf)).all():
         raise TmlatticeError(f"the noise is {noise} m; it is an rms, or two (x, y): zero or more")
@@ -125,11 +122,8 @@ class Engine(Protocol):
 
 
 def check_engine(name: str, known: Sequence[str] = ENGINES) -> None:
-    """Check the name of an engine, of those that a kind of measurement has.
-
-    Raises:
-        TmlatticeError: it is unknown.
-    """
+    """Check the name of an engine, of those that a kind of measurement has; TmlatticeError: it is
+    unknown."""
     if name not in known:
         raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(known)}")
 

@@ -115,11 +115,8 @@ def _rms(chain: Chain, launch: Array) -> Array:
 
 
 def each_setting(given: Sequence[Settings], shots: int) -> tuple[Settings, ...]:
-    """Return the settings of each shot; () are the design's in every one.
-
-    Raises:
-        TmlatticeError: their number differs from that of the shots.
-    """
+    """Return the settings of each shot; () are the design's in every one; TmlatticeError: their
+    number differs from that of the shots."""
     if given and len(given) != shots:
         raise TmlatticeError(f"{len(given)} settings do not fit {shots} shots; give one for each")
     return tuple(given) or ({},) * shots

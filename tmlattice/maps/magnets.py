@@ -69,11 +69,8 @@ def part_maps(element: Element, energy: float) -> list[TaylorMap]:
 
 
 def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
-    """Return the second-order map of elements in beam order: a layer, with the drifts before it.
-
-    Args:
-        dimension: 4 or 6.
-    """
+    """Return the second-order map of elements in beam order: a layer, with the drifts before it
+    (dimension: 4 or 6)."""
     way = identity(dimension)
     for element in elements:
         way = quadratic_map(element, energy, dimension).after(way)

@@ -247,11 +247,8 @@ def of_ocelot(part: Part, n: int) -> Quadratic:
 
 
 def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
-    """Return the map of one element, its errors included.
-
-    Raises:
-        LatticeError: it is not finite, or it loses energy, which needs six coordinates.
-    """
+    """Return the map of one element, its errors included; LatticeError: it is not finite, or it
+    loses energy, which needs six coordinates."""
     errors = element.errors
     if element.kind == "cavity":  # its gain depends on the turn, see `beam.rf`
         element = _empty(element)

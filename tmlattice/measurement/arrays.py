@@ -19,11 +19,7 @@ METRES = {
 
 
 def metres(unit: str) -> float:
-    """The length of a unit of readings, m.
-
-    Raises:
-        MeasurementError: another unit.
-    """
+    """The length of a unit of readings, m; MeasurementError: another unit."""
     if unit not in METRES:
         raise MeasurementError(f"no unit '{unit}'; readings are in {', '.join(METRES)}")
     return METRES[unit]

@@ -79,11 +79,8 @@ class Digest:
 
 
 def check_table(document: dict[str, Any], table: Path) -> None:
-    """Whether a table is whole, and belongs to its document, where that holds a digest.
-
-    Raises:
-        MeasurementError: it cannot be read, or is another.
-    """
+    """Whether a table is whole, and belongs to its document, where that holds a digest;
+    MeasurementError: it cannot be read, or is another."""
     if (stated := document.get("table_sha256")) is None:
         return
     digest = Digest()

@@ -88,11 +88,8 @@ def to_xarray(measured: AnyMeasurement) -> Any:
 
 
 def of_document(frame: Any) -> AnyMeasurement | None:
-    """The measurement of a frame of `to_dataframe`; None: it states none, or is no such table.
-
-    Raises:
-        MeasurementError: rows that cannot be read.
-    """
+    """The measurement of a frame of `to_dataframe`; None: it states none, or is no such table;
+    MeasurementError: rows that cannot be read."""
     document = frame.attrs.get(ATTRIBUTE)
     if isinstance(document, str):
         try:

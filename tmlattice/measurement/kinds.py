@@ -216,11 +216,8 @@ def _launches(listed: list[Document]) -> tuple[Array, Array | None]:
 
 
 def places_of(rows: Rows, column: str, known: Sequence[int]) -> NDArray[np.int64]:
-    """Each row's place among the shots, or steps, of the document.
-
-    Raises:
-        MeasurementError: one that is not among them, with its line.
-    """
+    """Each row's place among the shots, or steps, of the document; MeasurementError: one that is
+    not among them, with its line."""
     index = {own: i for i, own in enumerate(known)}
     found, of_row = np.unique(rows.whole[column], return_inverse=True)
     place = np.array([index.get(own, -1) for own in found.tolist()], dtype=np.int64)[of_row]
@@ -279,11 +276,8 @@ def _write_response(table: TextIO, m: OrbitResponse) -> Document:
 def write_response_table(
     table: TextIO, monitors: Sequence[str], orbits: Sequence[tuple[str, Array]]
 ) -> None:
-    """Write orbit changes as the table of an orbit response's folder.
-
-    Args:
-        orbits: a corrector's name, or "rf", and its orbit change, m, [monitor, 2].
-    """
+    """Write orbit changes as the table of an orbit response's folder (orbits: a corrector's name,
+    or "rf", and its orbit change, m, [monitor, 2])."""
     table.write(",".join(RESPONSE) + "\n")
     names = quoted(monitors)
     for start, (_, orbit) in zip(quoted([name for name, _ in orbits]), orbits, strict=True):

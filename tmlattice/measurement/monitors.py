@@ -30,11 +30,8 @@ HIGHEST_ENERGY = 1e6
 
 
 class Names:
-    """Places by name.
-
-    Raises:
-        MeasurementError: an empty name, one with a line break, or the same name twice.
-    """
+    """Places by name; MeasurementError: an empty name, one with a line break, or the same name
+    twice."""
 
     def __init__(self, kind: str, names: Iterable[str]) -> None:
         self.kind = kind
@@ -130,11 +127,8 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
 
 # --- what records have in common ------------------------------------------------------------------
 def check_values(values: Array, one: str) -> None:
-    """All are of a beam in some unit, one at least is there.
-
-    Raises:
-        MeasurementError: "a reading is infinite", where `one` is "reading".
-    """
+    """All are of a beam in some unit, one at least is there; MeasurementError: "a reading is
+    infinite", where `one` is "reading"."""
     large = np.abs(values) > IN_ANY_UNIT
     if large.any():
         article = "an" if one[0] in "aeiou" else "a"
@@ -145,11 +139,8 @@ def check_values(values: Array, one: str) -> None:
 
 
 def check_size(readings: Array, monitors: Sequence[str]) -> None:
-    """Readings [..., monitor, 2] are such that a reader takes them.
-
-    Raises:
-        MeasurementError: one above 0.2 m.
-    """
+    """Readings [..., monitor, 2] are such that a reader takes them; MeasurementError: one above 0.2
+    m."""
     large = np.abs(readings) > LARGEST_READING  # false for NaN
     if large.any():
         *_, monitor, plane = np.argwhere(large)[0]
@@ -211,11 +202,7 @@ def checked_shots(
 
 
 def shot_places(shots: Sequence[int], wanted: Sequence[int]) -> list[int]:
-    """Where the wanted ids stand.
-
-    Raises:
-        MeasurementError: one that is not there.
-    """
+    """Where the wanted ids stand; MeasurementError: one that is not there."""
     index = {shot: i for i, shot in enumerate(shots)}
     missing = [shot for shot in wanted if shot not in index]
     if missing:

@@ -52,11 +52,8 @@ class Rows:
         return _error(self.path, row, text)
 
     def check(self, *keys: str, metres: bool = True) -> None:
-        """No row stands twice, no turn is negative, no reading is in millimetres.
-
-        Raises:
-            MeasurementError: with the line.
-        """
+        """No row stands twice, no turn is negative, no reading is in millimetres; MeasurementError:
+        with the line."""
         for name, column in self.whole.items():
             if name == "turn" and column.min() < 0:
                 row = int((column < 0).argmax())
@@ -171,11 +168,8 @@ def match_names(
 
 
 def dense(rows: Rows, shot: Integers, shots: int, monitor: Integers, monitors: int) -> Array:
-    """Readings [shot, turn, monitor, 2] of rows, NaN where there is none.
-
-    Raises:
-        MeasurementError: a turn so late that the array would be all but empty.
-    """
+    """Readings [shot, turn, monitor, 2] of rows, NaN where there is none; MeasurementError: a turn
+    so late that the array would be all but empty."""
     turn = rows.whole.get("turn", np.zeros(len(rows), dtype=np.int64))
     turns = int(turn.max()) + 1
     if shots * turns * monitors > max(_MOST_CELLS, 100 * len(rows)):

@@ -63,11 +63,8 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
 
 
 def check_free(folder: str | Path, force: bool = False) -> None:
-    """Old data are kept: a folder is written to when it holds no measurement, or by force.
-
-    Raises:
-        MeasurementError: it holds one.
-    """
+    """Old data are kept: a folder is written to when it holds no measurement, or by force;
+    MeasurementError: it holds one."""
     if force:
         return
     for name in ("measurement.json", "readings.csv", "response.csv", "tunes.csv"):

@@ -26,11 +26,8 @@ class NetworkChain(torch.nn.Module, LayerChain):
         )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Apply `.to`, `.float`, `.cuda`, ... to every tensor.
-
-        Raises:
-            TypeError: another type than float64, or a device without sweeps.
-        """
+        """Apply `.to`, `.float`, `.cuda`, ... to every tensor; TypeError: another type than
+        float64, or a device without sweeps."""
         after = fn(torch.empty(0, dtype=torch.float64, device=self.W0.device))
         if after.dtype != torch.float64:
             raise TypeError(

@@ -32,11 +32,8 @@ MOST = 8
 
 
 def plot_ring(ring: Ring, span: tuple[float, float] | None = None) -> Figure:
-    """Draw betas along the ring, with its lattice below.
-
-    Args:
-        span: from and to which s, m; else the whole ring.
-    """
+    """Draw betas along the ring, with its lattice below (span: from and to which s, m; else the
+    whole ring)."""
     figure = plot_betas(ring, twiss(ring), span=span)
     figure.axes[0].set_title(ring.name, loc="right", fontsize="medium")
     return figure
@@ -69,12 +66,8 @@ def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
 
 
 def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = None) -> Figure:
-    """Draw the readings, x above y.
-
-    Args:
-        ring: along which, with its lattice below (all that `load_ring` takes); else by the number
-            of the monitor.
-    """
+    """Draw the readings, x above y (ring: along which, with its lattice below (all that `load_ring`
+    takes); else by the number of the monitor)."""
     known = None if ring is None else load_ring(ring)
     if isinstance(measured, TuneReading):
         return _tunes(measured, known)

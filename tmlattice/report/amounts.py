@@ -75,10 +75,6 @@ def degenerate_text(effect: str, support: Support) -> str:
 
 
 def all_of(places: Sequence[str | None], devices: Mapping[str, str]) -> str:
-    """The elements that share an amount.
-
-    Args:
-        places: their names; None: the beam.
-    """
+    """The elements that share an amount (places: their names; None: the beam)."""
     first = labelled(places[0] or "the beam", devices)
     return first if len(places) == 1 else f"{first} and {len(places) - 1} alike"

@@ -302,11 +302,8 @@ def _amount(effect: str, power_of_it: float) -> str:
 
 
 def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figure:
-    """The gain in chi-square of each hypothesis alone, before any finding.
-
-    Args:
-        span: from and to which s, m: then linear, to separate neighbours.
-    """
+    """The gain in chi-square of each hypothesis alone, before any finding (span: from and to which
+    s, m: then linear, to separate neighbours)."""
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
     s = middles(diagnosis)
     low, high = span or (0.0, diagnosis.ring.length)
