@@ -32,20 +32,6 @@ from tmlattice.maps.quadratic import (
 )
 from tmlattice.maps.taylor import TaylorMap
 
-__all__ = [
-    "LayerMaps",
-    "Quadratic",
-    "RingMaps",
-    "Weights",
-    "changed_maps",
-    "element_map",
-    "layer_elements",
-    "part_maps",
-    "ring_maps",
-    "ring_matrix",
-    "way_map",
-]
-
 Array = NDArray[np.float64]
 
 

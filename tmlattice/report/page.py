@@ -147,7 +147,7 @@ def draw(diagnosis: Diagnosis, folder: Path, correction: Correction | None = Non
 
 def draw_correction(correction: Correction | None, folder: Path) -> list[Picture]:
     """Draw the figure of a correction as a PNG file in the folder."""
-    from tmlattice.plots.correction import CAPTION, plot_correction
+    from tmlattice.plots.readings import CAPTION, plot_correction
 
     if correction is None:
         return []

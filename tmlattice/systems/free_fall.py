@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.maps import TaylorMap, taylor_map_of_ode
-from tmlattice.systems.comparison import Comparison
+from tmlattice.systems import Comparison
 from tmlattice.systems.learning import follow, map_of_weights, weights_of
 
 Array = NDArray[np.float64]

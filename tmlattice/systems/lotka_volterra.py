@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.errors import missing_package
 from tmlattice.maps import TaylorMap, right_hand_side, taylor_map_of_ode
-from tmlattice.systems.comparison import Comparison
+from tmlattice.systems import Comparison
 from tmlattice.systems.learning import fit_step_by_step, follow, weights_of
 
 if TYPE_CHECKING:
