@@ -89,7 +89,7 @@ def tunes():
     from tmlattice.fitting.study import study_tune_fit
     from tmlattice.plots import plot_study
 
-    cases = study_tune_fit("petra3", magnets=57, workers=1, progress=False)
+    cases = study_tune_fit("petra3", magnets=57, jobs=1, progress=False)
     yield "tunes", plot_study(petra3(), cases, plt.figure(figsize=(11, 5.5), layout="constrained"))
 
 

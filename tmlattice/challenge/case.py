@@ -174,19 +174,12 @@ def _write_truth(folder: Path, truth: Truth) -> None:
     arrays |= {f"clean_{k}": v for k, v in truth.clean.items()}
     with output_file(folder / f"{truth.name}.npz") as path, path.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
+    apart = {"name", "launches", "clean"} | ({"alone"} if not truth.alone else set())
     document = {
         "format": TRUTH,
         "version": 1,
-        "tier": truth.tier,
+        **{key: value for key, value in vars(truth).items() if key not in apart},
         "causes": [vars(cause) for cause in truth.causes],
-        "unknown": None if truth.unknown is None else dict(truth.unknown),
-        "signal_to_noise": list(truth.signal_to_noise),
-        "total": truth.total,
-        "background": dict(truth.background),
-        "amplitude": truth.amplitude,
-        "noise": truth.noise,
-        "seed": truth.seed,
-        **({"alone": dict(truth.alone)} if truth.alone else {}),
     }
     with output_file(folder / f"{truth.name}.json") as path:
         write_json(path, document)
@@ -288,14 +281,8 @@ def read_truth(folder: Path, name: str) -> Truth:
             raise ValueError(f"{len(truth.causes)} causes are none of tier {truth.tier}")
         return truth
     except (
-        OSError,
-        ArithmeticError,
-        LookupError,
-        TypeError,
-        ValueError,
-        MemoryError,
-        BadZipFile,
-    ) as error:
+        OSError, ArithmeticError, LookupError, TypeError, ValueError, MemoryError, BadZipFile
+    ) as error:  # fmt: skip
         reason = plain(str(error), 100)
         raise TmlatticeError(
             f"the truth of case {name} in '{folder}' cannot be read ({reason}); make it anew"
@@ -315,20 +302,16 @@ def _truth(folder: Path, name: str) -> Truth:
     def number(value: Any) -> float:
         return float("nan") if value is None else float(value)
 
+    plain = ("tier", "unknown", "background", "amplitude", "noise", "seed")
     return Truth(
-        name,
-        secret["tier"],
-        tuple(Cause(**cause) for cause in secret["causes"]),
-        secret["unknown"],
-        tuple(number(v) for v in secret["signal_to_noise"]),
-        number(secret["total"]),
-        secret["background"],
-        secret["amplitude"],
-        secret["noise"],
-        secret["seed"],
-        launches,
-        clean,
-        {kind: number(v) for kind, v in secret.get("alone", {}).items()},
+        name=name,
+        causes=tuple(Cause(**cause) for cause in secret["causes"]),
+        signal_to_noise=tuple(number(v) for v in secret["signal_to_noise"]),
+        total=number(secret["total"]),
+        launches=launches,
+        clean=clean,
+        alone={kind: number(v) for kind, v in secret.get("alone", {}).items()},
+        **{key: secret[key] for key in plain},
     )
 
 

@@ -250,7 +250,7 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
 
 def _columns(outcome: "TuneFit") -> "Table":
     """What each method made of the readings."""
-    from tmlattice.fitting.method_fit import errors
+    from tmlattice.fitting.outcome import errors
 
     made = table("method", *(method.method for method in outcome.methods))
 

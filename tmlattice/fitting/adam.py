@@ -20,6 +20,8 @@ from tmlattice.network.symplectic import symplectic_coefficients
 from tmlattice.observe.data import launch_errors
 from tmlattice.speaks import Speaks
 
+Network = TaylorNetwork | SymplecticNetwork
+
 
 class Regularization(StrEnum):
     """Term that is added to the loss, times its rate."""
@@ -51,7 +53,7 @@ class FitResult(Speaks):
         chi2: mean square of the residual over the noise; None if no noise is stated.
     """
 
-    network: TaylorNetwork | SymplecticNetwork
+    network: Network
     loss: list[float]
     penalty: list[float]
     best_epoch: int
@@ -80,7 +82,7 @@ class FitResult(Speaks):
 
 
 def fit_adam(
-    network: TaylorNetwork | SymplecticNetwork,
+    network: Network,
     measurement: Measurement,
     *,
     epochs: int = 1000,
@@ -213,9 +215,7 @@ def fit_adam(
 
 
 def _launches(
-    network: TaylorNetwork | SymplecticNetwork,
-    measurement: Measurement,
-    launch_sigma: ArrayLike | None,
+    network: Network, measurement: Measurement, launch_sigma: ArrayLike | None
 ) -> FreeLaunches:
     sigma = launch_errors(measurement, network.dimension, launch_sigma)
     ordered = measurement.in_order_of(network.monitors)
@@ -241,9 +241,7 @@ def _target(measurement: Measurement, monitors: Sequence[str]) -> tuple[Tensor, 
     )
 
 
-def _freed(
-    network: TaylorNetwork | SymplecticNetwork, free: Sequence[str] | None
-) -> tuple[TaylorNetwork | SymplecticNetwork, Sequence[str]]:
+def _freed(network: Network, free: Sequence[str] | None) -> tuple[Network, Sequence[str]]:
     """A copy in which these weights are free, and their names."""
     model = network.copy()
     if free is None:
@@ -257,15 +255,13 @@ def _freed(
     return model, free
 
 
-def _readings(
-    model: TaylorNetwork | SymplecticNetwork, launch: Tensor, epoch: int, rate: float
-) -> Tensor:
+def _readings(model: Network, launch: Tensor, epoch: int, rate: float) -> Tensor:
     """Readings in an epoch; a beam that is lost after the first epoch was lost by the fit."""
     try:
         readings: Tensor = model(launch)
         return readings
     except BeamLostError as error:
-        if epoch == 0:
+        if not epoch:
             raise
         raise BeamLostError(
             f"the fit diverged in epoch {epoch}: lower the learning rate ({rate:g}); {error}"
@@ -302,9 +298,7 @@ def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
     return step
 
 
-def _penalty(
-    model: TaylorNetwork | SymplecticNetwork, start: list[Tensor], kind: Regularization, design: Any
-) -> Tensor:
+def _penalty(model: Network, start: list[Tensor], kind: Regularization, design: Any) -> Tensor:
     if kind is Regularization.SYMPLECTIC and isinstance(model, TaylorNetwork):
         return symplectic_penalty(model.W1, model.W2, design).sum()
     if kind in (Regularization.NONE, Regularization.SYMPLECTIC):

@@ -23,9 +23,8 @@ from tmlattice.errors import (
 )
 from tmlattice.fitting.adam import Regularization
 from tmlattice.fitting.launches import FreeLaunches, with_noise
-from tmlattice.fitting.method_fit import METHODS, SPARSE_METHODS, MethodFit
 from tmlattice.fitting.methods import fine_tune
-from tmlattice.fitting.outcome import TuneFit
+from tmlattice.fitting.outcome import METHODS, SPARSE_METHODS, MethodFit, TuneFit
 from tmlattice.harmonics import MIN_TURNS, tunes
 from tmlattice.lattice import Ring, middle_of_first_arc
 from tmlattice.maps import element_map, ring_matrix

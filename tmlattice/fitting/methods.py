@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from tmlattice.by_name import by_name
 from tmlattice.errors import choice
-from tmlattice.fitting.adam import FitResult, Regularization, fit_adam
+from tmlattice.fitting.adam import FitResult, Network, Regularization, fit_adam
 from tmlattice.fitting.map_fit import Prior, fit_map
 from tmlattice.fitting.sparse import (
     EFFECTS,
@@ -39,7 +39,7 @@ class Method(StrEnum):
 
 @by_name
 def fine_tune(
-    network: TaylorNetwork | SymplecticNetwork,
+    network: Network,
     measurement: Measurement,
     *,
     method: Method | str = "adam",
@@ -127,9 +127,7 @@ def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: Method) 
     return options
 
 
-def _check_launches(
-    network: TaylorNetwork | SymplecticNetwork, measurement: Measurement, sigma: ArrayLike | None
-) -> None:
+def _check_launches(network: Network, measurement: Measurement, sigma: ArrayLike | None) -> None:
     """Warn of launches that differ from those stated; silent without a ring or a noise."""
     ring, n = network.ring, network.dimension
     if ring is None or measurement.noise is None:
