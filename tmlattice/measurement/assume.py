@@ -128,15 +128,7 @@ def read_of(data: Any) -> Array:
 
 def with_read(data: Any, change: Callable[[Array], Array]) -> Any:
     """Return the data with a change of everything that was read, [..., monitor, 2]."""
-    if isinstance(data, Dispersion):
-        steps = (replace(own, orbit=change(np.asarray(own.orbit))) for own in data.steps)
-        return _with(data, steps=tuple(steps))
-    if not isinstance(data, OrbitResponse):
-        return _with(data, **{data.READ: change(read_of(data))})
-    rf = data.rf
-    if rf is not None and rf.orbit is not None:
-        rf = replace(rf, orbit=change(rf.orbit))
-    return _with(data, response=change(data.response), rf=rf)
+    return _with(data, **data.read_with(change))
 
 
 def _sign(data: Any, x: float, y: float) -> Any:

@@ -4,7 +4,7 @@ Matching ignores case, and `name::0` stands for a name that stands once.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from tmlattice.measurement.arrays import METRES
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
-Values = TypeVar("Values", Array, None, Array | None)
 
 SETTINGS = ("kick", "k1_relative", "k2_relative", "frequency_relative")
 """What may be changed on purpose: rad, relative strengths, and the RF's relative frequency."""
@@ -216,10 +215,8 @@ def places_of(kind: str, known: Sequence[str], wanted: Sequence[str]) -> list[in
     return [names[name] for name in wanted]
 
 
-def spread(values: Values, places: Sequence[int], number: int) -> Values:
-    """[..., monitor, 2] among `number` monitors: NaN where there was none; None stays None."""
-    if values is None:
-        return values
+def spread(values: Array, places: Sequence[int], number: int) -> Array:
+    """[..., monitor, 2] among `number` monitors: NaN where there was none."""
     full = np.full((*values.shape[:-2], number, 2), np.nan)
     full[..., places, :] = values
     return full

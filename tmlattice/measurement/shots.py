@@ -1,6 +1,6 @@
 """Shots as monitors read them; those of a stored beam are closed orbits and turns after a kick."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
@@ -16,16 +16,14 @@ from tmlattice.measurement.monitors import (
     check_values,
     checked_shots,
     noise_table,
-    places_of,
     shot_places,
-    spread,
 )
-from tmlattice.measurement.shown import Shown
+from tmlattice.measurement.shown import OfMonitors
 
 Array = NDArray[np.float64]
 
 
-class Shots(Shown):
+class Shots(OfMonitors):
     """A record with shots, settings, monitors and noise; see `ClosedOrbit`.
 
     Its field `READ` holds what was read, [*`AXES`, monitor, 2]; the first axis is the shot. Its
@@ -86,20 +84,9 @@ class Shots(Shown):
             shots=shots,
         )
 
-    def in_order_of(self, monitors: Sequence[str]) -> Self:
-        """The same with other monitors, such as a ring's: NaN where one was not read.
-
-        Raises:
-            UnknownNameError: this measurement has a monitor that is not among them.
-        """
-        own: Any = self
-        places, number = places_of("monitor", monitors, own.monitors), len(monitors)
-        changed = {
-            self.READ: spread(getattr(own, self.READ), places, number),
-            "monitors": tuple(monitors),
-            "noise": spread(own.noise, places, number),
-        }
-        return replace(own, **changed)  # type: ignore[no-any-return]
+    def read_with(self, change: Callable[[Array], Array]) -> dict[str, Any]:
+        """Return the readings with a change, [..., monitor, 2]."""
+        return {self.READ: change(getattr(self, self.READ))}
 
     def select(
         self, shots: Sequence[int] | None = None, monitors: Sequence[str] | None = None
@@ -110,14 +97,12 @@ class Shots(Shown):
             UnknownNameError: a monitor that is not there.
             MeasurementError: a shot that is not there, or nothing is left.
         """
-        own: Any = self
-        at = shot_places(own.shots, own.shots if shots is None else shots)
-        here = places_of("monitor", own.monitors, own.monitors if monitors is None else monitors)
-        of_shots = {name: getattr(own, name) for name in self.OF_SHOTS}
+        own: Any = self if monitors is None else self.at_monitors(monitors)
+        if shots is None:
+            return own  # type: ignore[no-any-return]
+        at = shot_places(own.shots, shots)
+        of_shots = {name: getattr(own, name) for name in (self.READ, *self.OF_SHOTS)}
         changed = {
-            self.READ: getattr(own, self.READ)[at][..., here, :],
-            "monitors": tuple(own.monitors[i] for i in here),
-            "noise": None if own.noise is None else own.noise[here],
             "settings": tuple(own.settings[i] for i in at) if own.settings else (),
             "shots": tuple(own.shots[i] for i in at),
             **{name: None if values is None else values[at] for name, values in of_shots.items()},
