@@ -131,8 +131,9 @@ def tune_fit(
         turns: tracked for the tunes, at a vanishing amplitude.
         methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map"; or "known".
         candidates: names of the only magnets that may have changed, of "known".
-        epochs, learning_rate, regularization, regularization_rate, relative_to_design, free, clip,
-            patience: of "adam", see `fitting.adam.fit_adam`.
+        epochs, learning_rate, regularization, regularization_rate: of "adam", see
+            `fitting.adam.fit_adam`.
+        relative_to_design, free, clip, patience: of the same.
 
     Raises:
         UnstableRingError: the design or the perturbed ring has no tune.

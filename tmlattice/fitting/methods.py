@@ -75,8 +75,9 @@ def fine_tune(
             tunes.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n], m and
             rad; 0: exact; inf: unknown; None: the measurement's own.
-        epochs, learning_rate, regularization, regularization_rate, relative_to_design, free, clip,
-            patience: of "adam", see `fitting.adam.fit_adam`.
+        epochs, learning_rate, regularization, regularization_rate: of "adam", see
+            `fitting.adam.fit_adam`.
+        relative_to_design, free, clip, patience: of the same.
         ring, kinds, noise: of the others: the ring whose magnets change (None: the network's own),
             the kinds of magnets, and the rms of one reading, m (None: the measurement's).
         fault, largest_number, refined: of "sparse" and "known".

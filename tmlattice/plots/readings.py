@@ -66,6 +66,13 @@ def design_readings(diagnosis: Diagnosis) -> Array:
     return view.before if alone.point.lost else np.asarray(alone.point.view.readings)
 
 
+def worst_shot(diagnosis: Diagnosis, model: Array) -> int:
+    """The shot of the fit with the largest residual of a model, [shot, reading, 2], m."""
+    data = diagnosis.trajectories.data
+    left = np.where(data.valid, data.readings - model, 0.0) ** 2 * data.active[:, None, None]
+    return int(np.nan_to_num(left).sum(axis=(1, 2)).argmax())
+
+
 def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
     """Draw first-turn readings of a shot of the fit (else of the one with the largest residual),
     and the residuals of the design and the estimated ring."""
@@ -78,9 +85,7 @@ def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
         models.append(view.after)
     monitors = diagnosis.ring.monitors
     readings = np.where(data.valid, data.readings, np.nan)
-    if shot is None:
-        left = np.nan_to_num(readings - models[0]) ** 2 * data.active[:, None, None]
-        shot = int(left.sum(axis=(1, 2)).argmax())
+    shot = worst_shot(diagnosis, models[0]) if shot is None else shot
     first = slice(0, len(monitors))
     s = np.array([monitor.s for monitor in monitors])
     read, dropped = readings[shot, first], view.dropped[shot, first]

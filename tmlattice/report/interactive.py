@@ -32,7 +32,8 @@ from tmlattice.plots.diagnosis import (
     over_decades,
     thresholds,
 )
-from tmlattice.plots.readings import AFTER, BEFORE, design_readings
+from tmlattice.plots.readings import AFTER, BEFORE, design_readings, worst_shot
+from tmlattice.plots.response import RESIDUALS, gradient_errors
 from tmlattice.report.amounts import amount_text, words
 from tmlattice.speaks import micrometres
 
@@ -241,10 +242,7 @@ def readings(diagnosis: Diagnosis) -> Figure:
     models = {diagnosis.starting_model: (design_readings(diagnosis), BEFORE)}
     if diagnosis.verdict != "distributed":
         models["with the findings"] = (view.after, AFTER)
-    left = (
-        np.nan_to_num(read - models[diagnosis.starting_model][0]) ** 2 * data.active[:, None, None]
-    )
-    shot = int(left.sum(axis=(1, 2)).argmax())
+    shot = worst_shot(diagnosis, models[diagnosis.starting_model][0])
     s, names = zip(*((monitor.s, monitor.name) for monitor in monitors), strict=True)
     traces = []
     for plane, name in enumerate("xy"):
@@ -385,12 +383,7 @@ def steps(diagnosis: Diagnosis) -> Figure:
     kept = diagnosis.steps
     at = list(range(len(kept)))
     traces = []
-    for name, label, colour in (
-        ("heldout_rms_in_plane", "in-plane", "C0"),
-        ("heldout_rms_position", "in-plane, with position jump", "tab:cyan"),
-        ("heldout_rms_coupling", "coupling", "C3"),
-        ("dispersion_rms", "RF response", "C2"),
-    ):
+    for name, label, colour in RESIDUALS:
         values = [1e6 * getattr(step, name) for step in kept]
         trace = _trace(at, values, label, colour, text=[step.effect for step in kept],
                        hover=f"<br>{label} %{{y:.3g}} µm")  # fmt: skip
@@ -409,16 +402,11 @@ def steps(diagnosis: Diagnosis) -> Figure:
 
 def gradients(diagnosis: Diagnosis) -> Figure:
     """Relative gradient error of each quadrupole, with its standard error."""
-    rows = [
-        (c.element or "", diagnosis.ring[c.element or ""].s, 100 * c.amount, 100 * sigma)
-        for c, sigma in zip(diagnosis.causes, diagnosis.errors, strict=True)
-        if c.effect == "quadrupole_gradient"
-    ]
-    hover = [f"{name}\n{amount:+.4f} ± {error:.4f} %" for name, _, amount, error in rows]
-    trace = _trace([r[1] for r in rows], [r[2] for r in rows], "gradient error", "tab:red",
-                   mode="markers", size=5, text=hover, hover="<br>s = %{x:.2f} m",
-                   showlegend=False)  # fmt: skip
-    trace["error_y"] = {"array": _short([r[3] for r in rows], 3), "thickness": 1, "width": 0}
+    elements, amounts, errors = zip(*gradient_errors(diagnosis), strict=True)
+    hover = [f"{e.name}\n{a:+.4f} ± {sigma:.4f} %" for e, a, sigma in gradient_errors(diagnosis)]
+    trace = _trace([e.s for e in elements], amounts, "gradient error", "tab:red", mode="markers",
+                   size=5, text=hover, hover="<br>s = %{x:.2f} m", showlegend=False)  # fmt: skip
+    trace["error_y"] = {"array": _short(errors, 3), "thickness": 1, "width": 0}
     return _above_strip(diagnosis, [trace], "gradient error [%]")
 
 
