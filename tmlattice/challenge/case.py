@@ -61,13 +61,11 @@ class Case:
     """Public part of a case.
 
     Attributes:
-        name: of the case.
         lattice: argument of `load_ring`.
-        parts: measurements by folder: fit, heldout and perhaps reference of first turns; or one of
-            each kind by its name, and `before_KIND` of the machine before the fault; and `learnt`,
-            an orbit response of that machine.
+        parts: measurements by folder, see the module.
         options: of `diagnose`: background, effects.
         kinds: measurements that are diagnosed together; () of first turns.
+
     """
 
     name: str
@@ -112,20 +110,18 @@ class Truth:
     """Secret part of a case.
 
     Attributes:
-        name, tier: of the case.
         causes: of the catalogue; () for an unknown and for no effect.
         unknown: a fault that is not in the catalogue: kind, element, s, amount; or None. For an
             effect that was removed from the catalogue the kind is "taken_out" and the effect is in
             `causes`.
         signal_to_noise: of each cause alone, or of the unknown; NaN without a signal.
-        total: signal to noise of all together.
+        total: signal to noise of all together; `alone`: in each kind of several.
         background: rms of distributed errors, by effect.
         amplitude, noise: m; of a case of kinds 0, and in units of each kind's usual noise.
-        seed: of the case.
         launches: true ones by part (fit, heldout, reference), [shot, 5].
         clean: readings without noise by part, and "before": those of the fit without the fault,
             [shot, monitor, 2], m. A case of kinds has neither.
-        alone: signal to noise in each kind of a case of several kinds.
+
     """
 
     name: str

@@ -31,10 +31,10 @@ class Draw:
     """Random draws, and rejected ones.
 
     Attributes:
-        random: generator.
         signal: smallest and largest signal to noise, log-uniform.
         amount: of every effect instead, of random sign.
         unreachable: effects without an amount of the wanted signal to noise.
+
     """
 
     random: np.random.Generator

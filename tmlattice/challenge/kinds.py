@@ -62,15 +62,14 @@ class CaseSettings:
     """Settings of every case of a challenge.
 
     Attributes:
-        tier: of the challenge.
         lattice, ring: argument of `load_ring`, and its result.
-        seed: of the challenge.
         kinds: see `TIER_KINDS`.
         effects: drawn from these; None: from all usual ones.
         shots: of first turns, and kicks of a stored beam.
         signal, amount: see `Draw`.
         background: rms of distributed errors by effect.
         known_rms: whether the diagnosis is given these rms values.
+
     """
 
     tier: str

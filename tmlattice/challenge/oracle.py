@@ -41,10 +41,9 @@ class Refitted:
 
     Attributes:
         problem: rows whitened by noise and distributed errors.
-        start: fit of the nuisances alone.
-        seen: the scan of its residual.
-        statistic: fall of chi-square within the largest fault, [hypothesis].
-        amount: of that fall, [hypothesis].
+        start, seen: fit of the nuisances alone, and the scan of its residual.
+        statistic, amount: fall of chi-square within the largest fault, its amount, [hypothesis].
+
     """
 
     problem: Problem

@@ -64,13 +64,12 @@ def score(
     """Return all metrics of a challenge, in the format `tmlattice-challenge`.
 
     Args:
-        folder: of the challenge, with results and truth.
         oracle: with oracle and baselines, which take some seconds a case the first time.
-        jobs, scheduler, progress: of the oracle, see `run_batch`.
         lattice: the challenge's, if it is trusted Python code, see `check_lattice`.
 
     Raises:
         TmlatticeError: no results.
+
     """
     from tmlattice import __version__
 

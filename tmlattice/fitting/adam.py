@@ -37,20 +37,19 @@ class FitResult(Speaks):
     """A fine-tuned network and the history of its fit.
 
     Attributes:
-        network: with the weights of the epoch of least loss.
+        network: with the weights of the epoch of least loss, `best_epoch`.
         loss: of every epoch, m^2: squared residuals summed over monitors and planes, mean over
             shots; without the regularization.
-        penalty: of every epoch, the regularization's value before its rate; zeros for "none".
-        best_epoch: the epoch whose weights the network has.
+        penalty: of every epoch, the regularization's value before its rate.
         stopped_early: whether the patience ran out before the epochs.
         seconds: of wall clock.
-        options: all options of the fit.
-        tunes: fractional tunes (x, y) by the method itself, [2], or None.
-        tune_sigma: their standard error, [2]; None if the method has none (Adam).
+        tunes, tune_sigma: fractional tunes (x, y) by the method itself and their standard errors,
+            [2] each; None if the method has none (Adam).
         changes: relative changes of strengths, by magnet, with their standard errors: the causes
             that `sparse` selected, or all that `map` changed.
         launches: as fitted, [shot, n]; None if they were taken as exact.
         chi2: mean square of the residual over the noise; None if no noise is stated.
+
     """
 
     network: Network

@@ -68,13 +68,13 @@ def with_noise(
 
 @dataclass(frozen=True)
 class FreeLaunches:
-    """Readings and nominal values of launches, and their errors.
+    """Readings and nominal launches [shot, n], and their errors.
 
     Attributes:
-        nominal: [shot, n].
         sigma: rms of these; inf where unknown, 0 where exact, [shot, n].
         readings: m, [shot, monitor, 2]; NaN where missing.
         noise: rms of a reading, m, [monitor, 2].
+
     """
 
     nominal: Array

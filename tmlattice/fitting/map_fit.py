@@ -57,15 +57,14 @@ SETTLED = 0.01
 
 @dataclass(frozen=True)
 class MostProbable:
-    """Most probable changes.
+    """Most probable changes, and the problem and the model with them.
 
     Attributes:
-        problem: of the ring with these changes.
         hypotheses: (effect, magnet), [magnet].
         amounts, rms: relative changes, and those of the prior, [magnet].
         spread: root of their covariance, [magnet, magnet]: spread spread^T.
-        point: the model there.
         chi2: of every step.
+
     """
 
     problem: FirstTurns
@@ -129,23 +128,16 @@ def fit_map(
 
     Args:
         ring: of the network; None: the network's own `ring`.
-        prior: of the changes, see `Prior`.
         scale: rms of the prior, in %; None: 0.01 % for faults, else that of the largest marginal
             likelihood.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
-            exact; inf: unknown; None: the measurement's own.
+        launch_sigma: see `fine_tune`.
 
     Returns:
         The network of the most probable ring, its tunes, and their standard error by the posterior
         covariance. It is valid if the prior is: `Prior.STRENGTHS` describes many small changes, not
         one magnet with an error of 20 %.
 
-    Raises:
-        MeasurementError: no reading, or no noise stated.
-        TmlatticeError: no ring to change, or no powered magnet of these kinds.
-        BeamLostError: the launch is lost in the design.
-        ChoiceError: an unknown prior.
     """
     begun = time.perf_counter()
     prior = choice("prior", prior, Prior)

@@ -25,22 +25,20 @@ SPARSE_METHODS = ("sparse", "known")
 
 @dataclass(frozen=True, repr=False)
 class MethodFit(Speaks):
-    """One method's fit of the readings. Tunes are fractions (x, y), or None.
+    """One method's fit of the readings. Tunes are fractions (x, y), [2], or None.
 
     Attributes:
-        method: its name.
         fit: the network and its history, or None.
-        tunes: of the fitted ring, [2].
-        tune_sigma: their standard error, [2]; None if the method has none.
+        tune_sigma: standard error of the tunes; None if the method has none.
         signal: tracked states of the tunes' spectrum, [1, turns + 1, n].
         growth: of the fitted network's amplitude per turn, 1 if it is symplectic.
         after: readings of the shot shown by the fitted network, [monitor, 2], m.
         rms: of the residual of all shots, m.
-        readings: number of fitted readings.
-        noise: their rms, m; 0 without noise.
+        readings, noise: number of fitted readings, and their rms noise, m.
         chi2: residual in units of the noise, per reading, or None.
         seconds: of wall clock.
         problem: why there are no tunes, or None.
+
     """
 
     method: str
@@ -210,9 +208,7 @@ class TuneFit(Speaks):
     if it was used.
 
     Attributes:
-        ring: the design.
-        magnet: name of the perturbed magnet; None for other data.
-        change: relative change of its strength; None for other data.
+        magnet, change: the perturbed magnet, and its relative change; None for other data.
         launch: state at the start of the ring, [n], of the shot shown, as stated.
         noise: rms of a reading, m, over monitors and planes, or None.
         design_tunes, true_tunes: of OCELOT's one-turn matrices, design and perturbed, [2]; other
@@ -220,15 +216,12 @@ class TuneFit(Speaks):
         s: of the monitors, m, [monitor].
         measured, before: readings of one shot, and the design network's, [monitor, 2], m; NaN where
             missing.
-        rms_before: of the design's residual on all shots' first turns, m; unknown launches are
-            fitted, here to the design, by each method together with its weights.
-        methods: fit of each method.
+        rms_before: of the design's residual on all shots' first turns, m, unknown launches fitted.
         seconds: of wall clock, by stage; "fit" and "tunes" are of all methods.
-        seed: of the noise.
         turns: tracked for the tunes.
-        shots: number of shots fitted together.
         source: origin of the data; None for the experiment's own.
         noise_estimated: whether the noise is estimated from neighbouring monitors.
+
     """
 
     ring: Ring

@@ -74,17 +74,14 @@ def fit_sparse(
     """Fit a measurement's first turn by the set of changed magnets with the largest evidence.
 
     Args:
-        ring: of the network; None: the network's own `ring`.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
-            exact; inf: unknown; None: the measurement's own.
         candidates: names of the only magnets that may have changed; None: all of the kinds.
 
     Returns:
         The network of the refitted ring, its tunes from its own matrix, and their standard error:
         that of the changes, and the spread over other magnets that explain the readings nearly as
-        well, weighted by their evidence. Without a cause there is no error: the effect of a
-        smaller fault on the tunes is unknown.
+        well, weighted by their evidence; None without a cause.
+
     """
     begun = time.perf_counter()
     found = searched(network, measurement, ring, kinds, noise, launch_sigma, {
@@ -134,14 +131,8 @@ def searched(
     launch_sigma: ArrayLike | None,
     options: Mapping[str, Any] = {},
 ) -> Explanation:
-    """Return the changed magnets by their evidence.
-
-    Args:
-        network, measurement, ring, kinds, noise, launch_sigma: see `fit_sparse`.
-
-    Raises:
-        TmlatticeError: no ring to change.
-    """
+    """Return the changed magnets by their evidence, see `fit_sparse` and `sparse_causes`;
+    TmlatticeError: no ring to change."""
     ring = network.ring if ring is None else ring
     if ring is None:
         raise TmlatticeError("methods but 'adam' change the ring's magnets: give ring=")

@@ -57,10 +57,7 @@ class Case:
     """One fault, fitted by one method.
 
     Attributes:
-        magnet: name.
-        s: of its middle, m.
-        method: one of `METHODS`.
-        seed: of the noise.
+        s: of the magnet's middle, m.
         true_tunes: of the perturbed ring, or None if it is unstable.
         absolute_error, relative_error: of the tunes, or None without a prediction.
         tune_sigma: stated standard error of the tunes, or None if the method has none.
@@ -68,8 +65,8 @@ class Case:
         prediction_rms: error of the fitted network on new launches of five times the amplitude,
             against readings without noise, m.
         found: magnets that the method identifies, or None if it identifies none.
-        seconds: of the fit.
         problem: error message, or None.
+
     """
 
     magnet: str

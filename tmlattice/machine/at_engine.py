@@ -65,26 +65,22 @@ class AtEngine:
     magnet.
 
     Args:
-        causes: errors; those on readings (`monitor_*`) and on the beam (`energy_offset`,
-            `energy_spread`) are ignored here.
+        causes: errors; those on readings (`monitor_*`) and on the beam are ignored here.
         radiation_bends, radiation_wigglers: scale of the expected energy loss, 0: none, 1: as
             expected; causes add to it.
         steps: fourth-order integration steps per magnet. With 30 the first turn of a
             PETRA-III-style ring is converged to 0.002 micrometres rms at 1 mm (0.01 with 20).
         aperture: half width in m of quadrupoles and monitors, in both planes.
-        harmonic: of the RF; else that of the ring's first cavity, else the one nearest to 500 MHz.
-        voltage: of the RF in V, all cavities together; else that of the ring's cavities, else
-            four times the design's expected radiation loss.
+        harmonic, voltage: of the RF, see `rf_of`.
 
     Attributes:
-        ring: the design.
         expected_loss: energy that the design orbit loses in a turn at these scales, eV.
 
     Raises:
         LatticeError: an element that AT cannot build, a negative radiation loss, or an RF too
             weak for the loss.
-        EffectError: an effect that cannot sit on its element.
-        UnknownNameError: an unknown effect, element or family.
+        EffectError, UnknownNameError: an effect, element or family that cannot be.
+
     """
 
     def __init__(
@@ -165,7 +161,7 @@ class AtEngine:
     def track(
         self, launches: ArrayLike, turns: int = 1, settings: Sequence[Settings] | None = None
     ) -> Array:
-        """Return the beam at every monitor.
+        """Return the beam at every monitor, (x, y) in m, [shot, turn, monitor, 2]; NaN once lost.
 
         Over more than one turn the RF is on if the ring radiates, has cavities of its own, or
         its frequency is set: in the ring's cavities, else at the marker or drift named `rf`, else
@@ -174,18 +170,15 @@ class AtEngine:
 
         Args:
             launches: (x, px, y, py, tau, p) at the start of the sequence, [shot, 6].
-            turns: at least 1.
             settings: of each shot, by element name: `kick` of a corrector in rad (the total: the
                 design's kick is replaced), `k1_relative` of a quadrupole or a bend, `k2_relative`
                 of a sextupole, and under "rf" `frequency_relative`.
 
-        Returns:
-            (x, y) in m, [shot, turn, monitor, 2]; NaN once a particle is lost.
-
         Raises:
-            LatticeError: a setting that its element does not have.
-            UnknownNameError: a setting for an element that is not in the ring.
+            LatticeError, UnknownNameError: a setting that its element does not have; no such
+                element.
             ValueError: launches or settings of another shape, or no turn.
+
         """
         start = np.asarray(launches, dtype=float)
         if start.ndim != 2 or start.shape[1] != 6:

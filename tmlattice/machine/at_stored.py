@@ -22,12 +22,12 @@ ENERGY = 1e-3
 
 @dataclass(frozen=True)
 class Beam:
-    """Particles of a stored beam.
+    """Particles of a stored beam; one is the centroid alone, which does not decohere.
 
     Attributes:
-        particles: number; 1 is the centroid alone, which does not decohere.
         emittance: of the two modes, m rad.
         spread: rms relative energy deviation.
+
     """
 
     particles: int = 1

@@ -34,11 +34,10 @@ class Errors:
     """The errors of a simulated machine, as a truth file states them.
 
     Attributes:
-        ring: the design.
-        causes: errors, without the background.
-        background: rms by effect.
+        causes, background: errors, and the rms of distributed ones by effect.
         seed, machine_seed: of the noise, of the background.
         more: further inputs: engine, particles, ...
+
     """
 
     ring: Ring

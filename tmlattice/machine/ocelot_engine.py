@@ -48,16 +48,7 @@ class OcelotEngine:
         turns: int = 1,
         settings: Sequence[Settings] | None = None,
     ) -> Array:
-        """Return the beam at every monitor.
-
-        Args:
-            launches: OCELOT's (x, px, y, py, tau, p) at the start of the ring, [shot, 6].
-            turns: at least 1.
-            settings: of each shot, see `apply`.
-
-        Returns:
-            (x, y) in m, [shot, turn, monitor, 2]; NaN once the beam is lost.
-        """
+        """Return the beam at every monitor, see `AtEngine.track`."""
         launches, there = np.asarray(launches, dtype=float), self._there
         beam = np.empty((len(launches), turns, len(there.maps.at), 2))
         for shots, setting in groups(settings, len(launches)):

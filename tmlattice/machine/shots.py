@@ -36,10 +36,9 @@ class Shots:
     """Launches and settings.
 
     Attributes:
-        nominal: (x, px, y, py, delta), [shot, 5].
+        nominal: (x, px, y, py, delta), [shot, 5]; `sigma` is the launches' rms about it, [5].
         launches: of the beam, OCELOT's six coordinates, [shot, 6].
-        sigma: rms of the difference, [5].
-        settings: of each shot.
+
     """
 
     nominal: Array
