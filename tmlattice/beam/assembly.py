@@ -48,9 +48,6 @@ class Assembly:
     """A ring with known causes, its layers, and the directions of hypotheses in them.
 
     Attributes:
-        design, known: arguments.
-        ring: with the known causes.
-        layers, maps: of that ring.
         rf: see `rf_of`.
     """
 

@@ -5,6 +5,7 @@
 >>> chain.track([[1e-5, 0, 1e-5, 0]], turns=500)        # [1, 501, 4]
 """
 
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -64,17 +65,15 @@ def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Arra
     return solve
 
 
-def first_pass(
-    weights: tuple[Array, Array, Array], maps: RingMaps, start: Array
-) -> tuple[Array, Array]:
-    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane]."""
+def first_pass(weights: Sequence[Array], maps: RingMaps, start: Array) -> tuple[Array, Array]:
+    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane], from
+    launches [batch, n]."""
     W0, W1, W2 = weights
     size = sweeps.size_of(start.shape[1], len(start))
     packed = sweeps.pack(start, len(size[1]))
     states = np.empty((len(packed), len(W0) + 1, *packed.shape[1:]))
     states[:, 0] = packed
     sweeps.run(sweeps.forward, len(packed), size, W0, W1, W2, curved(W2), states)
-    check_alive(states, maps, size, len(start))
     readings = np.empty((len(packed), len(maps.at), 2, len(size[1])))
     out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
     sweeps.run(sweeps.read, len(packed), size, *out, states, readings)
@@ -85,10 +84,6 @@ class LayerChain:
     """Common part of chains of layers: names, launches, tracking, the one-turn map.
 
     A chain defines how its layers act on states (`_forward`, `_track`, `tangents`).
-
-    Attributes:
-        maps: names and positions of layers and monitors.
-        ring: the ring of these maps, if known.
     """
 
     maps: RingMaps
@@ -270,7 +265,8 @@ class Chain(LayerChain):
     def readings(self, launch: ArrayLike) -> Array:
         """Return (x, y) at every monitor on one pass, [batch, monitor, 2], m."""
         start = self._start(launch)
-        _, readings = first_pass(self.weights(), self.maps, start)
+        states, readings = first_pass(self.weights(), self.maps, start)
+        check_alive(states, self.maps, sweeps.size_of(self.dimension, len(start)), len(start))
         return sweeps.unpack(readings, len(start))
 
     def turn(self) -> Layers:

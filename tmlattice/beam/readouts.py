@@ -22,7 +22,6 @@ class Lost:
 
     Attributes:
         shot, turn: from 0.
-        element: the magnet in which it left the aperture.
     """
 
     shot: int

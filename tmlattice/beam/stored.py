@@ -74,7 +74,6 @@ class StoredBeam:
         rf: cavities that act on the oscillation; six coordinates.
 
     Attributes:
-        rf: as given.
         tunes: Q of the modes that are nearer to x and to y, in [0, 1).
         modes: their vectors at the monitors, [monitor, 2, mode]: the beam is at
             Re(sum_mode a E exp(2 pi i Q turn)), a any complex number.

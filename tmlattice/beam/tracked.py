@@ -53,7 +53,6 @@ class Paths:
         states, tangents: at every exit, [shot, step + 1, n], [shot, step + 1, n, n].
         beam_launch: d beam / d launch, all coordinates, [shot, reading, 2, n].
         monitors: d reading / d beam, [shot, monitor, 2, 2].
-        monitors_of: the monitors of the shots in which causes act.
     """
 
     readings: Array
@@ -78,9 +77,6 @@ class TrackedShots:
         active: shots in which causes act; the others are of the ring without, [shot].
 
     Attributes:
-        ring, layers, maps: with the known causes.
-        groups: shots with equal settings.
-        steps: of a turn.
         where: index of the state of each reading, [reading].
     """
 

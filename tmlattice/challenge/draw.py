@@ -28,14 +28,7 @@ class Measures(Protocol):
 
 @dataclass
 class Draw:
-    """Random draws, and rejected ones.
-
-    Attributes:
-        signal: smallest and largest signal to noise, log-uniform.
-        amount: of every effect instead, of random sign.
-        unreachable: effects without an amount of the wanted signal to noise.
-
-    """
+    """Random draws, and rejected ones."""
 
     random: np.random.Generator
     signal: tuple[float, float]

@@ -62,14 +62,9 @@ class CaseSettings:
     """Settings of every case of a challenge.
 
     Attributes:
-        lattice, ring: argument of `load_ring`, and its result.
         kinds: see `TIER_KINDS`.
         effects: drawn from these; None: from all usual ones.
-        shots: of first turns, and kicks of a stored beam.
         signal, amount: see `Draw`.
-        background: rms of distributed errors by effect.
-        known_rms: whether the diagnosis is given these rms values.
-
     """
 
     tier: str

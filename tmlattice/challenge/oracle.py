@@ -40,10 +40,7 @@ class Refitted:
     """Every hypothesis about one case.
 
     Attributes:
-        problem: rows whitened by noise and distributed errors.
-        start, seen: fit of the nuisances alone, and the scan of its residual.
         statistic, amount: fall of chi-square within the largest fault, its amount, [hypothesis].
-
     """
 
     problem: Problem

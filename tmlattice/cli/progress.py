@@ -18,12 +18,7 @@ EVERY = 0.5
 
 
 class Line:
-    """What a command is doing, and for how long: a line on a terminal's stderr, else nothing.
-
-    Attributes:
-        name: of the command.
-        stage: what is being done.
-    """
+    """What a command is doing, and for how long: a line on a terminal's stderr, else nothing."""
 
     def __init__(self, name: str) -> None:
         self.name = name

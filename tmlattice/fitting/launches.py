@@ -74,7 +74,6 @@ class FreeLaunches:
         sigma: rms of these; inf where unknown, 0 where exact, [shot, n].
         readings: m, [shot, monitor, 2]; NaN where missing.
         noise: rms of a reading, m, [monitor, 2].
-
     """
 
     nominal: Array

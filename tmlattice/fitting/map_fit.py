@@ -63,8 +63,6 @@ class MostProbable:
         hypotheses: (effect, magnet), [magnet].
         amounts, rms: relative changes, and those of the prior, [magnet].
         spread: root of their covariance, [magnet, magnet]: spread spread^T.
-        chi2: of every step.
-
     """
 
     problem: FirstTurns
@@ -137,7 +135,6 @@ def fit_map(
         The network of the most probable ring, its tunes, and their standard error by the posterior
         covariance. It is valid if the prior is: `Prior.STRENGTHS` describes many small changes, not
         one magnet with an error of 20 %.
-
     """
     begun = time.perf_counter()
     prior = choice("prior", prior, Prior)

@@ -81,7 +81,6 @@ def fit_sparse(
         The network of the refitted ring, its tunes from its own matrix, and their standard error:
         that of the changes, and the spread over other magnets that explain the readings nearly as
         well, weighted by their evidence; None without a cause.
-
     """
     begun = time.perf_counter()
     found = searched(network, measurement, ring, kinds, noise, launch_sigma, {

@@ -102,12 +102,8 @@ def spread_magnets(ring: Ring, number: int | None = None) -> list[str]:
 def turned_launches(optics: Optics, launch: Array, phases: Array) -> Array:
     """Return the launch [n] turned by phases [shot, 2], in rad, on its ellipses, [shot, n]."""
     launches = np.tile(launch, (len(phases), 1))
-    for plane in range(2):
-        alpha, beta = optics.alpha[plane], optics.beta[plane]
-        x, p = launch[2 * plane], launch[2 * plane + 1]
-        z = (x - 1j * (alpha * x + beta * p)) * np.exp(1j * phases[:, plane])
-        launches[:, 2 * plane] = z.real
-        launches[:, 2 * plane + 1] = (-z.imag - alpha * z.real) / beta
+    turned = optics.normalised(launch) * np.exp(1j * phases)
+    launches[:, :4] = optics.closed_orbit[:4] + np.real(turned @ optics.modes.T)
     return launches
 
 

@@ -45,7 +45,6 @@ class LayerEffects:
     """The catalogue as directions in the weights of single layers.
 
     Attributes:
-        ring, dimension: of the weights.
         hypotheses: (effect, element).
         layer: of each, [hypothesis].
         D0, D1, D2: d weights / d amount, [hypothesis, n], [hypothesis, n, n],

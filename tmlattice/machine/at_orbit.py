@@ -32,7 +32,6 @@ def closed(turn: Turn, start: Array, free: Sequence[int], late: float = 0.0) -> 
         start: near it, [6].
         free: free coordinates, which return: (0, 1, 2, 3) at a given energy, all six with the RF.
         late: excess of a turn over the RF's, m.
-
     """
     state, at = start.copy(), np.ix_(free, free)
     for _ in range(20):

@@ -26,8 +26,6 @@ class Beam:
 
     Attributes:
         emittance: of the two modes, m rad.
-        spread: rms relative energy deviation.
-
     """
 
     particles: int = 1

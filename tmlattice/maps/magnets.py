@@ -63,18 +63,6 @@ def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> T
     return TaylorMap(way.reduced())
 
 
-def layer_elements(ring: Ring) -> list[tuple[Element, ...]]:
-    """Return the elements of each layer: those before its magnet, and the magnet."""
-    layers: list[tuple[Element, ...]] = []
-    way: list[Element] = []
-    for element in ring.elements:
-        way.append(element)
-        if element.is_magnet:
-            layers.append(tuple(way))
-            way = []
-    return layers
-
-
 @dataclass(frozen=True)
 class RingMaps:
     """The weights of a ring's chain of layers, stacked.

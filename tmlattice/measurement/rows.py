@@ -32,7 +32,6 @@ class Rows:
     """The columns of a table, one entry a row.
 
     Attributes:
-        path: of the file.
         whole: columns of whole numbers by name, [row].
         names: columns of names: the names, each once, and their places, [row].
         xy: the other two columns: x, y in m, or a value and its error, [row, 2]; NaN where a

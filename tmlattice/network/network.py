@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tmlattice.beam import sweeps
 from tmlattice.beam.aperture import APERTURE, bounded, lost_beam
-from tmlattice.beam.chain import Chain
+from tmlattice.beam.chain import Chain, first_pass
 from tmlattice.beam.sweeps import curved
 from tmlattice.errors import TmlatticeError, choice, missing_package
 from tmlattice.input_files import zip_of
@@ -42,23 +42,11 @@ class CompiledSweep:
 
     def forward(self, launch: Tensor, weights: Tensors) -> tuple[Tensor, Tensor, Tensor]:
         """One pass through all layers."""
-        batch, n = launch.shape
-        W0, W1, W2 = (w.detach().numpy() for w in weights)
-        size = sweeps.size_of(n, batch)
-        packed = sweeps.pack(launch.detach().numpy(), len(size[1]))
-        states = np.empty((len(packed), len(W0) + 1, *packed.shape[1:]))
-        states[:, 0] = packed
-        sweeps.run(sweeps.forward, len(packed), size, W0, W1, W2, curved(W2), states)
-        maps = self.maps
-        readings = np.empty((len(packed), len(maps.at), 2, len(size[1])))
-        out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
-        sweeps.run(sweeps.read, len(packed), size, *out, states, readings)
-        end = sweeps.unpack(states[:, -1], batch)
-        return (
-            torch.from_numpy(sweeps.unpack(readings, batch)),
-            torch.from_numpy(end),
-            torch.from_numpy(states),
-        )
+        own = [w.detach().numpy() for w in weights]
+        states, readings = first_pass(own, self.maps, launch.detach().numpy())
+        both = (sweeps.unpack(values, len(launch)) for values in (readings, states[:, -1]))
+        read, end = map(torch.from_numpy, both)
+        return read, end, torch.from_numpy(states)
 
     def backward(
         self, launch: Tensor, weights: Tensors, kept: Tensor, pulls: Tensors, wanted: bool
