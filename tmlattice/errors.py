@@ -109,7 +109,7 @@ def unknown_choice(kind: str, name: object, known: Iterable[str]) -> ChoiceError
     return ChoiceError(f"no {kind} '{name}'; there are {', '.join(known)}")
 
 
-def choice(kind: str, name: object, known: type[Choice]) -> Choice:
+def choice(kind: str, name: str, known: type[Choice]) -> Choice:
     """The member of an enumeration; a `ChoiceError` names all of them."""
     try:
         return known(name)

@@ -28,14 +28,12 @@ class Dispersion(OfMonitors):
     Attributes:
         steps: each with its orbit change, m (not m per relative energy), [monitor, 2], NaN where
             missing.
-        monitors: names, in the order of the orbits.
-        noise: rms of one orbit change, m, [monitor, 2], NaN where unknown; None: all unknown. A
-            pair (x, y), or a mapping of pairs by monitor, is taken too.
-        lattice, energy: what the data state about them (GeV); hints.
+        noise: rms of one orbit change, and the other attributes: see `Measurement`.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, a step of 0 Hz, or no
             orbit at all.
+
     """
 
     steps: tuple[RfStep, ...]

@@ -65,21 +65,16 @@ class OrbitResponse(OfMonitors):
     the beam energy a little.
 
     Attributes:
-        correctors: names, one a column.
-        planes: "x" or "y", the plane in which each kicks.
+        correctors, planes: names, one a column, and "x" or "y", the plane in which each kicks.
         kicks: the steps, rad, [column].
-        monitors: names.
         response: the orbit change for that kick, m (not m/rad), [column, monitor, 2], NaN where
             missing.
-        noise: rms of a reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
-            (x, y), or a mapping of pairs by monitor, is taken too.
+        noise: rms of an orbit change, and the other attributes: see `Measurement`.
         rf: the RF's step, or None.
-        lattice, energy: what the data state about them (GeV); hints.
-        devices: names that the control system has for monitors and correctors, by the names here;
-            empty: unknown.
 
     Raises:
         MeasurementError: shapes that do not fit, or numbers that cannot be.
+
     """
 
     correctors: tuple[str, ...]

@@ -116,15 +116,11 @@ class ClosedOrbit(Shots):
 
     Attributes:
         orbit: (x, y) in m, [shot, monitor, 2]; NaN where missing.
-        monitors: names, in the order of the readings.
-        noise: rms of one (averaged) reading, m, [monitor, 2], NaN where unknown; None: all unknown.
-            A pair (x, y), or a mapping of pairs by monitor, is taken too.
-        settings: of each shot, see `Measurement`; () for the design's in every shot.
-        shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data state about them (GeV); hints.
+        noise: rms of one (averaged) reading, and the other attributes: see `Measurement`.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
+
     """
 
     READ: ClassVar[str] = "orbit"
@@ -149,18 +145,12 @@ class TurnByTurn(Shots):
 
     Attributes:
         readings: (x, y) in m, [shot, turn, monitor, 2]; NaN where missing, as behind a lost beam.
-        monitors: names, in the order of the readings.
-        noise: rms of one reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
-            (x, y), or a mapping of pairs by monitor, is taken too.
-        settings: of each shot, see `Measurement`; () for the design's in every shot.
-        shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data state about them (GeV); hints.
-        devices: names that the control system has for monitors and correctors, by the names here;
-            empty: unknown.
+            The other attributes are those of `Measurement`.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, no reading at all, or
             less than 16 or more than 10,000 turns.
+
     """
 
     readings: Array

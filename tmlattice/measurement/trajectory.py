@@ -62,13 +62,13 @@ class Measurement(Shots):
             "k1_relative", "k2_relative", or "frequency_relative" under the name "rf"; () for
             the design's in every shot.
         shots: their ids; () for 0, 1, ...
-        lattice: what the data state about the lattice; a hint.
-        energy: what the data state about the beam energy, GeV; a hint.
+        lattice, energy: what the data state about them (GeV); hints.
         devices: names that the control system has for monitors and correctors, by the names here;
             empty: unknown.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
+
     """
 
     OF_SHOTS: ClassVar[tuple[str, ...]] = ("launches", "launch_sigma")

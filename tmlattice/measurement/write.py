@@ -119,13 +119,14 @@ class MeasurementWriter:
         """Write one shot; nothing of it is kept but its id.
 
         Args:
-            launch: nominal x, px, y, py, delta, [5] (or [4], delta 0).
-            launch_sigma: their rms, [5] (or [4], delta exact); None: unknown.
+            launch, launch_sigma: nominal x, px, y, py, delta, [5] (or [4]), and their rms; None:
+                unknown.
             settings: see `Measurement`; None or {} for the design's.
             readings: m, [turn, monitor, 2], NaN where missing.
 
         Raises:
             MeasurementError: shapes or numbers that no reader would take, or a shot once more.
+
         """
         if shot in self._shots:
             raise MeasurementError(f"shot {shot} is written already; give each an id of its own")
@@ -192,18 +193,14 @@ def measurement_writer(
     The folder appears, whole, when the block ends; after an exception or Ctrl-C nothing is left.
 
     Args:
-        folder: made where it is not there.
-        monitors: names, in the order of the readings.
-        noise: rms of a reading, m: a pair (x, y), [monitor, 2], a mapping by monitor, or None.
-        lattice: name or path, a hint for the reader.
-        energy: GeV.
+        monitors, noise, lattice, energy, devices: see `Measurement`.
         force: a measurement that is there already is replaced.
-        devices: names of the control system, see `Measurement`.
 
     Raises:
         OutputError: it cannot be written.
         MeasurementError: names or noise that cannot be; no reading written; a folder that holds
             a measurement.
+
     """
     check_free(folder, force)
     with ExitStack() as stack:
