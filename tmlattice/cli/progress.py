@@ -1,8 +1,4 @@
-"""A progress line on a terminal, for every command that works for more than a few seconds.
-
->>> with shown("tmlattice diagnose", quiet):
-...     tell("noise")      # what is being done
-"""
+"""A progress line on a terminal, for every command that works for more than a few seconds."""
 
 import sys
 import threading

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from enum import StrEnum
 from inspect import signature
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tmlattice.by_name import by_name
-from tmlattice.errors import choice
+from tmlattice.errors import unknown_choice
 from tmlattice.fitting.adam import FitResult, Network, Regularization, fit_adam
 from tmlattice.fitting.map_fit import Prior, fit_map
 from tmlattice.fitting.sparse import (
@@ -28,21 +27,12 @@ from tmlattice.network import SymplecticNetwork, TaylorNetwork
 from tmlattice.observe.data import NOISE_FLOOR, first_turn
 
 
-class Method(StrEnum):
-    """Method of fine-tuning a network."""
-
-    ADAM = "adam"
-    MAP = "map"
-    SPARSE = "sparse"
-    KNOWN = "known"
-
-
 @by_name
 def fine_tune(
     network: Network,
     measurement: Measurement,
     *,
-    method: Method | str = "adam",
+    method: str = "adam",
     launch_sigma: ArrayLike | None = None,
     progress: bool = True,
     epochs: int = 1000,
@@ -92,29 +82,30 @@ def fine_tune(
         TmlatticeError: a measurement that cannot be fitted, see the methods.
     """
     given = dict(locals())
-    chosen = choice("method", method, Method)
-    fit = _FITS[chosen]
-    options = _options_of(fit, given, chosen)
-    if chosen is Method.KNOWN and not candidates:
+    if method not in _FITS:
+        raise unknown_choice("method", method, _FITS)
+    fit = _FITS[method]
+    options = _options_of(fit, given, method)
+    if method == "known" and not candidates:
         raise ValueError(
             "method 'known' needs the names of the magnets that may have changed: give candidates="
         )
     if fit is not fit_adam and isinstance(network, SymplecticNetwork):
         if network.ring is None:
-            raise ValueError(f"method '{chosen}' needs a network made from a ring")
+            raise ValueError(f"method '{method}' needs a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
     result = fit(network, measurement, **options)
-    if chosen is Method.ADAM:
+    if fit is fit_adam:
         _check_launches(network, measurement, launch_sigma)
     return _with_chi2(result, measurement)
 
 
-_FITS: dict[Method, Callable[..., FitResult]] = {
-    Method.ADAM: fit_adam, Method.MAP: fit_map, Method.SPARSE: fit_sparse, Method.KNOWN: fit_sparse,
+_FITS: dict[str, Callable[..., FitResult]] = {
+    "adam": fit_adam, "map": fit_map, "sparse": fit_sparse, "known": fit_sparse
 }  # fmt: skip
 
 
-def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: Method) -> dict[str, Any]:
+def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: str) -> dict[str, Any]:
     """Those of the arguments that the method has; ValueError: another one was given."""
     own = signature(fit).parameters
     options = {}

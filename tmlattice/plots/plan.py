@@ -1,6 +1,6 @@
 """The ring from above, with the findings."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -15,8 +15,7 @@ from tmlattice.plots.strip import COLOURS
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Small:
+class Small(NamedTuple):
     """Small symbols next to the orbit, and their offset as a share of the ring's size, outside
     positive."""
 
