@@ -65,7 +65,6 @@ class Case:
         parts: measurements by folder, see the module.
         options: of `diagnose`: background, effects.
         kinds: measurements that are diagnosed together; () of first turns.
-
     """
 
     name: str
@@ -121,7 +120,6 @@ class Truth:
         launches: true ones by part (fit, heldout, reference), [shot, 5].
         clean: readings without noise by part, and "before": those of the fit without the fault,
             [shot, monitor, 2], m. A case of kinds has neither.
-
     """
 
     name: str

@@ -68,7 +68,6 @@ def run(
 
     Returns:
         Results by case; a failed one has "error".
-
     """
     public = read_set(folder)
     described = check_lattice(folder / "challenge.json", public["lattice"], lattice)

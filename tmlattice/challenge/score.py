@@ -69,7 +69,6 @@ def score(
 
     Raises:
         TmlatticeError: no results.
-
     """
     from tmlattice import __version__
 

@@ -49,7 +49,6 @@ class FitResult(Speaks):
             that `sparse` selected, or all that `map` changed.
         launches: as fitted, [shot, n]; None if they were taken as exact.
         chi2: mean square of the residual over the noise; None if no noise is stated.
-
     """
 
     network: Network

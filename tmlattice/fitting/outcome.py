@@ -38,7 +38,6 @@ class MethodFit(Speaks):
         chi2: residual in units of the noise, per reading, or None.
         seconds: of wall clock.
         problem: why there are no tunes, or None.
-
     """
 
     method: str
@@ -221,7 +220,6 @@ class TuneFit(Speaks):
         turns: tracked for the tunes.
         source: origin of the data; None for the experiment's own.
         noise_estimated: whether the noise is estimated from neighbouring monitors.
-
     """
 
     ring: Ring

@@ -66,7 +66,6 @@ class Case:
             against readings without noise, m.
         found: magnets that the method identifies, or None if it identifies none.
         problem: error message, or None.
-
     """
 
     magnet: str

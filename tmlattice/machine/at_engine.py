@@ -80,7 +80,6 @@ class AtEngine:
         LatticeError: an element that AT cannot build, a negative radiation loss, or an RF too
             weak for the loss.
         EffectError, UnknownNameError: an effect, element or family that cannot be.
-
     """
 
     def __init__(
@@ -178,7 +177,6 @@ class AtEngine:
             LatticeError, UnknownNameError: a setting that its element does not have; no such
                 element.
             ValueError: launches or settings of another shape, or no turn.
-
         """
         start = np.asarray(launches, dtype=float)
         if start.ndim != 2 or start.shape[1] != 6:

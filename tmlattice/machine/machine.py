@@ -37,7 +37,6 @@ class Errors:
         causes, background: errors, and the rms of distributed ones by effect.
         seed, machine_seed: of the noise, of the background.
         more: further inputs: engine, particles, ...
-
     """
 
     ring: Ring

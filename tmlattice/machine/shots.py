@@ -38,7 +38,6 @@ class Shots:
     Attributes:
         nominal: (x, px, y, py, delta), [shot, 5]; `sigma` is the launches' rms about it, [5].
         launches: of the beam, OCELOT's six coordinates, [shot, 6].
-
     """
 
     nominal: Array

@@ -33,7 +33,6 @@ class Dispersion(OfMonitors):
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, a step of 0 Hz, or no
             orbit at all.
-
     """
 
     steps: tuple[RfStep, ...]

@@ -74,7 +74,6 @@ class OrbitResponse(OfMonitors):
 
     Raises:
         MeasurementError: shapes that do not fit, or numbers that cannot be.
-
     """
 
     correctors: tuple[str, ...]

@@ -120,7 +120,6 @@ class ClosedOrbit(Shots):
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
-
     """
 
     READ: ClassVar[str] = "orbit"
@@ -150,7 +149,6 @@ class TurnByTurn(Shots):
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, no reading at all, or
             less than 16 or more than 10,000 turns.
-
     """
 
     readings: Array

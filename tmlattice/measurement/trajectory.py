@@ -68,7 +68,6 @@ class Measurement(Shots):
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
-
     """
 
     OF_SHOTS: ClassVar[tuple[str, ...]] = ("launches", "launch_sigma")

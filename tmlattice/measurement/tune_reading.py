@@ -30,7 +30,6 @@ class TuneReading(Shown):
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or nothing measured.
-
     """
 
     tune: Array

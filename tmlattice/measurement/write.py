@@ -126,7 +126,6 @@ class MeasurementWriter:
 
         Raises:
             MeasurementError: shapes or numbers that no reader would take, or a shot once more.
-
         """
         if shot in self._shots:
             raise MeasurementError(f"shot {shot} is written already; give each an id of its own")
@@ -200,7 +199,6 @@ def measurement_writer(
         OutputError: it cannot be written.
         MeasurementError: names or noise that cannot be; no reading written; a folder that holds
             a measurement.
-
     """
     check_free(folder, force)
     with ExitStack() as stack:
