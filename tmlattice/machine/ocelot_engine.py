@@ -19,13 +19,7 @@ Array = NDArray[np.float64]
 class OcelotEngine:
     """A ring with causes, tracked through second-order maps.
 
-    Over many turns the RF replaces the design orbit's loss: see `beam.rf`.
-
-    Args:
-        voltage, harmonic: of the RF, see `rf_of`.
-    """
-
-    name = "ocelot"
+    Over many turns the RF replaces the design orbit's loss: see `beam.rf`."""
 
     def __init__(
         self,
@@ -34,13 +28,11 @@ class OcelotEngine:
         *,
         radiation_bends: float = 0.0,
         radiation_wigglers: float = 0.0,
-        voltage: float | None = None,
-        harmonic: int | None = None,
     ) -> None:
         scales = {"bends": radiation_bends, "wigglers": radiation_wigglers}
         lost = [Cause(f"radiation_loss_{what}", None, scale) for what, scale in scales.items()]
         known = [*causes, *(cause for cause in lost if cause.amount)]
-        self._there = replace(assembly(ring, known), rf=rf_of(ring, harmonic, voltage))
+        self._there = replace(assembly(ring, known), rf=rf_of(ring))
 
     def track(
         self,
