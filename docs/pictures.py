@@ -89,7 +89,7 @@ def tunes():
     from tmlattice.fitting.study import study_tune_fit
     from tmlattice.plots import plot_study
 
-    cases = study_tune_fit("petra3", magnets=57, workers=1, progress=False)
+    cases = study_tune_fit("petra3", magnets=57, jobs=1, progress=False)
     yield "tunes", plot_study(petra3(), cases, plt.figure(figsize=(11, 5.5), layout="constrained"))
 
 
@@ -125,7 +125,7 @@ def response():
 def together():
     """Turns, dispersion and tunes of one machine: readings, and the residuals of each."""
     from tmlattice.machine.stored_beam import simulate_dispersion, simulate_tunes, simulate_turns
-    from tmlattice.plots.parts import plot_parts
+    from tmlattice.plots.readings import plot_parts
 
     ring, weak = tmlattice.load_ring(SMALL), [Cause("quadrupole_gradient", "QD::5", -0.02)]
     read = {

@@ -32,7 +32,7 @@ from tmlattice.input_files import check_shape, content_of, json_of, yaml_of
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.machine_file import load_machine_file
 from tmlattice.network import TaylorNetwork
-from tmlattice.network.stored import load_network, save_network
+from tmlattice.network.network import load_network, save_network
 from tmlattice.report.interactive import as_plain
 
 BEAM = "beam, particle=electron, energy=3.0;"

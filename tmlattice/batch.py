@@ -120,7 +120,6 @@ def finished(folder: Path, keep: Iterable[str] | None = None) -> dict[str, dict[
     """The results that are there, by case; failed ones have a key "error".
 
     Args:
-        folder: of the results.
         keep: keys to keep of each; None: all.
     """
     results = {}
@@ -153,7 +152,6 @@ def run_batch(
         work: takes what a case needs and returns its result; importable by other processes.
         cases: by name, which is the file's: a function that loads what the case needs. It is
             called here, shortly before the case runs: the workers need no files of ours.
-        folder: of the results.
         jobs: local processes, one thread each; 1: this process; None: one a core.
         scheduler: address of a Dask scheduler, instead of local processes.
         progress: show a bar where there is a terminal.
@@ -294,11 +292,8 @@ class _Cluster:
         return future
 
     def check(self) -> None:
-        """See to it that somebody is at work.
-
-        Raises:
-            TmlatticeError: the scheduler is gone, or there has been no worker for long.
-        """
+        """See to it that somebody is at work; TmlatticeError: the scheduler is gone, or there has
+        been no worker for long."""
         if self._client.status != "running":
             raise TmlatticeError(
                 f"the Dask scheduler at '{self._address}' is gone; start it and run this again: "

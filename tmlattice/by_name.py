@@ -9,16 +9,13 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from typing import Any, TypeVar, cast
-
-from tmlattice.late import Method
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 MEASURED = ("measurement", "data", "reference", "heldout")
 """Parameters that are measurements."""
-
-_open = Method("tmlattice.importers.bring_in", "measured", "A measurement by its path or frame.")
 
 
 def by_name(function: F) -> F:
@@ -35,7 +32,9 @@ def by_name(function: F) -> F:
             value = given.get(name)
             if name == "ring":
                 if value is not None:
-                    given[name] = _ring(value)
+                    from tmlattice.lattice import load_ring
+
+                    given[name] = load_ring(value)
                 continue
             ring = given.get("ring", getattr(given.get("network"), "ring", None))
             if isinstance(value, Mapping) and not is_frame(value):  # a Dataset is a Mapping
@@ -48,20 +47,12 @@ def by_name(function: F) -> F:
 
 
 def _measured(value: Any, ring: Any) -> Any:
-    return _open.function(value, ring) if _is_path(value) or is_frame(value) else value
+    if not (isinstance(value, str | os.PathLike) or is_frame(value)):
+        return value
+    return import_module("tmlattice.importers.bring_in").measured(value, ring)
 
 
 def is_frame(value: Any) -> bool:
     """Whether it is a pandas DataFrame, or an xarray Dataset or DataArray."""
     frame = hasattr(value, "columns") and hasattr(value, "reset_index")
     return frame or (hasattr(value, "dims") and hasattr(value, "to_dataframe"))
-
-
-def _is_path(value: Any) -> bool:
-    return isinstance(value, str | os.PathLike)
-
-
-def _ring(lattice: Any) -> Any:
-    from tmlattice.lattice import load_ring
-
-    return load_ring(lattice)

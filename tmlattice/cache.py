@@ -50,12 +50,7 @@ def is_private(state: os.stat_result) -> bool:
 
 
 def private_or_warn(place: Path, variable: str = "TMLATTICE_CACHE") -> bool:
-    """`is_private`, of a folder that is there and no link; a warning where it is not.
-
-    Args:
-        place: the folder.
-        variable: of the environment, which names another one.
-    """
+    """`is_private`, of a folder that is there and no link; a warning where it is not."""
     state = os.lstat(place)
     if stat.S_ISDIR(state.st_mode) and is_private(state):
         return True
@@ -127,15 +122,8 @@ def key(*parts: object) -> str:
 
 
 def load(name: str, read: Callable[[bytes], Value]) -> Value | None:
-    """The entry of a key, as `read` makes it of its bytes.
-
-    Args:
-        name: of `key`.
-        read: raises where the bytes are not what it expects.
-
-    Returns:
-        None where there is no entry, or a damaged one.
-    """
+    """The entry of a key, as `read` makes it of its bytes: None where there is no entry, or a
+    damaged one."""
     try:
         with _opened() as place:
             content = b"" if place is None else _content(name, place)
@@ -153,11 +141,8 @@ def load(name: str, read: Callable[[bytes], Value]) -> Value | None:
 
 
 def check_form(array: Any, shape: tuple[int, ...], below: int | None = None) -> None:
-    """Refuse an array of another form than an entry's: of floats, or of indices below a number.
-
-    Raises:
-        ValueError: it has another one.
-    """
+    """Refuse an array of another form than an entry's: of floats, or of indices below a number;
+    ValueError: it has another one."""
     right = array.shape == shape and array.dtype == ("float64" if below is None else "int64")
     if right and below is not None and array.size:
         right = 0 <= array.min() <= array.max() < below

@@ -3,6 +3,10 @@
 import difflib
 import unicodedata
 from collections.abc import Iterable, Sequence
+from enum import StrEnum
+from typing import TypeVar
+
+Choice = TypeVar("Choice", bound=StrEnum)
 
 
 def harmless(text: str) -> str:
@@ -22,7 +26,6 @@ def plain(text: str, longest: int | None = None) -> str:
     """A text from a file as it may be shown: in one line, `harmless`.
 
     Args:
-        text: as it stands in the file.
         longest: characters; what is beyond is left out.
     """
     shown = harmless(" ".join(text.split()))
@@ -90,7 +93,6 @@ def missing_package(
     """The error for a package of an extra.
 
     Args:
-        error: of the import.
         what: needs it, as the subject of the sentence.
         extra: brings it.
         instead: another way, if there is one.
@@ -105,6 +107,14 @@ def missing_package(
 def unknown_choice(kind: str, name: object, known: Iterable[str]) -> ChoiceError:
     """The error for a word that is none of a short list; all of them are named."""
     return ChoiceError(f"no {kind} '{name}'; there are {', '.join(known)}")
+
+
+def choice(kind: str, name: str, known: type[Choice]) -> Choice:
+    """The member of an enumeration; a `ChoiceError` names all of them."""
+    try:
+        return known(name)
+    except ValueError:
+        raise unknown_choice(kind, name, known) from None
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:

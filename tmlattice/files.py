@@ -142,11 +142,8 @@ def _pour(made: Path, device: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Know before the work whether a file can be written there; nothing is left behind.
-
-    Raises:
-        OutputError: the folder is not there or cannot be written.
-    """
+    """Know before the work whether a file can be written there; nothing is left behind;
+    OutputError: the folder is not there or cannot be written."""
     try:
         if path.is_dir():
             raise OutputError(f"'{path}' is a folder; name a file")

@@ -34,11 +34,7 @@ MOST_YAML, MOST_NODES, DEEPEST = 4 << 20, 100_000, 20
 
 
 def check_regular(path: Path, error: type[TmlatticeError]) -> int:
-    """Size of a file in bytes.
-
-    Raises:
-        error: no such file, or a folder, pipe or device.
-    """
+    """Size of a file in bytes; error: no such file, or a folder, pipe or device."""
     try:
         status = path.stat()
     except (OSError, ValueError) as problem:
@@ -92,11 +88,6 @@ def zip_of(path: Path, error: type[TmlatticeError], wanted: str) -> BytesIO:
     """The content of a ZIP archive (NumPy's and torch's arrays) whose parts are not compressed,
     so that together they are as large as the file.
 
-    Args:
-        path: the file.
-        error: raised.
-        wanted: what it should hold, and where that is from.
-
     Raises:
         error: as of `content_of`, no archive, or compressed parts.
     """
@@ -116,17 +107,7 @@ def zip_of(path: Path, error: type[TmlatticeError], wanted: str) -> BytesIO:
 
 
 def check_no_code(file: Path, lattice: str, error: type[TmlatticeError], instead: str) -> None:
-    """Whether a lattice that a file of data names is data too.
-
-    Args:
-        file: names it.
-        lattice: a built-in name or a path.
-        error: raised.
-        instead: how a user who trusts it has it run.
-
-    Raises:
-        error: it is Python code.
-    """
+    """Whether a lattice that a file of data names is data too; error: it is Python code."""
     if Path(lattice).suffix.casefold() == ".py":
         raise error(
             f"{file}: its lattice '{plain(lattice, 60)}' is Python code, which would be run; "
@@ -135,11 +116,8 @@ def check_no_code(file: Path, lattice: str, error: type[TmlatticeError], instead
 
 
 def text_of(path: Path, error: type[TmlatticeError]) -> str:
-    """The text of a file in UTF-8.
-
-    Raises:
-        error: as of `content_of`, or another encoding, with the line.
-    """
+    """The text of a file in UTF-8; error: as of `content_of`, or another encoding, with the
+    line."""
     try:
         return content_of(path, error).decode("utf-8-sig")
     except UnicodeDecodeError as problem:
@@ -151,8 +129,6 @@ def json_of(path: Path, error: type[TmlatticeError], finite: bool = True) -> Any
     """The value of a JSON file.
 
     Args:
-        path: the file.
-        error: raised.
         finite: whether NaN and Infinity, which are no JSON, are refused.
 
     Raises:
@@ -205,11 +181,7 @@ def _whole(digits: str) -> int:
 
 
 def number(text: str) -> float:
-    """A number of a table, also one with an exponent of Fortran, such as `1.5D-3`.
-
-    Raises:
-        ValueError: it is none; `1_000`, which Python takes for one, is none either.
-    """
+    """A number of a table, also one with an exponent of Fortran, such as `1.5D-3`."""
     return float(_FORTRAN.sub("e", text.replace("_", "?")))
 
 
@@ -262,12 +234,8 @@ def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:
 
 
 def toml_of(path: Path, error: type[TmlatticeError]) -> dict[str, Any]:
-    """The value of a TOML file, of the size and depth that a YAML file may have.
-
-    Raises:
-        error: as of `text_of`, or no TOML, with the line; a number that is not finite; or too much
-            of it.
-    """
+    """The value of a TOML file, of the size and depth that a YAML file may have; error: as of
+    `text_of`, or no TOML, with the line; a number that is not finite; or too much of it."""
     if check_regular(path, error) > MOST_YAML:
         raise error(f"'{path}' is larger than {MOST_YAML >> 20} MB; write less of it")
     text = text_of(path, error)
@@ -305,11 +273,8 @@ def schema_of(name: str) -> Any:
 
 
 def check_shape(path: Path, value: Any, schema: str, error: type[TmlatticeError]) -> None:
-    """Whether what stands in a file has the types and values of its schema.
-
-    Raises:
-        error: it has not; with the place, what stands there and what is expected.
-    """
+    """Whether what stands in a file has the types and values of its schema; error: it has not; with
+    the place, what stands there and what is expected."""
     from jsonschema.exceptions import best_match
 
     wrong = best_match(schema_of(schema).iter_errors(value))

@@ -20,7 +20,6 @@ class Method:
 
     Args:
         module, name: where the function is.
-        doc: what it does, for `help`.
     """
 
     def __init__(self, module: str, name: str, doc: str) -> None:

@@ -216,7 +216,6 @@ def ring_tunes(ring: Ring, energy: float = 0.0) -> list[float] | None:
     there are none.
 
     Args:
-        ring: with its errors.
         energy: relative deviation of the beam's.
     """
     try:
@@ -396,11 +395,10 @@ def off_momentum(network: LayerChain, length: float, delta: float = 1e-4) -> Off
         path, total = _on_closed_orbit(network, side)
         tunes.append(matrix_tunes(total[-1, :4, :4]))
         paths.append(path)
-    shift = (tunes[0] - tunes[1] + 0.5) % 1.0 - 0.5  # a tune may cross an integer in between
     change = (paths[0] - paths[1]) / (2 * delta)
     slip = change[-1, 4] - change[0, 4]  # tau is c t: later is positive
     return OffMomentum(
-        chromaticity=shift / (2 * delta),
+        chromaticity=short_way(tunes[0] - tunes[1]) / (2 * delta),  # a tune may cross an integer
         s=np.concatenate([[0.0], network.maps.s]),
         dispersion=change[:-1][:, [0, 2]],
         momentum_compaction=float(slip / length),

@@ -67,12 +67,7 @@ def temporary_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold a folder's lock, or go on without it where it is not to be had for `PATIENCE`.
-
-    Args:
-        folder: of an output.
-        shared: among those who read it.
-    """
+    """Hold a folder's lock, or go on without it where it is not to be had for `PATIENCE`."""
     descriptor = None
     with suppress(OSError):  # a folder is no file that every system opens
         descriptor = os.open(folder, os.O_RDONLY)

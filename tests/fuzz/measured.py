@@ -57,7 +57,7 @@ def write_known(folder):
 def write_network(ten, folder):
     """Weights of a network, beside turns."""
     from tmlattice.network import TaylorNetwork
-    from tmlattice.network.stored import save_network
+    from tmlattice.network.network import save_network
 
     save_network(TaylorNetwork.from_ring(ten), folder / "network.pt")
     words = ["diagnose", "ring.json", "turns", "--network", "network.pt"]

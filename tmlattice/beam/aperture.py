@@ -26,11 +26,8 @@ def lost(states: Array) -> NDArray[np.bool_]:
 
 
 def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) -> None:
-    """Raise where a trajectory of states [block, layer + 1, n, lane] has left the aperture.
-
-    Raises:
-        BeamLostError: names the trajectory and the layer where it was lost.
-    """
+    """Raise where a trajectory of states [block, layer + 1, n, lane] has left the aperture;
+    BeamLostError: names the trajectory and the layer where it was lost."""
     last = states[:, -1]
     if np.isfinite(last).all() and np.abs(last).max(initial=0.0) < APERTURE:
         return

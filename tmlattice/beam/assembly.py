@@ -48,9 +48,6 @@ class Assembly:
     """A ring with known causes, its layers, and the directions of hypotheses in them.
 
     Attributes:
-        design, known: arguments.
-        ring: with the known causes.
-        layers, maps: of that ring.
         rf: see `rf_of`.
     """
 
@@ -165,15 +162,7 @@ def assembly(ring: Ring, known: Sequence[Cause] = (), dimension: int = 6) -> Ass
 
 
 class Group:
-    """Shots with equal settings, and the layers of their ring.
-
-    Args:
-        number: of the group.
-        shots: of it.
-        settings: theirs.
-        active: whether causes act.
-        there: the ring with the known causes.
-    """
+    """Shots with equal settings, and the layers of their ring."""
 
     def __init__(
         self,
@@ -200,12 +189,7 @@ class Group:
         causes: Sequence[Cause],
         made: dict[tuple[int, tuple[Cause, ...], int], LayerParts],
     ) -> dict[int, LayerParts]:
-        """Return the layers of causes, with these causes.
-
-        Args:
-            causes: that act on elements.
-            made: cache: groups share layers without settings, and one fit those of the next.
-        """
+        """Return the layers of causes, with these causes."""
         touching: dict[int, list[Cause]] = {}
         for cause in causes:
             for layer in self.there.layers_of(cause):

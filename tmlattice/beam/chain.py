@@ -5,6 +5,7 @@
 >>> chain.track([[1e-5, 0, 1e-5, 0]], turns=500)        # [1, 501, 4]
 """
 
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -14,7 +15,7 @@ from tmlattice.beam import sweeps
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.aperture import APERTURE, check_alive, lost
 from tmlattice.beam.layers import Layers
-from tmlattice.beam.rf import NO_RF, Cavities
+from tmlattice.beam.rf import NO_RF
 from tmlattice.beam.sweeps import curved
 from tmlattice.by_name import by_name
 from tmlattice.errors import BeamLostError, UnstableRingError
@@ -52,8 +53,6 @@ def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Arra
 
     Args:
         turn: one-turn matrix, [n, n].
-        free: free coordinates of the start.
-        rows: coordinates that should repeat, as many.
 
     Raises:
         UnstableRingError: the matrix is singular.
@@ -66,21 +65,15 @@ def closing(turn: Array, free: NDArray[np.intp], rows: NDArray[np.intp]) -> Arra
     return solve
 
 
-def first_pass(
-    weights: tuple[Array, Array, Array], maps: RingMaps, start: Array
-) -> tuple[Array, Array]:
-    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane] of a pass.
-
-    Raises:
-        BeamLostError: names the layer where a trajectory was lost.
-    """
+def first_pass(weights: Sequence[Array], maps: RingMaps, start: Array) -> tuple[Array, Array]:
+    """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane], from
+    launches [batch, n]."""
     W0, W1, W2 = weights
     size = sweeps.size_of(start.shape[1], len(start))
     packed = sweeps.pack(start, len(size[1]))
     states = np.empty((len(packed), len(W0) + 1, *packed.shape[1:]))
     states[:, 0] = packed
     sweeps.run(sweeps.forward, len(packed), size, W0, W1, W2, curved(W2), states)
-    check_alive(states, maps, size, len(start))
     readings = np.empty((len(packed), len(maps.at), 2, len(size[1])))
     out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
     sweeps.run(sweeps.read, len(packed), size, *out, states, readings)
@@ -91,10 +84,6 @@ class LayerChain:
     """Common part of chains of layers: names, launches, tracking, the one-turn map.
 
     A chain defines how its layers act on states (`_forward`, `_track`, `tangents`).
-
-    Attributes:
-        maps: names and positions of layers and monitors.
-        ring: the ring of these maps, if known.
     """
 
     maps: RingMaps
@@ -251,9 +240,6 @@ class Chain(LayerChain):
     Layer k sends the state x at the exit of magnet k - 1 to W0[k] + W1[k] x + W2[k] x^[2] at the
     exit of magnet k. States are OCELOT's (x, px, y, py), or (x, px, y, py, tau, p), in m and units
     of the reference momentum.
-
-    Args:
-        maps: weights and read-outs of a ring.
     """
 
     def __init__(self, maps: RingMaps) -> None:
@@ -277,14 +263,10 @@ class Chain(LayerChain):
         return self.maps.W0, self.maps.W1, self.maps.W2
 
     def readings(self, launch: ArrayLike) -> Array:
-        """Return (x, y) at every monitor on one pass, [batch, monitor, 2], m.
-
-        Raises:
-            BeamLostError: names the layer where a trajectory was lost.
-            ValueError: a launch of another shape.
-        """
+        """Return (x, y) at every monitor on one pass, [batch, monitor, 2], m."""
         start = self._start(launch)
-        _, readings = first_pass(self.weights(), self.maps, start)
+        states, readings = first_pass(self.weights(), self.maps, start)
+        check_alive(states, self.maps, sweeps.size_of(self.dimension, len(start)), len(start))
         return sweeps.unpack(readings, len(start))
 
     def turn(self) -> Layers:
@@ -302,23 +284,10 @@ class Chain(LayerChain):
     def tangents(self, x: Array) -> tuple[Array, Array]:
         """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state /
         d launch there, [layer + 2, n, n]."""
-        return self.trajectory(x)
-
-    def trajectory(
-        self, x: ArrayLike, turns: int = 1, cavities: Cavities = NO_RF
-    ) -> tuple[Array, Array]:
-        """Return the same over many turns, with the RF: [step + 1, n] and [step + 1, n, n], a turn
-        of layer + 1 steps.
-
-        Args:
-            x: launch, [n].
-            turns: at least 1.
-            cavities: in six coordinates; see `beam.rf`.
-        """
         turn, n = self.turn(), self.dimension
-        states = np.empty((1, turns * turn.steps + 1, n))
+        states = np.empty((1, turn.steps + 1, n))
         tangents = np.empty((*states.shape, n))
         states[0, 0], tangents[0, 0] = x, np.eye(n)
-        rf = cavities.exits, cavities.values
+        rf = NO_RF.exits, NO_RF.values
         kernels.trajectories(0, 1, *turn.W, turn.curved, *rf, states, tangents)
         return states[0], tangents[0]

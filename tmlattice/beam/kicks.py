@@ -35,8 +35,6 @@ def orbits_of_kicks(
     """Closed orbit for a kick behind each of some magnets, m, [place, source].
 
     Args:
-        model: of the ring.
-        sources: magnets.
         exits: number of magnets before each place, [place].
         rows: d orbit / d state there, [place, n].
         kicks: changes of the state, [source, n]; or the plane, for 1 rad each.
@@ -57,8 +55,6 @@ def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
     share, which changes the energy of the step.
 
     Args:
-        model: of the ring, six coordinates.
-        step: relative, of the frequency.
         plane: 0 or 1.
     """
     rows = model.reading_slopes[:, plane]
@@ -71,13 +67,7 @@ def dispersion_of_kicks(model: ResponseModel, step: float, plane: int) -> Array:
 
 def dispersion_behind(model: ResponseModel, layers: Sequence[int] | Indices, plane: int) -> Array:
     """Change of the dispersion behind some layers by a kick of 1 rad behind each magnet that kicks
-    in a plane, m per relative energy, [layer, source].
-
-    Args:
-        model: of the ring, six coordinates.
-        layers: indices.
-        plane: 0 or 1.
-    """
+    in a plane, m per relative energy, [layer, source] (plane: 0 or 1)."""
     behind = np.asarray(layers) + 1
     rows = model.tangents[behind][:, 2 * plane]
     orbits = orbits_of_kicks(model, kicking(model.ring, plane), behind, rows, plane)
@@ -112,8 +102,6 @@ def by_energy(
     monitors.
 
     Args:
-        model: of the ring, six coordinates.
-        names: of the correctors.
         at: indices of the monitors among the ring's, [monitor].
         at_monitors: the RF's orbit over the energy of its step in the model, m, [monitor, 2].
         at_correctors: in the plane of each, m per relative energy, [corrector].

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
-from tmlattice.maps.magnets import Weights
+from tmlattice.maps.quadratic import Weights
 
 Array = NDArray[np.float64]
 LayerParts = tuple[Weights, list[Weights]]

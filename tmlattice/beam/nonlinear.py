@@ -53,11 +53,7 @@ class NonlinearTurn:
 
 
 def nonlinear_turn(layers: LayerMaps) -> NonlinearTurn:
-    """Return the steps of a ring.
-
-    Args:
-        layers: of the ring, six coordinates.
-    """
+    """Return the steps of a ring."""
     n, ring = layers.dimension, layers.ring
     maps: list[Any] = []
     kicks: list[tuple[complex, complex, float]] = []
@@ -106,9 +102,6 @@ def track(
     Args:
         states: at the start of the ring, [shot, n].
         turns: at least 1.
-        way: the ring's turn.
-        maps: of the same ring, for its monitors.
-        cavities: of the ring.
     """
     readings = np.full((len(states), turns, len(maps.at), 2), np.nan)
     share(

@@ -22,7 +22,6 @@ class Lost:
 
     Attributes:
         shot, turn: from 0.
-        element: the magnet in which it left the aperture.
     """
 
     shot: int
@@ -33,15 +32,14 @@ class Lost:
         return f"shot {self.shot} is lost on turn {self.turn} in '{self.element}'"
 
 
-def lost(states: Array, names: tuple[str, ...], aperture: float = APERTURE) -> tuple[Lost, ...]:
+def lost(states: Array, names: tuple[str, ...]) -> tuple[Lost, ...]:
     """Return the shots whose beam leaves the aperture, and where.
 
     Args:
         states: at the start and at every exit, turn by turn, [shot, step + 1, n].
         names: of the layers; a turn has one step more, the drift to its end.
-        aperture: m.
     """
-    outside = ~np.all(np.abs(states[:, :, 0:3:2]) < aperture, axis=2)  # true for NaN
+    outside = ~np.all(np.abs(states[:, :, 0:3:2]) < APERTURE, axis=2)  # true for NaN
     found = []
     for shot in np.flatnonzero(outside.any(axis=1)):
         turn, step = divmod(max(int(outside[shot].argmax()) - 1, 0), len(names) + 1)
@@ -49,21 +47,13 @@ def lost(states: Array, names: tuple[str, ...], aperture: float = APERTURE) -> t
     return tuple(found)
 
 
-def positions(
-    launches: Array,
-    turns: int,
-    layers: Layers,
-    cavities: Cavities = NO_RF,
-    aperture: float = APERTURE,
-) -> Array:
+def positions(launches: Array, turns: int, layers: Layers, cavities: Cavities = NO_RF) -> Array:
     """Return (x, y) at every monitor on every turn, [shot, turn, monitor, 2], m; NaN if lost.
 
     Args:
         launches: [shot, n].
         turns: at least 1.
-        layers: of the turn.
         cavities: in six coordinates; none on a single turn.
-        aperture: m.
     """
     n, at = launches.shape[1], layers.at
     size = sweeps.size_of(n, len(launches))
@@ -82,7 +72,7 @@ def positions(
             sweeps.run(sweeps.forward, *way, states)
         sweeps.run(sweeps.read, len(states), size, *layers.R, bent, at, states, readings)
         beam[:, turn] = sweeps.unpack(readings, len(launches))
-        inside = np.abs(states[:, :, 0:3:2]).max(axis=2) < aperture  # [block, exit, lane]
+        inside = np.abs(states[:, :, 0:3:2]).max(axis=2) < APERTURE  # [block, exit, lane]
         inside = sweeps.unpack(np.logical_and.accumulate(inside, axis=1), len(launches))
         beam[:, turn][~(inside[:, at] & alive[:, None])] = np.nan
         alive &= inside[:, -1]

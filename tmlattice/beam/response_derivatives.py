@@ -20,8 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import KICK, ResponseModel
-from tmlattice.beam.feed_down import feed_down
+from tmlattice.beam.closed_orbit import KICK, ResponseModel, feed_down
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions, ring_effect
 from tmlattice.errors import EffectError
@@ -44,17 +43,11 @@ def derivatives(
     """Yield d (orbit response) / d amount of effects.
 
     Args:
-        model: the ring of the linearisation; its monitors read without errors.
-        hypotheses: (effect, place) of the catalogue, of effects on the ring.
         correctors: names; None: all of the ring, in beam order.
 
     Yields:
         For each hypothesis [corrector + 1, monitor, 2]: m/rad per unit for the correctors; and in
         the last row the RF's, m per relative step per unit, 0 in four coordinates.
-
-    Raises:
-        EffectError: an effect that does not act on the ring.
-        UnknownNameError, MeasurementError: see `ResponseModel.columns`.
     """
     slopes = ResponseSlopes(model, correctors)
     return map(slopes.whole, slopes.factors(hypotheses))
@@ -122,7 +115,6 @@ class ResponseSlopes:
 
         Args:
             hypotheses: see `factors`.
-            at: indices of the monitors.
             plane: of each column's readings, the RF's last, [column].
         """
         parts = []
@@ -140,11 +132,8 @@ class ResponseSlopes:
             yield out
 
     def factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
-        """Yield the derivative by each hypothesis, in factors.
-
-        Raises:
-            EffectError: an effect that does not act on the ring.
-        """
+        """Yield the derivative by each hypothesis, in factors; EffectError: an effect that does not
+        act on the ring."""
         for name, _ in hypotheses:
             if not isinstance(find(name), RingEffect):
                 raise EffectError(f"'{name}' does not act on the ring; it has no such derivative")

@@ -62,7 +62,6 @@ def rf_of(ring: Ring, harmonic: int | None = None, voltage: float | None = None)
     """Return the RF of a ring: its cavities, else its marker or drift named `rf`, else its end.
 
     Args:
-        ring: the design.
         harmonic: else that of the ring's first cavity, else the one nearest to 499.65 MHz.
         voltage: of all cavities, V; else that of the ring's, else four times the expected loss.
     """
@@ -129,18 +128,7 @@ def cavities(
     ring: Ring, rf: Rf, layer_of: Sequence[int] | NDArray[np.intp], loss: float, frequency: float
 ) -> Cavities:
     """Return thin cavities behind the magnets before them; the drift between commutes with a gain
-    of energy to second order.
-
-    Args:
-        ring: with its elements.
-        rf: of the ring.
-        layer_of: the layer of each element.
-        loss: relative energy loss of a turn on the design orbit.
-        frequency: relative change of the frequency.
-
-    Raises:
-        LatticeError: a voltage below the loss.
-    """
+    of energy to second order; LatticeError: a voltage below the loss."""
     if not rf.on(loss, frequency) or rf.voltage == 0:
         return NO_RF
     crest = rf.voltage / (ring.energy * 1e9 * ring.beta)

@@ -12,7 +12,6 @@ def settle(  # type: ignore[no-untyped-def]
     """Find closed orbits by Broyden's method from a given Jacobian.
 
     Args:
-        first, last: orbits of this call.
         W0, W1, W2, curved: the ring's maps, the closing drift last, [map, ...].
         layer: the map that is replaced, [orbit].
         V0, V1, V2: its replacement, [orbit, ...].

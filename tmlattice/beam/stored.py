@@ -25,8 +25,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.feed_down import feed_down
+from tmlattice.beam.closed_orbit import ResponseModel, feed_down
 from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.effects.directions import Directions, directions_nearby
 from tmlattice.errors import UnstableRingError
@@ -75,13 +74,9 @@ class StoredBeam:
         rf: cavities that act on the oscillation; six coordinates.
 
     Attributes:
-        rf: as given.
         tunes: Q of the modes that are nearer to x and to y, in [0, 1).
         modes: their vectors at the monitors, [monitor, 2, mode]: the beam is at
             Re(sum_mode a E exp(2 pi i Q turn)), a any complex number.
-
-    Raises:
-        UnstableRingError: the beam does not oscillate.
     """
 
     def __init__(self, model: ResponseModel, rf: Cavities = NO_RF) -> None:
@@ -105,11 +100,8 @@ class StoredBeam:
         self.modes: ComplexArray = self._G @ self._U
 
     def launched(self, amplitude: ComplexArray) -> Array:
-        """State at the start of the ring after a kick, [..., n].
-
-        Args:
-            amplitude: of the modes at turn 0, [..., mode].
-        """
+        """State at the start of the ring after a kick, [..., n] (amplitude: of the modes at turn 0,
+        [..., mode])."""
         kicked = np.real(amplitude @ self._U.T)
         kicked[..., TRANSVERSE:] = 0.0  # a kick changes neither energy nor time
         return np.asarray(self.model.state + kicked)
@@ -120,11 +112,8 @@ class StoredBeam:
         return Moved(self.model.readings, self.tunes, self.modes)
 
     def moved(self, hypotheses: Sequence[Hypothesis]) -> Moved:
-        """Return the derivatives by effects on the ring.
-
-        Args:
-            hypotheses: (effect, place), of effects on the ring.
-        """
+        """Return the derivatives by effects on the ring (hypotheses: (effect, place), of effects on
+        the ring)."""
         model, count = self.model, len(hypotheses)
         monitors = len(model.maps.at)
         moved = Moved(
@@ -234,11 +223,7 @@ def _nearest(
     turn: Array, tunes: ComplexArray, modes: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """Eigenvalues and vectors of a turn with RF: first the two nearest to those of the transverse
-    motion alone, then the others.
-
-    Raises:
-        UnstableRingError: the RF makes one of them grow.
-    """
+    motion alone, then the others; UnstableRingError: the RF makes one of them grow."""
     values, vectors = np.linalg.eig(turn)
     chosen: list[int] = []
     for mode in (0, 1):

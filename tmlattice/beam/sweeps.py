@@ -206,12 +206,8 @@ def curved(W2: Array) -> NDArray[np.bool_]:
 
 def size_of(n: int, batch: int) -> Size:
     """Compile-time constants of the kernels, as lengths: the dimension and the lanes."""
-    return (None,) * n, (None,) * lanes_for(batch)
-
-
-def lanes_for(batch: int) -> int:
-    """Number of trajectories in a block for a batch of this size."""
-    return next((lanes for lanes in LANES if batch <= lanes), LANES[-1])
+    lanes = next((lanes for lanes in LANES if batch <= lanes), LANES[-1])
+    return (None,) * n, (None,) * lanes
 
 
 def pack(rows: Array, lanes: int) -> Array:

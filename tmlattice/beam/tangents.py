@@ -132,7 +132,6 @@ def carry(first, last, owner, start, launch_kick, G, out):  # type: ignore[no-un
     """out [hypothesis, shot, reading, 2] += G v: kicks carried to all readings downstream.
 
     Args:
-        first, last: shots.
         owner: hypothesis of each row, [row].
         start: the first reading downstream of the row, [row, turn].
         launch_kick: the kick as a change of the launch, C^-1 kick, [shot, turn, row, n].

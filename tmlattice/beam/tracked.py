@@ -29,7 +29,7 @@ from tmlattice.effects import (
     find,
     monitors_with,
 )
-from tmlattice.effects.settings import groups
+from tmlattice.effects.apply import groups
 from tmlattice.lattice import Ring
 
 Array = NDArray[np.float64]
@@ -53,7 +53,6 @@ class Paths:
         states, tangents: at every exit, [shot, step + 1, n], [shot, step + 1, n, n].
         beam_launch: d beam / d launch, all coordinates, [shot, reading, 2, n].
         monitors: d reading / d beam, [shot, monitor, 2, 2].
-        monitors_of: the monitors of the shots in which causes act.
     """
 
     readings: Array
@@ -73,21 +72,12 @@ class TrackedShots:
     sets the frequency: see `rf`. On one turn cavities are drifts.
 
     Args:
-        ring: the design.
-        settings: of each shot.
-        turns: of each shot.
         known: causes that are no hypotheses (radiation, if asked for).
         dimension: 6; 4 if no cause changes the energy.
         active: shots in which causes act; the others are of the ring without, [shot].
 
     Attributes:
-        ring, layers, maps: with the known causes.
-        groups: shots with equal settings.
-        steps: of a turn.
         where: index of the state of each reading, [reading].
-
-    Raises:
-        LatticeError: an RF that cannot replace the loss.
     """
 
     def __init__(
@@ -211,7 +201,6 @@ class TrackedShots:
 
         Args:
             launches: (x, px, y, py, delta), [shot, 5].
-            causes: of all three kinds.
             kicks: by layer, in the middle of its magnet, for each shot, [shot, 2], rad.
         """
         return self._read(self.beam(launches, causes, kicks), self._monitors(causes))

@@ -61,11 +61,8 @@ class Case:
     """Public part of a case.
 
     Attributes:
-        name: of the case.
         lattice: argument of `load_ring`.
-        parts: measurements by folder: fit, heldout and perhaps reference of first turns; or one of
-            each kind by its name, and `before_KIND` of the machine before the fault; and `learnt`,
-            an orbit response of that machine.
+        parts: measurements by folder, see the module.
         options: of `diagnose`: background, effects.
         kinds: measurements that are diagnosed together; () of first turns.
     """
@@ -112,20 +109,17 @@ class Truth:
     """Secret part of a case.
 
     Attributes:
-        name, tier: of the case.
         causes: of the catalogue; () for an unknown and for no effect.
         unknown: a fault that is not in the catalogue: kind, element, s, amount; or None. For an
             effect that was removed from the catalogue the kind is "taken_out" and the effect is in
             `causes`.
         signal_to_noise: of each cause alone, or of the unknown; NaN without a signal.
-        total: signal to noise of all together.
+        total: signal to noise of all together; `alone`: in each kind of several.
         background: rms of distributed errors, by effect.
         amplitude, noise: m; of a case of kinds 0, and in units of each kind's usual noise.
-        seed: of the case.
         launches: true ones by part (fit, heldout, reference), [shot, 5].
         clean: readings without noise by part, and "before": those of the fit without the fault,
             [shot, monitor, 2], m. A case of kinds has neither.
-        alone: signal to noise in each kind of a case of several kinds.
     """
 
     name: str
@@ -174,30 +168,20 @@ def _write_truth(folder: Path, truth: Truth) -> None:
     arrays |= {f"clean_{k}": v for k, v in truth.clean.items()}
     with output_file(folder / f"{truth.name}.npz") as path, path.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
+    apart = {"name", "launches", "clean"} | ({"alone"} if not truth.alone else set())
     document = {
         "format": TRUTH,
         "version": 1,
-        "tier": truth.tier,
+        **{key: value for key, value in vars(truth).items() if key not in apart},
         "causes": [vars(cause) for cause in truth.causes],
-        "unknown": None if truth.unknown is None else dict(truth.unknown),
-        "signal_to_noise": list(truth.signal_to_noise),
-        "total": truth.total,
-        "background": dict(truth.background),
-        "amplitude": truth.amplitude,
-        "noise": truth.noise,
-        "seed": truth.seed,
-        **({"alone": dict(truth.alone)} if truth.alone else {}),
     }
     with output_file(folder / f"{truth.name}.json") as path:
         write_json(path, document)
 
 
 def read_set(folder: Path) -> dict[str, Any]:
-    """Return the public description of a challenge.
-
-    Raises:
-        TmlatticeError: no challenge in the folder, or a damaged description.
-    """
+    """Return the public description of a challenge; TmlatticeError: no challenge in the folder, or
+    a damaged description."""
     path = folder / "challenge.json"
     found = _read(path, SET)
     if found["tier"] not in TIERS:
@@ -211,16 +195,8 @@ def case_names(folder: Path) -> list[str]:
 
 
 def check_lattice(place: Path, lattice: Any, trusted: str | None) -> str:
-    """Return a challenge's lattice, if loading it runs only code that the caller trusts.
-
-    Args:
-        place: file with the name, for the error.
-        lattice: a built-in name or a path.
-        trusted: the lattice whose code may be run.
-
-    Raises:
-        TmlatticeError: Python code that is not trusted, or no name.
-    """
+    """Return a challenge's lattice, if loading it runs only code that the caller trusts;
+    TmlatticeError: Python code that is not trusted, or no name."""
     if not isinstance(lattice, str) or not lattice:
         raise TmlatticeError(f"{place}: its lattice is {lattice!r:.40}; it should be a name")
     if lattice != trusted:
@@ -234,11 +210,8 @@ CONTENTS = "lattice_contents"
 
 
 def check_contents(folder: Path, described: Mapping[str, Any]) -> None:
-    """Raise if the lattice differs from the one of the challenge, where that is recorded.
-
-    Raises:
-        TmlatticeError: it differs.
-    """
+    """Raise if the lattice differs from the one of the challenge, where that is recorded;
+    TmlatticeError: it differs."""
     known = described.get(CONTENTS)
     if known not in (None, fingerprint(contents(ring_of(described["lattice"])))):
         raise TmlatticeError(
@@ -302,14 +275,8 @@ def read_truth(folder: Path, name: str) -> Truth:
             raise ValueError(f"{len(truth.causes)} causes are none of tier {truth.tier}")
         return truth
     except (
-        OSError,
-        ArithmeticError,
-        LookupError,
-        TypeError,
-        ValueError,
-        MemoryError,
-        BadZipFile,
-    ) as error:
+        OSError, ArithmeticError, LookupError, TypeError, ValueError, MemoryError, BadZipFile
+    ) as error:  # fmt: skip
         reason = plain(str(error), 100)
         raise TmlatticeError(
             f"the truth of case {name} in '{folder}' cannot be read ({reason}); make it anew"
@@ -329,20 +296,16 @@ def _truth(folder: Path, name: str) -> Truth:
     def number(value: Any) -> float:
         return float("nan") if value is None else float(value)
 
+    plain = ("tier", "unknown", "background", "amplitude", "noise", "seed")
     return Truth(
-        name,
-        secret["tier"],
-        tuple(Cause(**cause) for cause in secret["causes"]),
-        secret["unknown"],
-        tuple(number(v) for v in secret["signal_to_noise"]),
-        number(secret["total"]),
-        secret["background"],
-        secret["amplitude"],
-        secret["noise"],
-        secret["seed"],
-        launches,
-        clean,
-        {kind: number(v) for kind, v in secret.get("alone", {}).items()},
+        name=name,
+        causes=tuple(Cause(**cause) for cause in secret["causes"]),
+        signal_to_noise=tuple(number(v) for v in secret["signal_to_noise"]),
+        total=number(secret["total"]),
+        launches=launches,
+        clean=clean,
+        alone={kind: number(v) for kind, v in secret.get("alone", {}).items()},
+        **{key: secret[key] for key in plain},
     )
 
 

@@ -28,14 +28,7 @@ class Measures(Protocol):
 
 @dataclass
 class Draw:
-    """Random draws, and rejected ones.
-
-    Attributes:
-        random: generator.
-        signal: smallest and largest signal to noise, log-uniform.
-        amount: of every effect instead, of random sign.
-        unreachable: effects without an amount of the wanted signal to noise.
-    """
+    """Random draws, and rejected ones."""
 
     random: np.random.Generator
     signal: tuple[float, float]
@@ -52,11 +45,8 @@ class Draw:
         effects: Sequence[str],
         places_of: Callable[[Effect], Sequence[str | None]],
     ) -> Cause:
-        """Return one cause, up to the largest amount of its effect.
-
-        Raises:
-            TmlatticeError: no effect is visible.
-        """
+        """Return one cause, up to the largest amount of its effect; TmlatticeError: no effect is
+        visible."""
         for _ in range(TRIES):
             name = effects[int(self.random.integers(len(effects)))]
             effect = find(name)

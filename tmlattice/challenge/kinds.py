@@ -62,15 +62,9 @@ class CaseSettings:
     """Settings of every case of a challenge.
 
     Attributes:
-        tier: of the challenge.
-        lattice, ring: argument of `load_ring`, and its result.
-        seed: of the challenge.
         kinds: see `TIER_KINDS`.
         effects: drawn from these; None: from all usual ones.
-        shots: of first turns, and kicks of a stored beam.
         signal, amount: see `Draw`.
-        background: rms of distributed errors by effect.
-        known_rms: whether the diagnosis is given these rms values.
     """
 
     tier: str
@@ -90,19 +84,7 @@ class CaseSettings:
 def measure(
     kind: str, ring: Ring, causes: Sequence[Cause], noise: float, shots: int, **own: Any
 ) -> Measured:
-    """Return one measurement of a machine by AT.
-
-    Args:
-        kind: of measurement.
-        ring: the design.
-        causes: errors of the machine.
-        noise: in units of the kind's usual noise.
-        shots: of first turns and of turns.
-        own: background, seed and machine_seed.
-
-    Raises:
-        TmlatticeError: no beam survives the causes.
-    """
+    """Return one measurement of a machine by AT."""
     fine = tuple(noise * rms for rms in NOISE)
     made: Mapping[str, Callable[[], Any]] = {
         "trajectory": lambda: simulate(
@@ -146,13 +128,7 @@ def problem_of(
 def problem_of_case(
     case: Case, background: Mapping[str, float], given: Sequence[Cause] = ()
 ) -> Problem:
-    """Return the measurements of a case as a problem; see `problem_of`.
-
-    Args:
-        case: public part.
-        background: rms of the distributed errors, by effect.
-        given: causes that are known, of first turns.
-    """
+    """Return the measurements of a case as a problem; see `problem_of`."""
     ring = ring_of(case.lattice)
     if case.kinds:
         return problem_of(ring, case.measured, case.before, background)
@@ -173,12 +149,8 @@ def quiet_problem(
     """Return the problem of first turns that agree with the design.
 
     Args:
-        ring: the design.
         launches: true ones, those of a reference first, [shot, 5].
-        settings: of each shot.
         noise: rms of a reading, m.
-        background: rms of the distributed errors, by effect.
-        reference: number of shots from before the fault.
     """
     active = np.arange(len(launches)) >= reference
     readings = Model(ring, settings, active=active).readings(launches)
@@ -213,11 +185,7 @@ def _among(problem: Problem, ring: Ring, background: Mapping[str, float]) -> Pro
 
 
 class Ruler:
-    """Signal to noise by the model.
-
-    Args:
-        problem: of a machine without the fault.
-    """
+    """Signal to noise by the model."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem

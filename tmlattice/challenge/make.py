@@ -95,10 +95,6 @@ def make(
             catalogue does not contain; E none. Those are in first turns; R is one effect in an
             orbit response, T in turns of a stored beam, M in two or three kinds together, P a
             change between two measurements of one machine.
-        cases: number of cases.
-        seed: of all random numbers.
-        folder: for the challenge.
-        lattice: argument of `load_ring`.
         reference: tier B, with a measurement from before the fault.
         learnt: tier B, with an orbit response from before the fault, whose diagnosis is the prior
             of the case's. A machine that stores no beam has none, and is diagnosed without.
@@ -106,12 +102,10 @@ def make(
         shots: of first turns and kicks of a stored beam; of the fit, two more are held out.
         effects: draw from these alone.
         amount: of the effect, of random sign, instead of a random signal to noise.
-        signal: smallest and largest signal to noise.
         background: tiers of kinds and tier B, rms of the distributed errors by effect (None: the
             catalogue's); default in tiers B and P: every usual one.
         known_rms: the diagnosis is given these rms; else it estimates them.
         kinds: of measurement, for tiers E, M and P; of M two or three are drawn.
-        progress: show a bar on a terminal.
 
     Returns:
         How often each effect was drawn without reaching the smallest signal to noise.
@@ -217,11 +211,8 @@ def _learnt_before(case: Case, drawn: "CaseDraw", correctors: int | None) -> Cas
 
 
 def evenly(ring: Ring, count: int) -> list[str]:
-    """Return correctors of a ring, evenly along it in each plane, half of each if possible.
-
-    Raises:
-        TmlatticeError: the ring has fewer.
-    """
+    """Return correctors of a ring, evenly along it in each plane, half of each if possible;
+    TmlatticeError: the ring has fewer."""
     planes = [[e.name for e in ring.elements if e.kind == kind]
               for kind in ("hcorrector", "vcorrector")]  # fmt: skip
     first, second = (len(own) for own in planes)
@@ -271,13 +262,7 @@ def _seed(folder: Path) -> int | None:
 
 
 class CaseDraw:
-    """One case, drawn from its own random numbers.
-
-    Args:
-        asked: settings of the challenge.
-        number: of the case.
-        reference: with a measurement from before the fault.
-    """
+    """One case, drawn from its own random numbers."""
 
     def __init__(self, asked: CaseSettings, number: int, reference: bool = False) -> None:
         self.asked, self.ring, self.number = asked, asked.ring, number

@@ -40,11 +40,7 @@ class Refitted:
     """Every hypothesis about one case.
 
     Attributes:
-        problem: rows whitened by noise and distributed errors.
-        start: fit of the nuisances alone.
-        seen: the scan of its residual.
-        statistic: fall of chi-square within the largest fault, [hypothesis].
-        amount: of that fall, [hypothesis].
+        statistic, amount: fall of chi-square within the largest fault, its amount, [hypothesis].
     """
 
     problem: Problem
@@ -80,12 +76,7 @@ def evaluate(argument: tuple[Case, Truth]) -> dict[str, Any]:
 
 
 def refitted(case: Case, truth: Truth, given: Sequence[Cause] = ()) -> Refitted:
-    """Return the hypotheses about a case, the leading ones refitted.
-
-    Args:
-        case, truth: both parts of it.
-        given: known causes.
-    """
+    """Return the hypotheses about a case, the leading ones refitted."""
     problem = problem_of_case(_without_dead(case, truth), truth.background, given)
     start = fit(problem, (), problem.first)
     hypotheses = hypotheses_of(case, problem)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.challenge.figures import RATES
 from tmlattice.diagnosis.recommended_actions import leading, pieces_of, recommended_actions
 from tmlattice.effects import Cause, find
 from tmlattice.inference.judgement import DEFAULT
@@ -66,12 +67,8 @@ def finding_row(finding: Mapping[str, Any] | None, cause: Cause, places: Places)
     """Return how one finding matches one true cause."""
     true = (cause.effect, cause.element)
     if finding is None:
-        keys = (
-            "place", "element_first", "element_in_three", "element_in_set", "effect_first",
-            "effect_in_set", "first", "in_set",
-        )  # fmt: skip
         empty = {"elements": 0, "members": 0, "mass": None, "probability": None, "pull": None}
-        return dict.fromkeys(keys, False) | empty
+        return dict.fromkeys(RATES[1:], False) | empty
     members = pairs(finding)
     elements = list(dict.fromkeys(element for _, element in members))
     effects = list(dict.fromkeys(effect for effect, _ in members))

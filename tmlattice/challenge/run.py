@@ -61,12 +61,10 @@ def run(
     progress: bool = True,
     lattice: str | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Diagnose every case of a challenge that has no result yet.
+    """Diagnose every case of a challenge that has no result yet; its truth is not read.
 
     Args:
-        folder: of the challenge; its truth is not read and may be absent.
         lattice: the challenge's, if it is trusted Python code, see `check_lattice`.
-        jobs, scheduler, progress: see `run_batch`.
 
     Returns:
         Results by case; a failed one has "error".

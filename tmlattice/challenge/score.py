@@ -64,9 +64,7 @@ def score(
     """Return all metrics of a challenge, in the format `tmlattice-challenge`.
 
     Args:
-        folder: of the challenge, with results and truth.
         oracle: with oracle and baselines, which take some seconds a case the first time.
-        jobs, scheduler, progress: of the oracle, see `run_batch`.
         lattice: the challenge's, if it is trusted Python code, see `check_lattice`.
 
     Raises:
@@ -247,8 +245,7 @@ def _as_noise(result: Mapping[str, Any], monitors: int) -> bool | None:
 
 def _class(result: Mapping[str, Any]) -> Row | None:
     """Equivalent explanations of a single finding: effects, number of elements, and the proposed
-    next shot: whether it changes a setting, and its separation.
-    """
+    next shot: whether it changes a setting, and its separation."""
     if len(result["findings"]) != 1 or len(result["findings"][0]["credible_set"]) < 2:
         return None
     members = result["findings"][0]["credible_set"]

@@ -50,11 +50,8 @@ class Unknown:
     """One fault of a kind at a place.
 
     Args:
-        ring: the design.
         kind: see `LARGEST`.
-        shots: all shots of the measurement.
         clean: their readings without a fault or noise, [shot, monitor, 2], m.
-        random: for the place, and for differences between shots.
     """
 
     def __init__(

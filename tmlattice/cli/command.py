@@ -17,18 +17,16 @@ import click
 from tmlattice import __version__
 from tmlattice.cli.challenge import challenge
 from tmlattice.cli.check import check
-from tmlattice.cli.compare import compare
 from tmlattice.cli.correct import correct
 from tmlattice.cli.diagnose import diagnose
-from tmlattice.cli.effects import effects
 from tmlattice.cli.import_files import import_files
-from tmlattice.cli.info import info
+from tmlattice.cli.info import effects, info
 from tmlattice.cli.init import init
 from tmlattice.cli.options import FILE, lattice_options
 from tmlattice.cli.predict import predict
 from tmlattice.cli.progress import stopped_in
-from tmlattice.cli.report import report
 from tmlattice.cli.reproduce import reproduce
+from tmlattice.cli.results import compare, report
 from tmlattice.cli.simulate import simulate
 from tmlattice.cli.study import study
 from tmlattice.cli.tune_fit import tune_fit

@@ -33,7 +33,6 @@ class Word(click.ParamType):  # type: ignore[type-arg]
     """A word of the command line that a function reads.
 
     Args:
-        name: of the type, in the help.
         read: of the word; ValueError where it cannot be read.
         refusal: the message then; {0} is the word, {1} and {2} its parts around the first "=".
     """
@@ -115,11 +114,7 @@ class Careful(click.Command):
     """A command that does not write over what it reads, nor twice into one file."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run it, unless an output is an input or another output.
-
-        Raises:
-            OutputError: it is.
-        """
+        """Run it, unless an output is an input or another output; OutputError: it is."""
         from tmlattice.files import OutputError
 
         values = [ctx.params.get(name) for name in INPUTS]
@@ -340,15 +335,7 @@ def named_data(where: object) -> Iterator[None]:
 
 
 def open_ring(lattice: str, read: bool = True) -> "Ring":
-    """The ring of a lattice, as the machine file states it; warn if it is a part of a ring.
-
-    Args:
-        lattice: a built-in name or a path.
-        read: the command needs monitors.
-
-    Raises:
-        LatticeError: no such ring, or one without monitors.
-    """
+    """The ring of a lattice, as the machine file states it; warn if it is a part of a ring."""
     machine = machine_file()
     options = {} if machine is None else dict(machine.options_for(lattice))
     return checked_ring(lattice, options | stated_options(), read)

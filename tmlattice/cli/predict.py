@@ -45,7 +45,7 @@ def predict(
     are left empty.
     """
     from tmlattice.files import output_file
-    from tmlattice.measurement.write import write_response_table
+    from tmlattice.measurement.kinds import write_response_table
     from tmlattice.observe.calibration import (
         calibrated_response,
         read_calibration,
@@ -65,7 +65,8 @@ def predict(
         )
         monitors = [monitor.name for monitor in ring.monitors]
         orbits = list(zip(columns.names, kick * response, strict=True))
-        write_response_table(file, monitors, orbits)
+        with file.open("w", encoding="utf-8", newline="") as table:
+            write_response_table(table, monitors, orbits)
     console().print(
         f"{ring.name}: {len(columns.names)} correctors, {len(monitors)} BPMs, kick "
         f"{1e6 * kick:g} µrad\nwritten: {out}"

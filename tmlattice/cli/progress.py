@@ -1,8 +1,4 @@
-"""A progress line on a terminal, for every command that works for more than a few seconds.
-
->>> with shown("tmlattice diagnose", quiet) as line:
-...     line.show("noise")      # what is being done
-"""
+"""A progress line on a terminal, for every command that works for more than a few seconds."""
 
 import sys
 import threading
@@ -18,12 +14,7 @@ EVERY = 0.5
 
 
 class Line:
-    """What a command is doing, and for how long: a line on a terminal's stderr, else nothing.
-
-    Attributes:
-        name: of the command.
-        stage: what is being done.
-    """
+    """What a command is doing, and for how long: a line on a terminal's stderr, else nothing."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -34,13 +25,15 @@ class Line:
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def show(self, stage: str) -> None:
-        """State what is being done."""
-        self.stage = stage
+    def __enter__(self) -> None:
+        if sys.stderr.isatty():
+            self._thread.start()
 
-    def start(self) -> None:
-        """Begin to count; nothing is shown before `AFTER` seconds."""
-        self._thread.start()
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.clear()
 
     def clear(self) -> None:
         """Make room for other output; the line comes back after `AFTER` more seconds."""
@@ -50,26 +43,18 @@ class Line:
                 self._bar.close()
                 self._bar = None
 
-    def close(self) -> None:
-        """End; the line is gone."""
-        self._end.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        self.clear()
-
     def _run(self) -> None:
         while not self._end.wait(EVERY):
             with self._lock:
-                if self._end.is_set() or time.monotonic() - self._silent_since < AFTER:
-                    continue
-                self._show()
+                if not self._end.is_set() and time.monotonic() - self._silent_since >= AFTER:
+                    self._show()
 
     def _show(self) -> None:
         from tqdm.auto import tqdm
 
-        if tqdm_is_at_work() and self._bar is None:
-            return  # the command's own bar
         if self._bar is None:
+            if any(not bar.disable for bar in list(getattr(tqdm, "_instances", ()))):
+                return  # the command's own bar
             self._bar = tqdm(
                 total=None, file=sys.stderr, bar_format="{desc}", leave=False, disable=None
             )
@@ -77,41 +62,33 @@ class Line:
         self._bar.set_description_str(f"{self.name}{stage}, {time.monotonic() - self._begun:.0f} s")
 
 
-def tqdm_is_at_work() -> bool:
-    """Whether some progress bar is shown."""
-    from tqdm.auto import tqdm
-
-    return any(not bar.disable for bar in list(getattr(tqdm, "_instances", ())))
-
-
 _shown: list[Line] = []
+stopped_in: list[str] = []
+"""The stage in which Ctrl-C came."""
 
 
 @contextmanager
-def shown(name: str, quiet: bool = False) -> Iterator[Line]:
+def shown(name: str, quiet: bool = False) -> Iterator[None]:
     """Show the progress of a command as long as it runs."""
     line = Line(name)
-    if not quiet and sys.stderr.isatty():
-        line.start()
     _shown.append(line)
     try:
-        yield line
+        if quiet:
+            yield
+            return
+        with line:
+            yield
     except KeyboardInterrupt:
         stopped_in[:] = [line.stage] * bool(line.stage)
         raise
     finally:
         _shown.remove(line)
-        line.close()
-
-
-stopped_in: list[str] = []
-"""The stage in which Ctrl-C came."""
 
 
 def tell(stage: str) -> None:
     """State what the command is doing."""
     if _shown:
-        _shown[-1].show(stage)
+        _shown[-1].stage = stage
 
 
 def clear() -> None:

@@ -12,7 +12,7 @@ from tmlattice.cli.options import FILE, console, is_quiet, table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tmlattice.systems.comparison import Comparison
+    from tmlattice.systems import Comparison
 
     Reproduced = tuple[list[Comparison], Figure]
 

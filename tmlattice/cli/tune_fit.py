@@ -16,6 +16,7 @@ from tmlattice.cli.options import (
     is_quiet,
     json_option,
     lattice_argument,
+    named_data,
     open_ring,
     outputs,
     read_data,
@@ -115,7 +116,12 @@ def tune_fit(
     errors, and the true tunes are unknown.
     """  # fmt: skip
     if measurement is not None:
-        _refuse_own_data(click.get_current_context())
+        context = click.get_current_context()
+        for name in OWN_DATA:
+            if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+                raise click.UsageError(
+                    f"--{name} makes data and --measurement reads them: leave one of the two out"
+                )
     from tmlattice.files import write_json
 
     with outputs(out, json_file) as (folder, write):
@@ -142,16 +148,8 @@ OWN_DATA = ("magnet", "change", "launch", "noise")
 """Options that determine how data are simulated; they have no use for measured data."""
 
 
-def _refuse_own_data(context: click.Context) -> None:
-    for name in OWN_DATA:
-        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
-            raise click.UsageError(
-                f"--{name} makes data and --measurement reads them: leave one of the two out"
-            )
-
-
 def _fit(ring: "Ring", path: Path, options: dict[str, Any]) -> "TuneFit":
-    from tmlattice.errors import MeasurementError, UnknownNameError
+    from tmlattice.errors import MeasurementError
     from tmlattice.fitting import tune_fit_measurement
     from tmlattice.measurement import Measurement, in_words
 
@@ -161,10 +159,8 @@ def _fit(ring: "Ring", path: Path, options: dict[str, Any]) -> "TuneFit":
             f"'{path}' is {in_words(data)}; tune-fit takes a trajectory, the first turn of a beam"
         )
     recipe = {k: v for k, v in options.items() if k not in (*OWN_DATA, "seed")}
-    try:
+    with named_data(path):
         return tune_fit_measurement(ring, data, source=str(path), progress=not is_quiet(), **recipe)
-    except (MeasurementError, UnknownNameError) as error:
-        raise MeasurementError(f"{path}: {error}") from error
 
 
 def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
@@ -222,12 +218,12 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
         f"noise {noise} µm{estimated}"
     )
     screen.print(_columns(outcome))
-    growth = outcome.growth
+    growth = outcome.methods[0].growth
     if growth is not None and abs(growth - 1) > 1e-3:
         screen.print(
             f"the network of {outcome.methods[0].method} is not symplectic: amplitudes change by "
             f"up to {100 * abs(growth - 1):.1f} % a turn; its tunes are from the first "
-            f"{outcome.turns_alive} turns"
+            f"{outcome.methods[0].turns_alive} turns"
         )
     for method in outcome.methods:
         if method.problem:
@@ -250,7 +246,7 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
 
 def _columns(outcome: "TuneFit") -> "Table":
     """What each method made of the readings."""
-    from tmlattice.fitting.method_fit import errors
+    from tmlattice.fitting.outcome import errors
 
     made = table("method", *(method.method for method in outcome.methods))
 

@@ -164,7 +164,7 @@ class Correction(Speaks):
         "Write settings.csv, correction.json and .txt, snippets and report.html into a folder.",
     )
     plot = Method(
-        "tmlattice.plots.correction", "plot_correction", "Draw the beta beating now and expected."
+        "tmlattice.plots.readings", "plot_correction", "Draw the beta beating now and expected."
     )
 
     def as_json(self) -> dict[str, Any]:

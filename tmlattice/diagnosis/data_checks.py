@@ -41,9 +41,9 @@ from tmlattice.measurement import (
     TurnByTurn,
 )
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of, with_read
+from tmlattice.measurement.kinds import STORED
 from tmlattice.measurement.lost_beam import beam_lost, exact
 from tmlattice.measurement.monitors import LARGEST_READING, Names
-from tmlattice.measurement.stored_files import KINDS as STORED
 from tmlattice.observe.compared import ANOTHER, Compared, OfResponse, compared
 from tmlattice.observe.global_errors import CERTAIN, OfTurns, Search, Verdict
 from tmlattice.observe.noise import PASSES, noise_scatter

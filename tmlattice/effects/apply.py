@@ -1,6 +1,6 @@
 """Causes applied to a ring: a new ring, the given one unchanged."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,36 @@ def _set(element: Element, attribute: str, amount: float) -> Element:
         f"{element.kind} '{element.name}' has no setting '{attribute}'; correctors have kick, "
         "quadrupoles and bends k1_relative, sextupoles k2_relative, rf frequency_relative"
     )
+
+
+def groups(
+    settings: Sequence[Settings] | None, shots: int
+) -> Iterator[tuple[NDArray[np.intp], Settings]]:
+    """Return the shots [index] of each different setting, and the setting.
+
+    Args:
+        settings: one for each shot; None or empty: the design's for all.
+
+    Raises:
+        ValueError: the numbers of settings and shots differ.
+    """
+    if not settings:
+        yield np.arange(shots), {}
+        return
+    if len(settings) != shots:
+        raise ValueError(f"{len(settings)} settings do not fit {shots} shots")
+    known: list[Settings] = []
+    members: list[list[int]] = []
+    for shot, setting in enumerate(settings):
+        for i, other in enumerate(known):
+            if other == setting:
+                members[i].append(shot)
+                break
+        else:
+            known.append(setting)
+            members.append([shot])
+    for setting, indices in zip(known, members, strict=True):
+        yield np.array(indices), setting
 
 
 def monitors_with(ring: Ring, causes: Iterable[Cause]) -> Monitors:

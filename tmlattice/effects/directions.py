@@ -22,8 +22,7 @@ from tmlattice.effects.effect import FamilyEffect, RingEffect, find
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
-from tmlattice.maps.magnets import Quadratic, Weights
-from tmlattice.maps.quadratic import difference
+from tmlattice.maps.quadratic import Quadratic, Weights, difference
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

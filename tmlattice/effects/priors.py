@@ -50,7 +50,6 @@ def rare(ring: Ring, effects: Sequence[str]) -> dict[tuple[str, str | None], flo
     """Return the odds of each (effect, place) that is less probable than an ordinary fault.
 
     Args:
-        ring: the design.
         effects: names.
     """
     return {

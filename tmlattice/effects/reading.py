@@ -80,7 +80,6 @@ class Monitors:
 
         Args:
             beam: on turns from 0 on, `ahead` more than `turns`.
-            turns: of each shot.
             before: position before turn 0, broadcastable to [shot, turn, monitor, 2].
 
         Raises:

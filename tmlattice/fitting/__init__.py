@@ -8,14 +8,12 @@
 import tmlattice.network  # noqa: F401  (first: its error names what to install without torch)
 from tmlattice.fitting.adam import FitResult, Regularization
 from tmlattice.fitting.experiment import tune_fit, tune_fit_measurement
-from tmlattice.fitting.method_fit import METHODS, MethodFit
-from tmlattice.fitting.methods import Method, fine_tune
-from tmlattice.fitting.outcome import TuneFit
+from tmlattice.fitting.methods import fine_tune
+from tmlattice.fitting.outcome import METHODS, MethodFit, TuneFit
 
 __all__ = [
     "METHODS",
     "FitResult",
-    "Method",
     "MethodFit",
     "Regularization",
     "TuneFit",

@@ -12,13 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tmlattice.errors import BeamLostError, MeasurementError, unknown_choice
+from tmlattice.errors import BeamLostError, MeasurementError, choice
 from tmlattice.fitting.launches import FreeLaunches
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork, symplectic_penalty
 from tmlattice.network.symplectic import symplectic_coefficients
 from tmlattice.observe.data import launch_errors
 from tmlattice.speaks import Speaks
+
+Network = TaylorNetwork | SymplecticNetwork
 
 
 class Regularization(StrEnum):
@@ -35,23 +37,21 @@ class FitResult(Speaks):
     """A fine-tuned network and the history of its fit.
 
     Attributes:
-        network: with the weights of the epoch of least loss.
+        network: with the weights of the epoch of least loss, `best_epoch`.
         loss: of every epoch, m^2: squared residuals summed over monitors and planes, mean over
             shots; without the regularization.
-        penalty: of every epoch, the regularization's value before its rate; zeros for "none".
-        best_epoch: the epoch whose weights the network has.
+        penalty: of every epoch, the regularization's value before its rate.
         stopped_early: whether the patience ran out before the epochs.
         seconds: of wall clock.
-        options: all options of the fit.
-        tunes: fractional tunes (x, y) by the method itself, [2], or None.
-        tune_sigma: their standard error, [2]; None if the method has none (Adam).
+        tunes, tune_sigma: fractional tunes (x, y) by the method itself and their standard errors,
+            [2] each; None if the method has none (Adam).
         changes: relative changes of strengths, by magnet, with their standard errors: the causes
             that `sparse` selected, or all that `map` changed.
         launches: as fitted, [shot, n]; None if they were taken as exact.
         chi2: mean square of the residual over the noise; None if no noise is stated.
     """
 
-    network: TaylorNetwork | SymplecticNetwork
+    network: Network
     loss: list[float]
     penalty: list[float]
     best_epoch: int
@@ -80,7 +80,7 @@ class FitResult(Speaks):
 
 
 def fit_adam(
-    network: TaylorNetwork | SymplecticNetwork,
+    network: Network,
     measurement: Measurement,
     *,
     epochs: int = 1000,
@@ -111,11 +111,9 @@ def fit_adam(
     The given network is not changed. The same input gives the same result: nothing is random.
 
     Args:
-        network: the design, or any start.
         measurement: at least one reading of the first turn; NaN are ignored.
         epochs: gradient steps at most.
         learning_rate: Adam's. A weight moves by at most about this per step, whatever its unit.
-        regularization: see above.
         regularization_rate: lambda. The paper's 1e-10 does nothing in metres.
         relative_to_design: the symplectic penalty counts departures from the design's own defect.
         free: names of the free weights: some of W0, W1, W2, or of W0, generator for a symplectic
@@ -126,33 +124,30 @@ def fit_adam(
             exact; inf: unknown; None: the measurement's own. Launches that are not exact follow
             the weights: after every epoch each moves half the way to its best value by the
             design's slopes.
-        progress: show a bar on a terminal.
 
     Raises:
         MeasurementError: no reading of the first turn, or a launch off the nominal energy for a
             network of four coordinates.
         UnknownNameError: a monitor that is not in the network.
         BeamLostError: the fit diverged (the learning rate is too high), or the launch is lost.
-        ChoiceError: an unknown regularization; it is a ValueError too.
-        ValueError: an unknown weight.
+        ValueError: an unknown regularization or weight.
 
     Source: A. Ivanov, U. Iben, A. Golovkina, physics-based polynomial neural networks for one-shot
     learning of dynamical systems.
     """
-    try:
-        regularization = Regularization(regularization)
-    except ValueError:
-        raise unknown_choice("regularization", regularization, Regularization) from None
+    regularization = choice("regularization", regularization, Regularization)
     weight, target = _target(measurement, network.monitors)
-    beam = _beam(network, measurement, launch_sigma)
+    launches = _launches(network, measurement, launch_sigma)
+    first = launches.fitted(network)
+    gains = launches.gains(network, first) if launches.sigma.any() else None
     model, free = _freed(network, free)
     device = next(model.parameters()).device
-    launch, weight, target = (
-        t.to(device) for t in (torch.from_numpy(beam.launches), weight, target)
-    )
+    launch, weight, target = (t.to(device) for t in (torch.from_numpy(first), weight, target))
     start = [p.detach().clone() for p in model.parameters()]
     moving = [p for p in model.parameters() if p.requires_grad]
-    design = _defect(network) if relative_to_design else None
+    design = None
+    if relative_to_design and isinstance(network, TaylorNetwork):
+        design = symplectic_coefficients(network.W1, network.W2)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the tensors are small: more threads only wait for each other
     step = _adam(moving, learning_rate)
@@ -185,7 +180,10 @@ def fit_adam(
                 break
             torch.nn.utils.clip_grad_norm_(moving, clip)
             step()
-            launch = beam.after(readings, launch)
+            if gains is not None:
+                now = launch.cpu().numpy()
+                now = now + 0.5 * gains(readings.detach().cpu().numpy(), now)
+                launch = torch.from_numpy(now).to(device)
     finally:
         bar.close()
         torch.set_num_threads(threads)
@@ -210,49 +208,22 @@ def fit_adam(
             "clip": clip,
             "patience": patience,
         },
-        launches=beam.settled(model, best_launch.cpu().numpy()),
+        launches=None if gains is None else launches.fitted(model, best_launch.cpu().numpy(), 2),
     )
 
 
-@dataclass(frozen=True)
-class _Beam:
-    """Launches of a fit: their start, and how they follow the weights."""
-
-    launches: NDArray[np.float64]
-    free: FreeLaunches | None = None
-    gains: Callable[..., NDArray[np.float64]] | None = None
-
-    def after(self, readings: Tensor, launch: Tensor) -> Tensor:
-        if self.gains is None:
-            return launch
-        now = launch.cpu().numpy()
-        moved = now + 0.5 * self.gains(readings.detach().cpu().numpy(), now)
-        return torch.from_numpy(moved).to(launch.device)
-
-    def settled(
-        self, network: TaylorNetwork | SymplecticNetwork, launch: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
-        return None if self.free is None else self.free.fitted(network, launch, steps=2)
-
-
-def _beam(
-    network: TaylorNetwork | SymplecticNetwork,
-    measurement: Measurement,
-    launch_sigma: ArrayLike | None,
-) -> _Beam:
-    launches = measurement.states(network.dimension)
+def _launches(
+    network: Network, measurement: Measurement, launch_sigma: ArrayLike | None
+) -> FreeLaunches:
     sigma = launch_errors(measurement, network.dimension, launch_sigma)
-    if not sigma.any():
-        return _Beam(launches)
     ordered = measurement.in_order_of(network.monitors)
     if ordered.noise is None and np.isfinite(sigma[sigma > 0]).any():
         raise MeasurementError(
             "the launches have an error but the readings have none; give the measurement's noise"
         )
     noise = np.full((len(network.monitors), 2), 1.0) if ordered.noise is None else ordered.noise
-    free = FreeLaunches(launches, sigma, ordered.readings[:, 0], noise)
-    launches = free.fitted(network)
-    return _Beam(launches, free, free.gains(network, launches))
+    launches = measurement.states(network.dimension)
+    return FreeLaunches(launches, sigma, ordered.readings[:, 0], noise)
 
 
 def _target(measurement: Measurement, monitors: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -268,9 +239,7 @@ def _target(measurement: Measurement, monitors: Sequence[str]) -> tuple[Tensor, 
     )
 
 
-def _freed(
-    network: TaylorNetwork | SymplecticNetwork, free: Sequence[str] | None
-) -> tuple[TaylorNetwork | SymplecticNetwork, Sequence[str]]:
+def _freed(network: Network, free: Sequence[str] | None) -> tuple[Network, Sequence[str]]:
     """A copy in which these weights are free, and their names."""
     model = network.copy()
     if free is None:
@@ -284,15 +253,13 @@ def _freed(
     return model, free
 
 
-def _readings(
-    model: TaylorNetwork | SymplecticNetwork, launch: Tensor, epoch: int, rate: float
-) -> Tensor:
+def _readings(model: Network, launch: Tensor, epoch: int, rate: float) -> Tensor:
     """Readings in an epoch; a beam that is lost after the first epoch was lost by the fit."""
     try:
         readings: Tensor = model(launch)
         return readings
     except BeamLostError as error:
-        if epoch == 0:
+        if not epoch:
             raise
         raise BeamLostError(
             f"the fit diverged in epoch {epoch}: lower the learning rate ({rate:g}); {error}"
@@ -329,16 +296,7 @@ def _adam(moving: Sequence[Tensor], rate: float) -> Callable[[], None]:
     return step
 
 
-def _defect(network: TaylorNetwork | SymplecticNetwork) -> Any:
-    """Symplectic defect of the design by coefficient; None if there is none."""
-    if not isinstance(network, TaylorNetwork):
-        return None
-    return symplectic_coefficients(network.W1, network.W2)
-
-
-def _penalty(
-    model: TaylorNetwork | SymplecticNetwork, start: list[Tensor], kind: Regularization, design: Any
-) -> Tensor:
+def _penalty(model: Network, start: list[Tensor], kind: Regularization, design: Any) -> Tensor:
     if kind is Regularization.SYMPLECTIC and isinstance(model, TaylorNetwork):
         return symplectic_penalty(model.W1, model.W2, design).sum()
     if kind in (Regularization.NONE, Regularization.SYMPLECTIC):

@@ -23,9 +23,8 @@ from tmlattice.errors import (
 )
 from tmlattice.fitting.adam import Regularization
 from tmlattice.fitting.launches import FreeLaunches, with_noise
-from tmlattice.fitting.method_fit import METHODS, SPARSE_METHODS, MethodFit
 from tmlattice.fitting.methods import fine_tune
-from tmlattice.fitting.outcome import TuneFit
+from tmlattice.fitting.outcome import METHODS, SPARSE_METHODS, MethodFit, TuneFit
 from tmlattice.harmonics import MIN_TURNS, tunes
 from tmlattice.lattice import Ring, middle_of_first_arc
 from tmlattice.maps import element_map, ring_matrix
@@ -84,11 +83,8 @@ def perturbed_ring(ring: Ring, magnet: str, change: float) -> Ring:
 
 
 def changed_ring(ring: Ring, magnet: str, change: float | None) -> tuple[Ring, Array, float]:
-    """Return the perturbed ring, its tunes [2] and the change: by default the largest usual one.
-
-    Raises:
-        UnstableRingError: the ring has no tunes with this change, or with any.
-    """
+    """Return the perturbed ring, its tunes [2] and the change: by default the largest usual one;
+    UnstableRingError: the ring has no tunes with this change, or with any."""
     tried = CHANGES if change is None else (change,)
     for amount in tried:
         machine = perturbed_ring(ring, magnet, amount)
@@ -128,19 +124,16 @@ def tune_fit(
     """Perturb one magnet, measure one first turn, fine-tune the design's network, predict tunes.
 
     Args:
-        ring: the design.
         magnet: a quadrupole or sextupole; else the one that `middle_of_first_arc` names.
         change: relative change of its strength; None: -20 %, or less where that is unstable.
         launch: x, px, y, py at the start of the ring, m and rad.
         noise: rms of a reading, m; drawn from the seed.
         turns: tracked for the tunes, at a vanishing amplitude.
-        seed: of the noise.
         methods: some of `METHODS`: "adam", the paper's recipe; "sparse"; "map"; or "known".
         candidates: names of the only magnets that may have changed, of "known".
         epochs, learning_rate, regularization, regularization_rate: of "adam", see
             `fitting.adam.fit_adam`.
         relative_to_design, free, clip, patience: of the same.
-        progress: show a bar where there is a terminal.
 
     Raises:
         UnstableRingError: the design or the perturbed ring has no tune.
@@ -174,10 +167,8 @@ def first_turn_of(
     """Return the first turn of a ring with noise, its launches exact.
 
     Args:
-        machine: the ring.
         launches: [shot, 4], m and rad.
         noise: rms of a reading, m; at least `NOISE_FLOOR` is stated.
-        random: of the noise.
     """
     truth = TaylorNetwork.from_ring(machine)
     readings = truth.readings(launches)
@@ -206,14 +197,11 @@ def tune_fit_measurement(
     those at the nominal energy.
 
     Args:
-        ring: the design.
         measurement: of one shot or more; an unstated noise is estimated.
         turns: tracked for the tunes, at a vanishing amplitude.
         methods: some of `METHODS`, or "known".
         candidates: names of the only magnets that may have changed, of "known".
         source: where the data are from, for the report.
-        progress: show a bar where there is a terminal.
-        recipe: options of `fitting.adam.fit_adam`.
 
     Raises:
         MeasurementError: no reading of the first turn, every launch on the axis exactly, or shots
@@ -310,16 +298,7 @@ def fit_and_track(
     shown: int = 0,
     **options: Any,
 ) -> MethodFit:
-    """Return one method's fit, its tunes, and its residual.
-
-    Args:
-        name: of the method.
-        network: the design.
-        measurement: in the order of its monitors, with noise.
-        turns: tracked for the tunes.
-        shown: the shot whose readings are kept.
-        options: of `fine_tune`.
-    """
+    """Return one method's fit, its tunes, and its residual."""
     read, noise = measurement.readings[:, 0], measurement.noise
     assert noise is not None
     begun = time.perf_counter()
@@ -364,10 +343,6 @@ def network_tunes(network: NetworkChain, launch: Array, turns: int) -> tuple[Arr
     Returns:
         Fractions (x, y) [2]; the states they come from, [1, turns + 1, n], fewer where the motion
         grew; the growth of the amplitude in a turn, 1 for a symplectic network.
-
-    Raises:
-        UnstableRingError: no closed orbit, or no tune.
-        TooFewTurnsError: the motion grew too fast.
     """
     optics = one_turn_optics(network)
     first = (optics.closed_orbit + TUNE_AMPLITUDE * launch)[None]

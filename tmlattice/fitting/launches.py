@@ -40,8 +40,6 @@ def with_noise(
     """Return the first turn with noise for every reading, and whether some of it is estimated.
 
     Args:
-        ring: the design.
-        measurement: in the order of its monitors.
         dimension: 4 or 6.
 
     Raises:
@@ -70,10 +68,9 @@ def with_noise(
 
 @dataclass(frozen=True)
 class FreeLaunches:
-    """Readings and nominal values of launches, and their errors.
+    """Readings and nominal launches [shot, n], and their errors.
 
     Attributes:
-        nominal: [shot, n].
         sigma: rms of these; inf where unknown, 0 where exact, [shot, n].
         readings: m, [shot, monitor, 2]; NaN where missing.
         noise: rms of a reading, m, [monitor, 2].
@@ -113,11 +110,7 @@ class FreeLaunches:
         return step
 
     def fitted(self, network: NetworkChain, start: Array | None = None, steps: int = 4) -> Array:
-        """Return the best launches for a network, [shot, n].
-
-        Raises:
-            BeamLostError: the beam is lost in it.
-        """
+        """Return the best launches for a network, [shot, n]."""
         launches = self.nominal if start is None else start
         if not self.sigma.any():
             return launches

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
 from tmlattice.effects import Cause
-from tmlattice.errors import UnstableRingError, unknown_choice
+from tmlattice.errors import UnstableRingError, choice
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.sparse import FAULT, first_turns, fitted, searched, warn_of_launches
 from tmlattice.inference.distributed import components_of_rows
@@ -57,15 +57,12 @@ SETTLED = 0.01
 
 @dataclass(frozen=True)
 class MostProbable:
-    """Most probable changes.
+    """Most probable changes, and the problem and the model with them.
 
     Attributes:
-        problem: of the ring with these changes.
         hypotheses: (effect, magnet), [magnet].
         amounts, rms: relative changes, and those of the prior, [magnet].
         spread: root of their covariance, [magnet, magnet]: spread spread^T.
-        point: the model there.
-        chi2: of every step.
     """
 
     problem: FirstTurns
@@ -83,11 +80,9 @@ def most_probable(
     """Return the most probable changes, and their covariance.
 
     Args:
-        problem: of the design.
         hypotheses: (effect, magnet).
         amounts: first guess, [magnet].
         rms: of the prior, [magnet].
-        learn: multiply it by the factor of the largest marginal likelihood.
     """
     chi2, nuisances = list[float](), problem.first
     while True:
@@ -130,34 +125,19 @@ def fit_map(
     """Fit a measurement's first turn by the most probable changes under a prior.
 
     Args:
-        network: the design.
-        measurement: at least one shot.
         ring: of the network; None: the network's own `ring`.
-        prior: of the changes, see `Prior`.
-        kinds: of magnets that may have changed.
         scale: rms of the prior, in %; None: 0.01 % for faults, else that of the largest marginal
             likelihood.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
-            exact; inf: unknown; None: the measurement's own.
-        progress: ignored, as in every method.
+        launch_sigma: see `fine_tune`.
 
     Returns:
         The network of the most probable ring, its tunes, and their standard error by the posterior
         covariance. It is valid if the prior is: `Prior.STRENGTHS` describes many small changes, not
         one magnet with an error of 20 %.
-
-    Raises:
-        MeasurementError: no reading, or no noise stated.
-        TmlatticeError: no ring to change, or no powered magnet of these kinds.
-        BeamLostError: the launch is lost in the design.
-        ChoiceError: an unknown prior.
     """
     begun = time.perf_counter()
-    try:
-        prior = Prior(prior)
-    except ValueError:
-        raise unknown_choice("prior", prior, Prior) from None
+    prior = choice("prior", prior, Prior)
     sparse = searched(network, measurement, ring, kinds, noise, launch_sigma)
     hypotheses = sparse.first.hypotheses
     start = np.zeros(len(hypotheses))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from enum import StrEnum
 from inspect import signature
 from typing import Any
 
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from tmlattice.by_name import by_name
 from tmlattice.errors import unknown_choice
-from tmlattice.fitting.adam import FitResult, Regularization, fit_adam
+from tmlattice.fitting.adam import FitResult, Network, Regularization, fit_adam
 from tmlattice.fitting.map_fit import Prior, fit_map
 from tmlattice.fitting.sparse import (
     EFFECTS,
@@ -28,21 +27,12 @@ from tmlattice.network import SymplecticNetwork, TaylorNetwork
 from tmlattice.observe.data import NOISE_FLOOR, first_turn
 
 
-class Method(StrEnum):
-    """Method of fine-tuning a network."""
-
-    ADAM = "adam"
-    MAP = "map"
-    SPARSE = "sparse"
-    KNOWN = "known"
-
-
 @by_name
 def fine_tune(
-    network: TaylorNetwork | SymplecticNetwork,
+    network: Network,
     measurement: Measurement,
     *,
-    method: Method | str = "adam",
+    method: str = "adam",
     launch_sigma: ArrayLike | None = None,
     progress: bool = True,
     epochs: int = 1000,
@@ -66,7 +56,6 @@ def fine_tune(
     """Fit a network to the first turn of a measurement; the given network is not changed.
 
     Args:
-        network: the design.
         measurement: launches and readings; a path or a DataFrame is taken too.
         method: "adam", every weight free and a symplectic penalty, the paper's recipe
             (`fitting.adam.fit_adam`); "map", the most probable changes under a prior
@@ -76,7 +65,6 @@ def fine_tune(
             tunes.
         launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n], m and
             rad; 0: exact; inf: unknown; None: the measurement's own.
-        progress: show a bar where there is a terminal.
         epochs, learning_rate, regularization, regularization_rate: of "adam", see
             `fitting.adam.fit_adam`.
         relative_to_design, free, clip, patience: of the same.
@@ -89,42 +77,36 @@ def fine_tune(
     A warning reports readings that contradict the stated errors of the launches.
 
     Raises:
-        ChoiceError: an unknown method; it is a ValueError too.
-        ValueError: an option's value, or an option without meaning for the method.
+        ValueError: an unknown method, an option's value, or an option without meaning for the
+            method.
         TmlatticeError: a measurement that cannot be fitted, see the methods.
     """
     given = dict(locals())
-    try:
-        chosen = Method(method)
-    except ValueError:
-        raise unknown_choice("method", method, Method) from None
-    fit = _FITS[chosen]
-    options = _options_of(fit, given, chosen)
-    if chosen is Method.KNOWN and not candidates:
+    if method not in _FITS:
+        raise unknown_choice("method", method, _FITS)
+    fit = _FITS[method]
+    options = _options_of(fit, given, method)
+    if method == "known" and not candidates:
         raise ValueError(
             "method 'known' needs the names of the magnets that may have changed: give candidates="
         )
     if fit is not fit_adam and isinstance(network, SymplecticNetwork):
         if network.ring is None:
-            raise ValueError(f"method '{chosen}' needs a network made from a ring")
+            raise ValueError(f"method '{method}' needs a network made from a ring")
         network = TaylorNetwork.from_ring(network.ring, network.dimension)
     result = fit(network, measurement, **options)
-    if chosen is Method.ADAM:
+    if fit is fit_adam:
         _check_launches(network, measurement, launch_sigma)
     return _with_chi2(result, measurement)
 
 
-_FITS: dict[Method, Callable[..., FitResult]] = {
-    Method.ADAM: fit_adam, Method.MAP: fit_map, Method.SPARSE: fit_sparse, Method.KNOWN: fit_sparse,
+_FITS: dict[str, Callable[..., FitResult]] = {
+    "adam": fit_adam, "map": fit_map, "sparse": fit_sparse, "known": fit_sparse
 }  # fmt: skip
 
 
-def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: Method) -> dict[str, Any]:
-    """Those of the arguments that the method has.
-
-    Raises:
-        ValueError: another one was given.
-    """
+def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: str) -> dict[str, Any]:
+    """Those of the arguments that the method has; ValueError: another one was given."""
     own = signature(fit).parameters
     options = {}
     for name, parameter in signature(fine_tune).parameters.items():
@@ -137,9 +119,7 @@ def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: Method) 
     return options
 
 
-def _check_launches(
-    network: TaylorNetwork | SymplecticNetwork, measurement: Measurement, sigma: ArrayLike | None
-) -> None:
+def _check_launches(network: Network, measurement: Measurement, sigma: ArrayLike | None) -> None:
     """Warn of launches that differ from those stated; silent without a ring or a noise."""
     ring, n = network.ring, network.dimension
     if ring is None or measurement.noise is None:

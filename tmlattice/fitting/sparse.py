@@ -74,29 +74,13 @@ def fit_sparse(
     """Fit a measurement's first turn by the set of changed magnets with the largest evidence.
 
     Args:
-        network: the design.
-        measurement: at least one shot.
-        ring: of the network; None: the network's own `ring`.
-        kinds: of magnets that may have changed.
         noise: rms of one reading, m; else the measurement's.
-        launch_sigma: standard error of the launch coordinates, one number, [n] or [shot, n]; 0:
-            exact; inf: unknown; None: the measurement's own.
-        fault: prior rms of a relative change.
-        largest_number: of causes.
-        refined: candidates that are refitted after each scan.
         candidates: names of the only magnets that may have changed; None: all of the kinds.
-        progress: ignored, as in every method.
 
     Returns:
         The network of the refitted ring, its tunes from its own matrix, and their standard error:
         that of the changes, and the spread over other magnets that explain the readings nearly as
-        well, weighted by their evidence. Without a cause there is no error: the effect of a
-        smaller fault on the tunes is unknown.
-
-    Raises:
-        MeasurementError: no reading, or no noise stated.
-        TmlatticeError: no ring to change, or no powered magnet of these kinds.
-        UnstableRingError: the ring that explains the readings has no tune.
+        well, weighted by their evidence; None without a cause.
     """
     begun = time.perf_counter()
     found = searched(network, measurement, ring, kinds, noise, launch_sigma, {
@@ -146,15 +130,8 @@ def searched(
     launch_sigma: ArrayLike | None,
     options: Mapping[str, Any] = {},
 ) -> Explanation:
-    """Return the changed magnets by their evidence.
-
-    Args:
-        network, measurement, ring, kinds, noise, launch_sigma: see `fit_sparse`.
-        options: further ones of `sparse_causes`.
-
-    Raises:
-        TmlatticeError: no ring to change.
-    """
+    """Return the changed magnets by their evidence, see `fit_sparse` and `sparse_causes`;
+    TmlatticeError: no ring to change."""
     ring = network.ring if ring is None else ring
     if ring is None:
         raise TmlatticeError("methods but 'adam' change the ring's magnets: give ring=")
@@ -171,15 +148,7 @@ def fitted(
     chi2: Sequence[float],
     **result: Any,
 ) -> FitResult:
-    """Return the ring with these changes as a fitted network.
-
-    Args:
-        found: the search.
-        causes, errors: relative changes, and their standard errors.
-        launches: as fitted, [shot, 5].
-        chi2: of every step.
-        result: further attributes.
-    """
+    """Return the ring with these changes as a fitted network (launches: as fitted, [shot, 5])."""
     problem = first_turns(found)
     model, data = problem.model, problem.data
     n = model.dimension

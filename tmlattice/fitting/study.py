@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,9 +28,9 @@ from tmlattice.fitting.experiment import (
     fit_and_track,
     perturbed_ring,
 )
-from tmlattice.fitting.method_fit import errors
+from tmlattice.fitting.outcome import errors
 from tmlattice.input_files import json_of
-from tmlattice.lattice import Element, Ring, load_ring
+from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.lattice.load import contents
 from tmlattice.maps import ring_matrix
@@ -46,8 +46,8 @@ the changed magnets, the best possible."""
 
 UNSTABLE = "the perturbed ring is unstable"
 
-_LATTICE = ("lattice", "sequence", "energy", "monitors", "correctors", "particle")
-
+NETWORK = ("network of the design",)
+"""Key of it in a ring's memory."""
 NEW_AMPLITUDE = 5.0
 """Amplitude of the new launches of the prediction over that of the fitted launch."""
 
@@ -57,10 +57,7 @@ class Case:
     """One fault, fitted by one method.
 
     Attributes:
-        magnet: name; two names with a + between for a pair.
-        s: of its middle, m; of the first of a pair.
-        method: one of `METHODS`.
-        seed: of the noise.
+        s: of the magnet's middle, m.
         true_tunes: of the perturbed ring, or None if it is unstable.
         absolute_error, relative_error: of the tunes, or None without a prediction.
         tune_sigma: stated standard error of the tunes, or None if the method has none.
@@ -68,7 +65,6 @@ class Case:
         prediction_rms: error of the fitted network on new launches of five times the amplitude,
             against readings without noise, m.
         found: magnets that the method identifies, or None if it identifies none.
-        seconds: of the fit.
         problem: error message, or None.
     """
 
@@ -88,46 +84,25 @@ class Case:
 
     @property
     def right(self) -> bool | None:
-        """Whether the identified magnets are exactly the changed ones."""
-        return None if self.found is None else set(self.found) == set(self.magnet.split("+"))
+        """Whether the changed magnet alone is identified."""
+        return None if self.found is None else self.found == (self.magnet,)
 
 
-def spread_magnets(
-    ring: Ring, number: int | None = None, kind: str = "quadrupole"
-) -> list[Element]:
-    """Return `number` powered magnets of a kind, evenly in beam order; None, or more: all.
-
-    Raises:
-        TmlatticeError: the ring has none.
-    """
-    attribute = {"quadrupole": "k1", "sextupole": "k2"}[kind]
-    powered = [e for e in ring.magnets if e.kind == kind and getattr(e, attribute) != 0]
+def spread_magnets(ring: Ring, number: int | None = None) -> list[str]:
+    """Return `number` powered quadrupoles, evenly in beam order; None, or more: all;
+    TmlatticeError: the ring has none."""
+    powered = [e.name for e in ring.magnets if e.kind == "quadrupole" and e.k1 != 0]
     if not powered:
-        raise TmlatticeError(f"'{ring.name}' has no powered {kind} to study")
+        raise TmlatticeError(f"'{ring.name}' has no powered quadrupole to study")
     number = len(powered) if number is None else min(number, len(powered))
     return [powered[int((i + 0.5) * len(powered) / number)] for i in range(number)]
-
-
-def faults(ring: Ring, number: int | None, kind: str) -> list[str]:
-    """Return the names of the cases: quadrupoles, sextupoles, or pairs of quadrupoles a third of
-    the ring apart, as name+name."""
-    if kind != "pair":
-        return [e.name for e in spread_magnets(ring, number, kind)]
-    powered = [e.name for e in spread_magnets(ring)]
-    other = [powered[(i + len(powered) // 3) % len(powered)] for i in range(len(powered))]
-    chosen = [powered.index(e.name) for e in spread_magnets(ring, number)]
-    return [f"{powered[i]}+{other[i]}" for i in chosen]
 
 
 def turned_launches(optics: Optics, launch: Array, phases: Array) -> Array:
     """Return the launch [n] turned by phases [shot, 2], in rad, on its ellipses, [shot, n]."""
     launches = np.tile(launch, (len(phases), 1))
-    for plane in range(2):
-        alpha, beta = optics.alpha[plane], optics.beta[plane]
-        x, p = launch[2 * plane], launch[2 * plane + 1]
-        z = (x - 1j * (alpha * x + beta * p)) * np.exp(1j * phases[:, plane])
-        launches[:, 2 * plane] = z.real
-        launches[:, 2 * plane + 1] = (-z.imag - alpha * z.real) / beta
+    turned = optics.normalised(launch) * np.exp(1j * phases)
+    launches[:, :4] = optics.closed_orbit[:4] + np.real(turned @ optics.modes.T)
     return launches
 
 
@@ -147,24 +122,12 @@ def run_case(
     """Return one case; a failed fit has its error message in the case.
 
     Args:
-        ring: the design.
-        magnet: name, or name+name.
-        method: one of `METHODS`.
-        change: relative, of each magnet.
         launch: of the first shot; the others are the same turned by pi / shots each, in both
             planes.
-        shots: trajectories.
         noise: rms of one reading, m.
-        turns: tracked for Adam's tunes.
-        seed: of the noise.
-        recipe: options of Adam.
     """
-    names = magnet.split("+")
-    s = ring[names[0]].s
-    empty = Case(ring[names[0]].name if len(names) == 1 else magnet, s, method, seed)
-    machine = ring
-    for name in names:
-        machine = perturbed_ring(machine, name, change)
+    empty = Case(ring[magnet].name, ring[magnet].s, method, seed)
+    machine = perturbed_ring(ring, magnet, change)
     try:
         true = matrix_tunes(ring_matrix(machine))
     except UnstableRingError:
@@ -179,7 +142,7 @@ def run_case(
     measurement = first_turn_of(machine, launches, noise, generator)
     known = dataclasses.replace(empty, true_tunes=_pair(true))
     kind, _, regularization = method.partition("-")
-    options: dict[str, Any] = {"candidates": names} if kind == "known" else {}
+    options: dict[str, Any] = {"candidates": [magnet]} if kind == "known" else {}
     if kind == "adam":
         options = {**recipe, "regularization": regularization or "symplectic"}
     try:
@@ -217,36 +180,32 @@ def _pair(values: Array) -> Pair:
     return float(values[0]), float(values[1])
 
 
-_networks: dict[int, tuple[Ring, TaylorNetwork]] = {}
-_rings: dict[tuple[Any, ...], Ring] = {}
-
-
 def _network_of(ring: Ring) -> TaylorNetwork:
-    if id(ring) not in _networks or _networks[id(ring)][0] is not ring:
-        _networks.clear()
-        _networks[id(ring)] = ring, TaylorNetwork.from_ring(ring)
-    return _networks[id(ring)][1]
+    if NETWORK not in ring.memory:
+        ring.memory[NETWORK] = TaylorNetwork.from_ring(ring)
+    network: TaylorNetwork = ring.memory[NETWORK]
+    return network
 
 
-def _work(task: tuple[tuple[Any, ...], tuple[str, str, int], dict[str, Any]]) -> dict[str, Any]:
+@cache
+def _ring(lattice: str) -> Ring:
+    return load_ring(lattice)
+
+
+def _work(task: tuple[str, tuple[str, str], dict[str, Any]]) -> dict[str, Any]:
     """A worker's task: plain data in and out, the ring loaded once."""
-    lattice, (magnet, method, seed), options = task
-    if lattice not in _rings:
-        _rings[lattice] = load_ring(*lattice)
-    return dataclasses.asdict(run_case(_rings[lattice], magnet, method, seed=seed, **options))
+    lattice, job, options = task
+    return dataclasses.asdict(run_case(_ring(lattice), *job, **options))
 
 
-def _name_of(job: tuple[str, str, int]) -> str:
+def _name_of(job: tuple[str, str]) -> str:
     """File name of a case, without characters of magnets' names that files may not have."""
     return hashlib.sha256("\0".join(map(str, job)).encode()).hexdigest()[:16]
 
 
 def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
-    """Make the folder of a study, or check that it is this study's.
-
-    Raises:
-        TmlatticeError: it contains the cases of another study, or cannot be written.
-    """
+    """Make the folder of a study, or check that it is this study's; TmlatticeError: it contains the
+    cases of another study, or cannot be written."""
     stated = folder / "options.json"
     text = json.loads(json.dumps(identity))
     if stated.exists():
@@ -271,9 +230,9 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
         write_json(path, text)
 
 
-def _case(job: tuple[str, str, int], values: dict[str, Any]) -> Case:
+def _case(job: tuple[str, str], values: dict[str, Any]) -> Case:
     if "error" in values:  # the code, or the worker, failed
-        return Case(job[0], float("nan"), job[1], job[2], problem=values["error"])
+        return Case(job[0], float("nan"), job[1], 0, problem=values["error"])
     plain: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != MADE_BY
     }
@@ -285,34 +244,21 @@ def study_tune_fit(
     methods: Sequence[str] = ("adam", "map", "sparse"),
     magnets: int | None = 40,
     *,
-    kind: str = "quadrupole",
-    seeds: int = 1,
-    seed: int = 0,
     scheduler: str | None = None,
     jobs: int | None = None,
     folder: Path | None = None,
-    sequence: str | None = None,
-    energy: float | None = None,
-    monitors: Sequence[str] = (),
-    correctors: Sequence[str] = (),
-    particle: str | None = None,
     progress: bool = True,
     **options: Any,
 ) -> list[Case]:
-    """Change magnet after magnet, measure, fine-tune by each method, and compare with the truth.
+    """Change quadrupole after quadrupole, measure, fine-tune by each method, compare with the
+    truth.
 
     Args:
         lattice: name or path; every worker loads it.
-        methods: some of `METHODS`.
         magnets: number of magnets, evenly spread; None: all.
-        kind: quadrupole, sextupole, or pair (of quadrupoles).
-        seeds: noises for each magnet and method, seed, seed + 1, ...
-        seed: the first.
         scheduler: address of a Dask scheduler; None: local processes.
         jobs: local processes; 1: this one; else one a core.
         folder: where every case is written as it ends, and read from when the study goes on.
-        sequence, energy, monitors, correctors, particle: see `load_ring`.
-        progress: show a bar on a terminal.
         options: of `run_case`.
 
     Returns:
@@ -322,24 +268,21 @@ def study_tune_fit(
     Raises:
         TmlatticeError: an unknown method, another study's folder, or no scheduler.
     """
+    from tmlattice import __version__
+
     unknown = [m for m in methods if m not in METHODS]
     if unknown or not methods:
         raise TmlatticeError(f"no method '{', '.join(unknown)}'; there are {', '.join(METHODS)}")
-    marks = (tuple(monitors), tuple(correctors), particle)
-    where = (lattice, sequence, energy, *(marks if any(marks) else ()))
-    ring = load_ring(*where)
+    ring = load_ring(lattice)
     need_monitors(ring)
-    names = faults(ring, magnets, kind)
-    tasks = [(n, m, seed + i) for n in names for m in dict.fromkeys(methods) for i in range(seeds)]
-    from tmlattice import __version__
-
+    tasks = [(n, m) for n in spread_magnets(ring, magnets) for m in dict.fromkeys(methods)]
     made_from = (__version__, contents(ring), sorted(options.items(), key=str))
     with nullcontext() if folder is not None else TemporaryDirectory() as temporary:
         if folder is not None:
-            _open_folder(folder, {**dict(zip(_LATTICE, where, strict=False)), **options})
+            _open_folder(folder, {"lattice": lattice, **options})
         results = run_batch(
             _work,
-            {_name_of(job): partial(tuple, (where, job, options)) for job in tasks},
+            {_name_of(job): partial(tuple, (lattice, job, options)) for job in tasks},
             folder / "cases" if folder is not None else Path(str(temporary)),
             jobs=jobs,
             scheduler=scheduler,

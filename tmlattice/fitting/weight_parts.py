@@ -16,9 +16,9 @@ from tmlattice.fitting.launches import with_noise
 from tmlattice.inference.newton import fit
 from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
-from tmlattice.maps import LayerMaps
-from tmlattice.maps.taylor import kronecker_exponents, symplectic_form
+from tmlattice.maps import LayerMaps, TaylorMap
 from tmlattice.measurement import Measurement
+from tmlattice.network.generators import field_matrix
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.metric import behind
@@ -45,7 +45,6 @@ class LayerEffects:
     """The catalogue as directions in the weights of single layers.
 
     Attributes:
-        ring, dimension: of the weights.
         hypotheses: (effect, element).
         layer: of each, [hypothesis].
         D0, D1, D2: d weights / d amount, [hypothesis, n], [hypothesis, n, n],
@@ -62,12 +61,8 @@ class LayerEffects:
 
 
 def layer_effects(ring: Ring, dimension: int = 4) -> LayerEffects:
-    """Return directions of all usual effects that act through one layer and change no read-out.
-
-    Args:
-        ring: the design.
-        dimension: of the network, 4 or 6.
-    """
+    """Return directions of all usual effects that act through one layer and change no read-out
+    (dimension: of the network, 4 or 6)."""
     chosen = [name for name in names() if isinstance(CATALOGUE[name], RingEffect)]
     if dimension == 4:
         chosen = [name for name in chosen if not CATALOGUE[name].energy]
@@ -206,42 +201,13 @@ def symplectic_directions(W0: Array, W1: Array, W2: Array) -> Array:
         A row for each monomial of H, [generator, n, 1 + n + n (n + 1) / 2]: changes of W0, W1, W2
         side by side. They are independent where W1 is regular.
     """
-    n = len(W0)
-    i, j = np.triu_indices(n)
-    pair = np.empty((n, n), dtype=np.intp)
-    pair[i, j] = pair[j, i] = np.arange(len(i))
-    # the image's monomials 1, z, z^[2] as polynomials of x, truncated
-    image = np.concatenate([W0[:, None], W1, W2], axis=1)
-    products = np.zeros((len(i), image.shape[1]))
-    products[:, 0] = W0[i] * W0[j]
-    products[:, 1 : 1 + n] = W0[i, None] * W1[j] + W0[j, None] * W1[i]
-    products[:, 1 + n :] = W0[i, None] * W2[j] + W0[j, None] * W2[i]
-    for a in range(n):
-        for b in range(n):
-            products[:, 1 + n + pair[a, b]] += W1[i, a] * W1[j, b]
-    one = np.zeros((1, image.shape[1]))
-    one[0, 0] = 1.0
-    monomials = np.concatenate([one, image, products])
-    index = {e: m for m, e in enumerate(e for d in range(3) for e in kronecker_exponents(n, d))}
-    form = symplectic_form(n)
-    found = []
-    for degree in (1, 2, 3):
-        for exponents in kronecker_exponents(n, degree):
-            slope = np.zeros((n, image.shape[1]))  # grad H
-            for v in range(n):
-                if exponents[v]:
-                    lower = tuple(e - (u == v) for u, e in enumerate(exponents))
-                    slope[v] = exponents[v] * monomials[index[lower]]
-            found.append(form @ slope)
-    return np.array(found)
+    image = TaylorMap([W0, W1, W2]).powers(2, 2)
+    return np.asarray(np.einsum("amk,mp->kap", field_matrix(len(W0)), image))
 
 
 def split(seen: Trajectories, effects: LayerEffects, weights: Array) -> Split:
-    """Return the parts: effects, other symplectic changes, the rest.
-
-    Args:
-        weights: change, [layer, n, P].
-    """
+    """Return the parts: effects, other symplectic changes, the rest (weights: change, [layer, n,
+    P])."""
     maps = seen.model.maps
     kicked, trajectory = seen.roots(), seen.ensemble()
     rows = stacked((effects.D0, effects.D1, effects.D2))

@@ -151,7 +151,6 @@ def read_network(
     """Return the change of a network's weights from the design, layer by layer.
 
     Args:
-        ring: the design.
         network: fine-tuned, of this ring.
         measurement: its first turn's trajectories and noise give the significance of a change.
         effects: of `layer_effects`, to be shared by many networks.

@@ -25,7 +25,7 @@ from tmlattice.measurement import (
     in_words,
 )
 from tmlattice.measurement.arrays import Unit
-from tmlattice.measurement.stored_files import QUANTITIES
+from tmlattice.measurement.kinds import QUANTITIES
 
 
 def from_frame(

@@ -123,11 +123,8 @@ def _frame(wrong: Build, angle: float) -> dict[str, Array]:
 
 
 def errors_of(element: Element, energy: float) -> Build:
-    """Return the errors of an element in the ring itself; energy in GeV.
-
-    Raises:
-        LatticeError: a rolled bend: the maps roll its design plane, and no effect does.
-    """
+    """Return the errors of an element in the ring itself; energy in GeV; LatticeError: a rolled
+    bend: the maps roll its design plane, and no effect does."""
     errors = element.errors
     if element.kind == "bend" and errors.roll:
         raise LatticeError(f"AT cannot build the bend '{element.name}' with a roll of its own")
@@ -176,11 +173,8 @@ class Builder:
         self.walls = {"RApertures": np.array([-aperture, aperture, -aperture, aperture])}
 
     def pieces(self, element: Element, wrong: Build, setting: Mapping[str, float]) -> list[Any]:
-        """Return the pieces; their number is the same for every setting.
-
-        Raises:
-            LatticeError: an element, or an error of it, that AT cannot build.
-        """
+        """Return the pieces; their number is the same for every setting; LatticeError: an element,
+        or an error of it, that AT cannot build."""
         build: Callable[..., list[Any]] | None = getattr(self, f"_{element.kind}", None)
         if build is None:
             raise LatticeError(f"AT cannot build the {element.kind} '{element.name}'")

@@ -27,6 +27,7 @@ from scipy.constants import c as SPEED_OF_LIGHT
 
 from tmlattice.beam.rf import RELATIVISTIC, Rf, rf_of, stable_phase
 from tmlattice.effects import Cause, RingEffect, check, find
+from tmlattice.effects.apply import groups
 from tmlattice.effects.build import Build
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import NO_ERRORS, Ring
@@ -64,27 +65,21 @@ class AtEngine:
     magnet.
 
     Args:
-        ring: the design.
-        causes: errors; those on readings (`monitor_*`) and on the beam (`energy_offset`,
-            `energy_spread`) are ignored here.
+        causes: errors; those on readings (`monitor_*`) and on the beam are ignored here.
         radiation_bends, radiation_wigglers: scale of the expected energy loss, 0: none, 1: as
             expected; causes add to it.
         steps: fourth-order integration steps per magnet. With 30 the first turn of a
             PETRA-III-style ring is converged to 0.002 micrometres rms at 1 mm (0.01 with 20).
         aperture: half width in m of quadrupoles and monitors, in both planes.
-        harmonic: of the RF; else that of the ring's first cavity, else the one nearest to 500 MHz.
-        voltage: of the RF in V, all cavities together; else that of the ring's cavities, else
-            four times the design's expected radiation loss.
+        harmonic, voltage: of the RF, see `rf_of`.
 
     Attributes:
-        ring: the design.
         expected_loss: energy that the design orbit loses in a turn at these scales, eV.
 
     Raises:
         LatticeError: an element that AT cannot build, a negative radiation loss, or an RF too
             weak for the loss.
-        EffectError: an effect that cannot sit on its element.
-        UnknownNameError: an unknown effect, element or family.
+        EffectError, UnknownNameError: an effect, element or family that cannot be.
     """
 
     def __init__(
@@ -165,7 +160,7 @@ class AtEngine:
     def track(
         self, launches: ArrayLike, turns: int = 1, settings: Sequence[Settings] | None = None
     ) -> Array:
-        """Return the beam at every monitor.
+        """Return the beam at every monitor, (x, y) in m, [shot, turn, monitor, 2]; NaN once lost.
 
         Over more than one turn the RF is on if the ring radiates, has cavities of its own, or
         its frequency is set: in the ring's cavities, else at the marker or drift named `rf`, else
@@ -174,17 +169,13 @@ class AtEngine:
 
         Args:
             launches: (x, px, y, py, tau, p) at the start of the sequence, [shot, 6].
-            turns: at least 1.
             settings: of each shot, by element name: `kick` of a corrector in rad (the total: the
                 design's kick is replaced), `k1_relative` of a quadrupole or a bend, `k2_relative`
                 of a sextupole, and under "rf" `frequency_relative`.
 
-        Returns:
-            (x, y) in m, [shot, turn, monitor, 2]; NaN once a particle is lost.
-
         Raises:
-            LatticeError: a setting that its element does not have.
-            UnknownNameError: a setting for an element that is not in the ring.
+            LatticeError, UnknownNameError: a setting that its element does not have; no such
+                element.
             ValueError: launches or settings of another shape, or no turn.
         """
         start = np.asarray(launches, dtype=float)
@@ -210,15 +201,8 @@ class AtEngine:
         at non-zero dispersion shifts it. The ring's loss is replaced at its end. Broyden's method
         starts from the unset ring's Jacobian.
 
-        Args:
-            settings: one mapping an orbit, as in `track`.
-
         Returns:
             (x, y) in m, [orbit, monitor, 2].
-
-        Raises:
-            LatticeError, UnknownNameError: see `track`.
-            UnstableRingError: no closed orbit is found.
         """
         start, solve = self._stored
         readings = np.empty((len(settings), len(self._monitors), 2))
@@ -263,13 +247,7 @@ class AtEngine:
 
     def centroids(self, line: list[Any], beam: Array, turns: int) -> Iterator[tuple[Array, Array]]:
         """Yield of each turn the mean of the particles, [monitor, 2], and their part that is not
-        lost, [monitor].
-
-        Args:
-            line: of `stored_line`.
-            beam: the particles, [6, particle]; they are moved.
-            turns: number of turns.
-        """
+        lost, [monitor] (beam: the particles, [6, particle]; they are moved)."""
         block = max(TURNS_AT_ONCE // (beam.shape[1] * len(self._monitors)), 1)
         for turn in range(0, turns, block):
             seen = self.run(line, beam.T, min(block, turns - turn), beam, turn)
@@ -288,17 +266,12 @@ class AtEngine:
 
     def _groups(
         self, settings: Sequence[Settings]
-    ) -> Iterable[tuple[list[int], dict[int, Mapping[str, float]], float]]:
+    ) -> Iterable[tuple[NDArray[np.intp], dict[int, Mapping[str, float]], float]]:
         """(shots, settings by index in the ring, relative RF frequency) of equal shots."""
-        groups: dict[Any, list[int]] = defaultdict(list)
-        for shot, setting in enumerate(settings):
-            groups[
-                frozenset((name, frozenset(what.items())) for name, what in setting.items())
-            ].append(shot)
-        for shots in groups.values():
+        for shots, setting in groups(settings, len(settings)):
             changed: dict[int, Mapping[str, float]] = {}
             frequency = 0.0
-            for name, what in settings[shots[0]].items():
+            for name, what in setting.items():
                 if name.casefold() == "rf":
                     _check_setting("rf", what, ("frequency_relative",))
                     frequency = what.get("frequency_relative", 0.0)
@@ -367,13 +340,8 @@ class AtEngine:
 
 
 def to_at(launches: ArrayLike, energy: float, mass: float = 1e-9 * ELECTRON) -> Array:
-    """Return AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6].
-
-    Args:
-        launches: [..., 6].
-        energy: of the reference particle, GeV.
-        mass: its rest energy, GeV.
-    """
+    """Return AT's (x, px, y, py, delta, ct) of OCELOT's (x, px, y, py, tau, p), [..., 6] (launches:
+    [..., 6])."""
     launches = np.asarray(launches, dtype=float)
     rest = 1e9 * mass
     reference = np.sqrt((energy * 1e9) ** 2 - rest**2)

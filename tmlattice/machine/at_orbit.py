@@ -5,17 +5,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.beam.chain import NO_ORBIT
 from tmlattice.errors import UnstableRingError
 
 Array = NDArray[np.float64]
 Turn = Callable[[Array], Array]
 """Moves states [6, shot] to the line's end, in place, and returns readings of the first of them."""
-
-_NO_ORBIT = (
-    "no closed orbit: the search does not converge; the ring is at an integer resonance, or its "
-    "kicks are too large"
-)
-
 
 STEPS = np.array([3e-6, 3e-6, 3e-6, 3e-6, 1e-5, 1e-5])
 """Steps of the derivatives, m and 1: bends round x to 3e-14 m."""
@@ -34,13 +29,9 @@ def closed(turn: Turn, start: Array, free: Sequence[int], late: float = 0.0) -> 
     """Find the state that returns to itself: free coordinates by Newton's method, others given.
 
     Args:
-        turn: of the line.
         start: near it, [6].
         free: free coordinates, which return: (0, 1, 2, 3) at a given energy, all six with the RF.
         late: excess of a turn over the RF's, m.
-
-    Raises:
-        UnstableRingError: no closed orbit is found.
     """
     state, at = start.copy(), np.ix_(free, free)
     for _ in range(20):
@@ -61,7 +52,7 @@ def closed(turn: Turn, start: Array, free: Sequence[int], late: float = 0.0) -> 
         if np.abs(change).max() < 1e-11:
             return state
         state += change
-    raise UnstableRingError(_NO_ORBIT)
+    raise UnstableRingError(NO_ORBIT)
 
 
 def stored(turn: Turn) -> tuple[Array, Array]:
@@ -74,7 +65,7 @@ def stored(turn: Turn) -> tuple[Array, Array]:
         try:
             solve[:5, rows] = np.linalg.inv((np.eye(6)[:, :5] - slopes)[rows])
         except np.linalg.LinAlgError:
-            raise UnstableRingError(_NO_ORBIT) from None
+            raise UnstableRingError(NO_ORBIT) from None
         start = settle(turn, start, solve, 0.0, 1e-6)[0]
     return settle(turn, start, solve, 0.0)[0], solve
 
@@ -101,4 +92,4 @@ def settle(
         if np.abs(change).max() < tolerance:
             return state, readings
         state += change
-    raise UnstableRingError(_NO_ORBIT)
+    raise UnstableRingError(NO_ORBIT)

@@ -22,12 +22,10 @@ ENERGY = 1e-3
 
 @dataclass(frozen=True)
 class Beam:
-    """Particles of a stored beam.
+    """Particles of a stored beam; one is the centroid alone, which does not decohere.
 
     Attributes:
-        particles: number; 1 is the centroid alone, which does not decohere.
         emittance: of the two modes, m rad.
-        spread: rms relative energy deviation.
     """
 
     particles: int = 1
@@ -49,15 +47,7 @@ def turns_of(
     it. Lost particles no longer count; the beam is lost (NaN) with half of them.
 
     Args:
-        engine: the ring.
         kicked: change of x, px, y, py by the kick at the start of the ring, m and rad, [4].
-        turns: number of turns.
-        settings: of the shot.
-        beam: its particles.
-        random: of the particles.
-
-    Raises:
-        UnstableRingError: no closed orbit, or no stable motion.
     """
     line, with_rf, late = engine.stored_line(settings)
     state = _orbit(engine, line, late)
@@ -74,11 +64,7 @@ def turns_of(
 
 
 def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
-    """Return tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode].
-
-    Raises:
-        UnstableRingError: no closed orbit, or no tune.
-    """
+    """Return tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode]."""
     line, _, late = engine.stored_line(settings)
     state = _orbit(engine, line, late)
     turn = functools.partial(engine.one_pass, line)

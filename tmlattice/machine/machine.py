@@ -34,9 +34,7 @@ class Errors:
     """The errors of a simulated machine, as a truth file states them.
 
     Attributes:
-        ring: the design.
-        causes: errors, without the background.
-        background: rms by effect.
+        causes, background: errors, and the rms of distributed ones by effect.
         seed, machine_seed: of the noise, of the background.
         more: further inputs: engine, particles, ...
     """
@@ -49,12 +47,7 @@ class Errors:
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def every(self) -> list[Cause]:
-        """Return all errors, those of the background first.
-
-        Raises:
-            EffectError, UnknownNameError: an error that the ring cannot have.
-            LatticeError: a ring without monitors.
-        """
+        """Return all errors, those of the background first."""
         causes = [*draw_background(self.ring, self.background, self.machine_seed), *self.causes]
         need_monitors(self.ring)
         check(self.ring, causes)
@@ -92,11 +85,7 @@ def errors(
     machine_seed: int | None,
     **more: Any,
 ) -> Errors:
-    """Return the errors of a machine, as the arguments of a simulation state them.
-
-    Raises:
-        EffectError, UnknownNameError: a background that is unknown.
-    """
+    """Return the errors of a machine, as the arguments of a simulation state them."""
     return Errors(
         ring=ring,
         causes=tuple(causes),
@@ -108,11 +97,8 @@ def errors(
 
 
 def rms_of(noise: float | Sequence[float]) -> Array:
-    """Return the rms of a reading in x and y, m, [2].
-
-    Raises:
-        TmlatticeError: neither one number nor two, or a negative one.
-    """
+    """Return the rms of a reading in x and y, m, [2]; TmlatticeError: neither one number nor two,
+    or a negative one."""
     rms = np.asarray(noise, dtype=float)
     if rms.shape not in ((), (2,)) or not ((rms >= 0) & (rms < np.inf)).all():
         raise TmlatticeError(f"the noise is {noise} m; it is an rms, or two (x, y): zero or more")
@@ -134,11 +120,8 @@ class Engine(Protocol):
 
 
 def check_engine(name: str, known: Sequence[str] = ENGINES) -> None:
-    """Check the name of an engine, of those that a kind of measurement has.
-
-    Raises:
-        TmlatticeError: it is unknown.
-    """
+    """Check the name of an engine, of those that a kind of measurement has; TmlatticeError: it is
+    unknown."""
     if name not in known:
         raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(known)}")
 
@@ -159,8 +142,6 @@ class Machine:
     """A ring with known causes.
 
     Args:
-        ring: the design.
-        causes: of all three kinds.
         engine: "at": thick symplectic tracking by accelerator-toolbox; "ocelot": second-order maps.
         radiation: bends and wigglers radiate as expected.
         noise: rms of one reading, m, one number or (x, y).
@@ -200,7 +181,6 @@ class Machine:
         Args:
             launches: OCELOT's six coordinates, [shot, 6].
             turns: at least 1.
-            settings: of each shot.
         """
         weights, nodes = beams(launches, self.causes)
         flat = nodes.reshape(-1, 6)
@@ -230,9 +210,6 @@ class Machine:
 
         Args:
             shots: see `draw_shots`.
-            turns: of each shot.
-            seed: of the noise.
-            jobs: processes.
         """
         frozen = self.monitors.frozen
         first: Array | None = None

@@ -24,10 +24,6 @@ class NetworkEngine:
 
     States are AT's (x, px, y, py, delta, ct), as `AtEngine`'s. The RF acts once a turn, at its end.
 
-    Args:
-        ring: the design.
-        causes: those on readings or on the launch are ignored here.
-
     Raises:
         EffectError: a cause by which the beam loses energy.
     """
@@ -47,11 +43,7 @@ class NetworkEngine:
         self._rf = with_rf.values * [max(len(with_rf.exits), 1), 1, 1, 1]
 
     def stored_line(self, settings: Settings) -> tuple[Any, Any, float]:
-        """See `AtEngine.stored_line`; a line is whether the RF is on.
-
-        Raises:
-            TmlatticeError: settings.
-        """
+        """See `AtEngine.stored_line`; a line is whether the RF is on; TmlatticeError: settings."""
         if settings:
             raise TmlatticeError("the network has no settings; take the engine 'at'")
         return False, bool(self._rf[0]), 0.0

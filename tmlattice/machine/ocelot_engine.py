@@ -10,7 +10,7 @@ from tmlattice.beam.assembly import Group, assembly
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.rf import NO_RF, rf_of
 from tmlattice.effects import Cause, Settings
-from tmlattice.effects.settings import groups
+from tmlattice.effects.apply import groups
 from tmlattice.lattice import Ring
 
 Array = NDArray[np.float64]
@@ -19,19 +19,7 @@ Array = NDArray[np.float64]
 class OcelotEngine:
     """A ring with causes, tracked through second-order maps.
 
-    Over many turns the RF replaces the design orbit's loss: see `beam.rf`.
-
-    Args:
-        ring: the design.
-        causes: those on readings or on the launch are ignored here.
-        radiation_bends, radiation_wigglers: scale of the expected energy loss.
-        voltage, harmonic: of the RF, see `rf_of`.
-
-    Raises:
-        LatticeError: an RF too weak for the loss.
-    """
-
-    name = "ocelot"
+    Over many turns the RF replaces the design orbit's loss: see `beam.rf`."""
 
     def __init__(
         self,
@@ -40,13 +28,11 @@ class OcelotEngine:
         *,
         radiation_bends: float = 0.0,
         radiation_wigglers: float = 0.0,
-        voltage: float | None = None,
-        harmonic: int | None = None,
     ) -> None:
         scales = {"bends": radiation_bends, "wigglers": radiation_wigglers}
         lost = [Cause(f"radiation_loss_{what}", None, scale) for what, scale in scales.items()]
         known = [*causes, *(cause for cause in lost if cause.amount)]
-        self._there = replace(assembly(ring, known), rf=rf_of(ring, harmonic, voltage))
+        self._there = replace(assembly(ring, known), rf=rf_of(ring))
 
     def track(
         self,
@@ -54,16 +40,7 @@ class OcelotEngine:
         turns: int = 1,
         settings: Sequence[Settings] | None = None,
     ) -> Array:
-        """Return the beam at every monitor.
-
-        Args:
-            launches: OCELOT's (x, px, y, py, tau, p) at the start of the ring, [shot, 6].
-            turns: at least 1.
-            settings: of each shot, see `apply`.
-
-        Returns:
-            (x, y) in m, [shot, turn, monitor, 2]; NaN once the beam is lost.
-        """
+        """Return the beam at every monitor, see `AtEngine.track`."""
         launches, there = np.asarray(launches, dtype=float), self._there
         beam = np.empty((len(launches), turns, len(there.maps.at), 2))
         for shots, setting in groups(settings, len(launches)):

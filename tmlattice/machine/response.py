@@ -50,27 +50,15 @@ def simulate_response(
     """Return the response of a machine with known errors to correctors and RF, one by one.
 
     Args:
-        ring: the design.
-        causes: its errors.
         correctors: names; None: all, in beam order.
         kick: the whole change of each corrector, rad.
         rf_step: Hz; 0: the RF is not stepped; None: a step that raises the energy so that the
             design's orbit changes by 1.3 mm rms, to two digits.
-        one_sided: from the corrector's own kick to `kick` more, else from half below to half above.
         background: distributed errors: effect -> rms (None: the catalogue's), or "all".
         noise: rms of one orbit change, m, one number or (x, y).
         engine: "at": closed orbits of thick symplectic elements; "ocelot": of the second-order
             maps. Neither linearises.
-        seed: of the noise.
         machine_seed: of the background; else `seed`.
-        progress: show a bar on a terminal.
-
-    Raises:
-        EffectError, UnknownNameError: a cause, or a background, that the ring cannot have.
-        MeasurementError: an element that is not a corrector.
-        LatticeError: a ring without monitors.
-        TmlatticeError: another engine.
-        UnstableRingError: no closed orbit.
     """
     check_engine(engine)
     made_of = errors(

@@ -36,10 +36,8 @@ class Shots:
     """Launches and settings.
 
     Attributes:
-        nominal: (x, px, y, py, delta), [shot, 5].
+        nominal: (x, px, y, py, delta), [shot, 5]; `sigma` is the launches' rms about it, [5].
         launches: of the beam, OCELOT's six coordinates, [shot, 6].
-        sigma: rms of the difference, [5].
-        settings: of each shot.
     """
 
     nominal: Array
@@ -65,13 +63,10 @@ def draw_shots(
 
     Args:
         ring: the design; the amplitude is that of its own first turn.
-        shots: number of shots.
         amplitude: rms orbit over monitors and planes, m; both planes have the same rms on average
             over phases.
         sigma: rms of x, px, y, py, delta about the nominal launch.
         kicks: rms of random settings of all correctors, rad, on top of `settings`' own.
-        settings: of each shot.
-        seed: of launches and kicks.
 
     Raises:
         TmlatticeError: no shot, an amplitude that is not positive, or a sigma that is no rms.
@@ -118,11 +113,8 @@ def _rms(chain: Chain, launch: Array) -> Array:
 
 
 def each_setting(given: Sequence[Settings], shots: int) -> tuple[Settings, ...]:
-    """Return the settings of each shot; () are the design's in every one.
-
-    Raises:
-        TmlatticeError: their number differs from that of the shots.
-    """
+    """Return the settings of each shot; () are the design's in every one; TmlatticeError: their
+    number differs from that of the shots."""
     if given and len(given) != shots:
         raise TmlatticeError(f"{len(given)} settings do not fit {shots} shots; give one for each")
     return tuple(given) or ({},) * shots
@@ -145,7 +137,6 @@ def draw_background(ring: Ring, rms: Mapping[str, float], seed: int = 0) -> list
     """Return random distributed errors: every effect at every possible place, Gaussian.
 
     Args:
-        ring: the design.
         rms: by effect, see `background_rms`.
         seed: each effect has its own random stream.
     """

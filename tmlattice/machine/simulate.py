@@ -52,12 +52,6 @@ class Simulation(Errors):
     ) -> None:
         """Write a measurement folder shot by shot, atomically.
 
-        Args:
-            folder: see the measurement format.
-            jobs: processes.
-            progress: show a bar on a terminal.
-            force: replace an existing measurement.
-
         Raises:
             OutputError: it cannot be written.
             MeasurementError: the folder contains a measurement.
@@ -98,19 +92,13 @@ def simulate(
     """Return a machine with known causes, and the shots that measure it.
 
     Args:
-        ring: the design.
-        causes: its errors.
         background: distributed errors: effect -> rms (None: the catalogue's), or "all".
-        shots: number of shots.
-        turns: of each shot.
         amplitude: rms orbit over monitors and planes, m.
         noise: rms of one reading, m, one number or (x, y).
         engine: "at" or "ocelot".
         radiation: bends and wigglers radiate as expected.
         launch_sigma: rms of x, px, y, py, delta about the nominal launch.
         kicks: rms of random settings of all correctors, rad.
-        settings: of each shot.
-        seed: of launches, settings and noise.
         machine_seed: of the background; else `seed`. Measurements of one machine share it.
 
     Raises:

@@ -92,9 +92,6 @@ def simulate_turns(
     """Kick the stored beam of a machine with known errors, and read it turn by turn.
 
     Args:
-        ring: the design.
-        causes: its errors.
-        shots: number of kicks.
         turns: read after each, from 16 to 10,000.
         amplitude: of the oscillation in the design, rms over monitors and planes, m; phases are
             random.
@@ -108,7 +105,6 @@ def simulate_turns(
         settings: of each shot; () for the design's.
         engine: "at"; or "network": the ring's second-order network, for 100,000 particles and more,
             on a graphics card where there is one; without radiation and settings.
-        seed: of kicks, particles and noise.
         machine_seed: of the background; else `seed`.
 
     Raises:
@@ -248,8 +244,6 @@ def simulate_tunes(
     """Return tunes and chromaticities of a machine with known errors.
 
     Args:
-        shots: number of readings.
-        chromaticity: read it too.
         noise: rms of a tune, and of a chromaticity.
 
     The other arguments and the errors are as in `simulate_turns`.

@@ -32,20 +32,6 @@ from tmlattice.maps.quadratic import (
 )
 from tmlattice.maps.taylor import TaylorMap
 
-__all__ = [
-    "LayerMaps",
-    "Quadratic",
-    "RingMaps",
-    "Weights",
-    "changed_maps",
-    "element_map",
-    "layer_elements",
-    "part_maps",
-    "ring_maps",
-    "ring_matrix",
-    "way_map",
-]
-
 Array = NDArray[np.float64]
 
 
@@ -53,7 +39,6 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
     """Return the second-order map of one element from OCELOT, its parts composed.
 
     Args:
-        element: of a ring.
         energy: GeV.
         dimension: 4 for (x, px, y, py), 6 for OCELOT's (x, px, y, py, tau, p).
     """
@@ -70,29 +55,12 @@ def part_maps(element: Element, energy: float) -> list[TaylorMap]:
 
 
 def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
-    """Return the second-order map of elements in beam order: a layer, with the drifts before it.
-
-    Args:
-        elements: any, in beam order.
-        energy: GeV.
-        dimension: 4 or 6.
-    """
+    """Return the second-order map of elements in beam order: a layer, with the drifts before it
+    (dimension: 4 or 6)."""
     way = identity(dimension)
     for element in elements:
         way = quadratic_map(element, energy, dimension).after(way)
     return TaylorMap(way.reduced())
-
-
-def layer_elements(ring: Ring) -> list[tuple[Element, ...]]:
-    """Return the elements of each layer: those before its magnet, and the magnet."""
-    layers: list[tuple[Element, ...]] = []
-    way: list[Element] = []
-    for element in ring.elements:
-        way.append(element)
-        if element.is_magnet:
-            layers.append(tuple(way))
-            way = []
-    return layers
 
 
 @dataclass(frozen=True)
@@ -314,7 +282,6 @@ def changed_maps(maps: RingMaps, layers: LayerMaps, touched: Sequence[int]) -> R
 
     Args:
         maps: of a ring that differs from that of `layers` in the touched layers alone.
-        layers: of the ring.
         touched: layers, up to their number, which means the drift from the last magnet to the end.
     """
     arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2", "R0", "R1", "R2")}

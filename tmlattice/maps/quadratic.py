@@ -79,12 +79,7 @@ def _stacked(maps: Sequence[Quadratic], n: int) -> tuple[Array, Array, Array]:
 
 
 def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
-    """Return the sum of maps with signs, over a step: a derivative by differences.
-
-    Args:
-        ends: signs and maps, at least one.
-        step: distance of the ends.
-    """
+    """Return the sum of maps with signs, over a step: a derivative by differences."""
     signs, maps = zip(*ends, strict=True)
 
     def total(arrays: Iterable[Array | None]) -> Array | None:
@@ -252,11 +247,8 @@ def of_ocelot(part: Part, n: int) -> Quadratic:
 
 
 def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
-    """Return the map of one element, its errors included.
-
-    Raises:
-        LatticeError: it is not finite, or it loses energy, which needs six coordinates.
-    """
+    """Return the map of one element, its errors included; LatticeError: it is not finite, or it
+    loses energy, which needs six coordinates."""
     errors = element.errors
     if element.kind == "cavity":  # its gain depends on the turn, see `beam.rf`
         element = _empty(element)
@@ -342,7 +334,6 @@ def halves_without_sextupole(element: Element, energy: float, n: int) -> list[Qu
 
     Args:
         element: with a length; its `errors` are ignored.
-        energy: GeV.
         n: coordinates, 4 or 6.
     """
     from tmlattice.lattice.ocelot import SecondTM, TMTypes

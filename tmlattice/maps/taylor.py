@@ -207,14 +207,17 @@ class TaylorMap:
         if first.n != self.n:
             raise ValueError(f"maps of {self.n} and {first.n} coordinates do not compose")
         order = max(self.order, first.order) if order is None else order
-        table = _table(self.n, order)
-        inner = first.truncated(order)._rows
         # all terms of the outer map: a constant in `first` feeds them down
-        outer_table = self._table
+        return self._of_rows(self._rows @ first.powers(self.order, order), order)
+
+    def powers(self, degree: int, order: int) -> Array:
+        """Return the monomials of the image, of degree 0 to `degree`, as polynomials of x that are
+        truncated at an order, [monomial, monomial]."""
+        table, inner = _table(self.n, order), self.truncated(order)._rows
         values = [np.eye(1, inner.shape[1])[0]]
-        for parent, variable in outer_table.parents[1:]:
+        for parent, variable in _table(self.n, degree).parents[1:]:
             values.append(table.multiply(values[parent], inner[variable]))
-        return self._of_rows(self._rows @ np.array(values), order)
+        return np.array(values)
 
     def __matmul__(self, first: "TaylorMap") -> "TaylorMap":
         """Return `second @ first`: first `first`, then `second`, as with matrices."""

@@ -19,11 +19,7 @@ METRES = {
 
 
 def metres(unit: str) -> float:
-    """The length of a unit of readings, m.
-
-    Raises:
-        MeasurementError: another unit.
-    """
+    """The length of a unit of readings, m; MeasurementError: another unit."""
     if unit not in METRES:
         raise MeasurementError(f"no unit '{unit}'; readings are in {', '.join(METRES)}")
     return METRES[unit]
@@ -45,9 +41,6 @@ def readings_of(
 
     Args:
         x, y: [*axes, monitor], of which the first axes may be absent; None: not read.
-        monitors: names.
-        axes: of the result, before the monitor.
-        unit: of x and y.
 
     Raises:
         MeasurementError: another shape, another number of monitors, or neither x nor y.

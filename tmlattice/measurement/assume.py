@@ -7,7 +7,7 @@ correction for the kinds of measurement where it has a meaning. The data checks 
 goes on with those that he has confirmed.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -59,8 +59,6 @@ def assume(data: Data, names: Iterable[str], ring_monitors: Sequence[str]) -> Da
     """The data with what is assumed undone, one after another.
 
     Args:
-        data: a measurement of any kind.
-        names: of `ASSUMPTIONS`.
         ring_monitors: names of the ring's monitors, in beam order.
 
     Raises:
@@ -130,15 +128,7 @@ def read_of(data: Any) -> Array:
 
 def with_read(data: Any, change: Callable[[Array], Array]) -> Any:
     """Return the data with a change of everything that was read, [..., monitor, 2]."""
-    if isinstance(data, Dispersion):
-        steps = (replace(own, orbit=change(np.asarray(own.orbit))) for own in data.steps)
-        return _with(data, steps=tuple(steps))
-    if not isinstance(data, OrbitResponse):
-        return _with(data, **{data.READ: change(read_of(data))})
-    rf = data.rf
-    if rf is not None and rf.orbit is not None:
-        rf = replace(rf, orbit=change(rf.orbit))
-    return _with(data, response=change(data.response), rf=rf)
+    return _with(data, **data.read_with(change))
 
 
 def _sign(data: Any, x: float, y: float) -> Any:
@@ -288,297 +278,135 @@ _ORBITS = (*_FIRST, *_CHANGES)
 _READ = (*_ORBITS, TurnByTurn)
 
 
+SIGN = "change the sign of {}"
+UNIT = "give {} in {}"
+NAMES = "give each reading its own BPM's name"
+STEP = "give the step that the orbit change belongs to"
+
+_Row = tuple[Any, ...]
+
+
+def _shifts() -> Iterator[_Row]:
+    for by in (1, -1, 2, -2, 3, -3):
+        count = f"{abs(by)} place{'s' * (abs(by) > 1)} {'down' if by > 0 else 'up'}stream"
+        words = f"the names of the BPMs are shifted: what was read stands {count} of its BPM"
+        yield f"monitors-shifted={by}", _READ, words, NAMES, _reordered, partial(_shift, by=by)
+
+
+def _folds() -> Iterator[_Row]:
+    for name, words, what, x, y in (
+        ("-x", "Qx is 1 - Qx", "1 - Qx", True, False),
+        ("-y", "Qy is 1 - Qy", "1 - Qy", False, True),
+        ("s", "both tunes are 1 - Q", "1 - Q", True, True),
+    ):
+        correction = f"give {what}: a spectrum does not separate Q from 1 - Q"
+        yield f"tune{name}-folded", (TuneReading,), words, correction, _folded, x, y
+
+
+_TABLE: tuple[_Row, ...] = (
+    ("x-reversed", _ORBITS, "x has the wrong sign at every BPM", SIGN.format("x"), _sign, -1, 1),
+    ("y-reversed", _ORBITS, "y has the wrong sign at every BPM", SIGN.format("y"), _sign, 1, -1),
+    ("readings-reversed", _ORBITS, "x and y have the wrong sign at every BPM",
+     SIGN.format("x and y"), _sign, -1, -1),
+    ("planes-exchanged", (*_READ, TuneReading), "x and y are exchanged everywhere",
+     "exchange x and y", _exchanged),
+    ("readings-in-mm", _ORBITS, "the readings are in mm", UNIT.format("them", "m"), _unit, 1e-3),
+    ("readings-in-um", _ORBITS, "the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
+    ("readings-in-km", _ORBITS, "the readings are a thousand times too small",
+     UNIT.format("them", "m"), _unit, 1e3),
+    ("readings-in-Mm", _CHANGES, "the readings are a million times too small",
+     UNIT.format("them", "m"), _unit, 1e6),
+    ("readings-doubled", (*_FIRST, *_RESPONSE), "the readings are twice what they should be",
+     "halve them", _unit, 0.5),
+    ("readings-halved", (*_FIRST, *_RESPONSE), "the readings are half of what they should be",
+     "double them", _unit, 2.0),
+    *_shifts(),
+    ("monitors-backwards", _READ, "the BPMs stand in the reverse order",
+     NAMES, _reordered, _reverse),
+    ("monitors-alphabetical", _READ, "the readings stand in the order of the sorted names",
+     NAMES, _reordered, _alphabet),
+    ("beam-backwards", _FIRST, "the beam runs against the lattice, from its end to its start",
+     "reverse the lattice, or start it where the beam is launched", _backwards),
+    ("turns-from-1", _FIRST, "turns are counted from 1", "count them from 0: turn 0 is the first",
+     _earlier),
+    ("launches-reversed", _FIRST, "the launches have the wrong sign",
+     SIGN.format("x, px, y and py of every launch"), _launches, -1, -1, -1, -1),
+    ("launches-x-reversed", _FIRST, "the launches have the wrong sign in x and px",
+     SIGN.format("x and px of every launch"), _launches, -1, -1, 1, 1),
+    ("launches-y-reversed", _FIRST, "the launches have the wrong sign in y and py",
+     SIGN.format("y and py of every launch"), _launches, 1, 1, -1, -1),
+    ("slopes-reversed", _FIRST, "px and py of the launches have the wrong sign",
+     SIGN.format("px and py of every launch"), _launches, 1, -1, 1, -1),
+    ("slopes-x-reversed", _FIRST, "px of the launches has the wrong sign",
+     SIGN.format("px of every launch"), _launches, 1, -1, 1, 1),
+    ("slopes-y-reversed", _FIRST, "py of the launches has the wrong sign",
+     SIGN.format("py of every launch"), _launches, 1, 1, 1, -1),
+    ("launches-exchanged", _FIRST, "x, px and y, py of the launches are exchanged", "exchange them",
+     _launches_exchanged),
+    ("launches-in-mm", _FIRST, "the launches are in mm and mrad", UNIT.format("them", "m and rad"),
+     _launches, 1e-3, 1e-3, 1e-3, 1e-3),
+    ("launches-in-um", _FIRST, "the launches are in µm and µrad", UNIT.format("them", "m and rad"),
+     _launches, 1e-6, 1e-6, 1e-6, 1e-6),
+    ("positions-in-mm", _FIRST, "x and y of the launches are in mm", UNIT.format("them", "m"),
+     _launches, 1e-3, 1, 1e-3, 1),
+    ("slopes-in-mrad", _FIRST, "px and py of the launches are in mrad", UNIT.format("them", "rad"),
+     _launches, 1, 1e-3, 1, 1e-3),
+    ("energies-reversed", _FIRST, "delta of the launches has the wrong sign",
+     SIGN.format("delta of every launch"), _launches, 1, 1, 1, 1, -1),
+    ("energies-in-percent", _FIRST, "delta of the launches is in per cent", "divide it by 100",
+     _launches, 1, 1, 1, 1, 0.01),
+    ("launches-unknown", _FIRST, "the launches are not what is stated",
+     "correct them, or their launch_sigma", _no_launches),
+    ("settings-reversed", (Measurement, ClosedOrbit),
+     "the kicks in the shots' settings have the wrong sign", SIGN.format("all of them"), _kicks_set,
+     -1),
+    ("settings-in-mrad", (Measurement, ClosedOrbit), "the kicks in the shots' settings are in mrad",
+     UNIT.format("them", "rad"), _kicks_set, 1e-3),
+    ("settings-not-there", _FIRST, "the kicks in the shots' settings were not there",
+     "take them out", _kicks_set, 0),
+    ("noise-from-data", _FIRST, "the stated noise is not that of the readings", "leave it out",
+     _no_noise),
+    ("kicks-reversed", _RESPONSE, "the kicks have the wrong sign", SIGN.format("all of them"),
+     _kicks, -1, -1),
+    ("kicks-x-reversed", _RESPONSE, "the horizontal kicks have the wrong sign", SIGN.format("them"),
+     _kicks, -1, 1),
+    ("kicks-y-reversed", _RESPONSE, "the vertical kicks have the wrong sign", SIGN.format("them"),
+     _kicks, 1, -1),
+    ("kicks-in-mrad", _RESPONSE, "the kicks are in mrad", UNIT.format("them", "rad"), _kicks, 1e-3,
+     1e-3),
+    ("kicks-in-urad", _RESPONSE, "the kicks are in µrad", UNIT.format("them", "rad"), _kicks, 1e-6,
+     1e-6),
+    ("kicks-in-krad", _RESPONSE, "the kicks are a thousand times too small",
+     UNIT.format("them", "rad"), _kicks, 1e3, 1e3),
+    ("kicks-doubled", _RESPONSE, "the kicks are half of those that were made",
+     "give the whole step, from one side to the other", _kicks, 2, 2),
+    ("kicks-halved", _RESPONSE, "the kicks are twice those that were made",
+     STEP, _kicks, 0.5, 0.5),
+    ("correctors-shifted=1", _RESPONSE, "the columns of each plane stand one corrector too late",
+     "give each its own corrector's name", _columns_shifted, 1),
+    ("correctors-shifted=-1", _RESPONSE, "the columns of each plane stand one corrector too early",
+     "give each its own corrector's name", _columns_shifted, -1),
+    ("rf-reversed", (OrbitResponse, Dispersion), "the RF's step has the wrong sign",
+     SIGN.format("step_hz"), _rf, -1),
+    ("rf-doubled", _RESPONSE, "the RF's step is half of the one that was made",
+     "give the whole step", _rf, 2),
+    ("rf-halved", _RESPONSE, "the RF's step is twice the one that was made",
+     STEP, _rf, 0.5),
+    ("rf-in-mm", _RESPONSE, "the RF's orbit is in mm", UNIT.format("it", "m"), _rf_orbit, 1e-3),
+    ("rf-in-km", _RESPONSE, "the RF's orbit is a thousand times too small", UNIT.format("it", "m"),
+     _rf_orbit, 1e3),
+    ("turns-backwards", (TurnByTurn,), "the turns are numbered backwards",
+     "number them from the kick on", _last_first),
+    *_folds(),
+)  # fmt: skip
+"""Name, kinds, words, correction, the change and its values."""
+
+
 def _of(
     kinds: tuple[type, ...], words: str, correction: str, change: Callable[..., Any], *values: Any
 ) -> Assumption:
     return Assumption(words, correction, kinds, lambda data: change(data, *values))
 
 
-_first, _columns = partial(_of, _FIRST), partial(_of, _RESPONSE)
-
-
-def _shifts() -> dict[str, Assumption]:
-    found = {}
-    for by in (1, -1, 2, -2, 3, -3):
-        count = f"{abs(by)} place{'s' * (abs(by) > 1)} {'down' if by > 0 else 'up'}stream"
-        found[f"monitors-shifted={by}"] = _of(
-            _READ,
-            f"the names of the BPMs are shifted: what was read stands {count} of its BPM",
-            "give each reading its own BPM's name",
-            _reordered, partial(_shift, by=by),
-        )  # fmt: skip
-    return found
-
-
-SIGN = "change the sign of {}"
-UNIT = "give {} in {}"
-
-ASSUMPTIONS: dict[str, Assumption] = {
-    "x-reversed": _of(_ORBITS, "x has the wrong sign at every BPM", SIGN.format("x"), _sign, -1, 1),
-    "y-reversed": _of(_ORBITS, "y has the wrong sign at every BPM", SIGN.format("y"), _sign, 1, -1),
-    "readings-reversed": _of(
-        _ORBITS,
-        "x and y have the wrong sign at every BPM",
-        SIGN.format("x and y"),
-        _sign,
-        -1,
-        -1,
-    ),
-    "planes-exchanged": _of(
-        (*_READ, TuneReading), "x and y are exchanged everywhere", "exchange x and y", _exchanged
-    ),
-    "readings-in-mm": _of(_ORBITS, "the readings are in mm", UNIT.format("them", "m"), _unit, 1e-3),
-    "readings-in-um": _of(_ORBITS, "the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
-    "readings-in-km": _of(
-        _ORBITS, "the readings are a thousand times too small", UNIT.format("them", "m"), _unit, 1e3
-    ),
-    "readings-in-Mm": _of(
-        _CHANGES, "the readings are a million times too small", UNIT.format("them", "m"), _unit, 1e6
-    ),
-    "readings-doubled": _of(
-        (*_FIRST, *_RESPONSE),
-        "the readings are twice what they should be",
-        "halve them",
-        _unit,
-        0.5,
-    ),
-    "readings-halved": _of(
-        (*_FIRST, *_RESPONSE),
-        "the readings are half of what they should be",
-        "double them",
-        _unit,
-        2.0,
-    ),
-    **_shifts(),
-    "monitors-backwards": _of(
-        _READ,
-        "the BPMs stand in the reverse order",
-        "give each reading its own BPM's name",
-        _reordered,
-        _reverse,
-    ),
-    "monitors-alphabetical": _of(
-        _READ,
-        "the readings stand in the order of the sorted names",
-        "give each reading its own BPM's name",
-        _reordered,
-        _alphabet,
-    ),
-    "beam-backwards": _first(
-        "the beam runs against the lattice, from its end to its start",
-        "reverse the lattice, or start it where the beam is launched",
-        _backwards,
-    ),
-    "turns-from-1": _first(
-        "turns are counted from 1", "count them from 0: turn 0 is the first", _earlier
-    ),
-    "launches-reversed": _first(
-        "the launches have the wrong sign",
-        SIGN.format("x, px, y and py of every launch"),
-        _launches,
-        -1,
-        -1,
-        -1,
-        -1,
-    ),
-    "launches-x-reversed": _first(
-        "the launches have the wrong sign in x and px",
-        SIGN.format("x and px of every launch"),
-        _launches,
-        -1,
-        -1,
-        1,
-        1,
-    ),
-    "launches-y-reversed": _first(
-        "the launches have the wrong sign in y and py",
-        SIGN.format("y and py of every launch"),
-        _launches,
-        1,
-        1,
-        -1,
-        -1,
-    ),
-    "slopes-reversed": _first(
-        "px and py of the launches have the wrong sign",
-        SIGN.format("px and py of every launch"),
-        _launches,
-        1,
-        -1,
-        1,
-        -1,
-    ),
-    "slopes-x-reversed": _first(
-        "px of the launches has the wrong sign",
-        SIGN.format("px of every launch"),
-        _launches,
-        1,
-        -1,
-        1,
-        1,
-    ),
-    "slopes-y-reversed": _first(
-        "py of the launches has the wrong sign",
-        SIGN.format("py of every launch"),
-        _launches,
-        1,
-        1,
-        1,
-        -1,
-    ),
-    "launches-exchanged": _first(
-        "x, px and y, py of the launches are exchanged", "exchange them", _launches_exchanged
-    ),
-    "launches-in-mm": _first(
-        "the launches are in mm and mrad",
-        UNIT.format("them", "m and rad"),
-        _launches,
-        1e-3,
-        1e-3,
-        1e-3,
-        1e-3,
-    ),
-    "launches-in-um": _first(
-        "the launches are in µm and µrad",
-        UNIT.format("them", "m and rad"),
-        _launches,
-        1e-6,
-        1e-6,
-        1e-6,
-        1e-6,
-    ),
-    "positions-in-mm": _first(
-        "x and y of the launches are in mm", UNIT.format("them", "m"), _launches, 1e-3, 1, 1e-3, 1
-    ),
-    "slopes-in-mrad": _first(
-        "px and py of the launches are in mrad",
-        UNIT.format("them", "rad"),
-        _launches,
-        1,
-        1e-3,
-        1,
-        1e-3,
-    ),
-    "energies-reversed": _first(
-        "delta of the launches has the wrong sign",
-        SIGN.format("delta of every launch"),
-        _launches,
-        1,
-        1,
-        1,
-        1,
-        -1,
-    ),
-    "energies-in-percent": _first(
-        "delta of the launches is in per cent", "divide it by 100", _launches, 1, 1, 1, 1, 0.01
-    ),
-    "launches-unknown": _first(
-        "the launches are not what is stated", "correct them, or their launch_sigma", _no_launches
-    ),
-    "settings-reversed": _of(
-        (Measurement, ClosedOrbit),
-        "the kicks in the shots' settings have the wrong sign",
-        SIGN.format("all of them"),
-        _kicks_set,
-        -1,
-    ),
-    "settings-in-mrad": _of(
-        (Measurement, ClosedOrbit),
-        "the kicks in the shots' settings are in mrad",
-        UNIT.format("them", "rad"),
-        _kicks_set,
-        1e-3,
-    ),
-    "settings-not-there": _first(
-        "the kicks in the shots' settings were not there", "take them out", _kicks_set, 0
-    ),
-    "noise-from-data": _first(
-        "the stated noise is not that of the readings", "leave it out", _no_noise
-    ),
-    "kicks-reversed": _columns(
-        "the kicks have the wrong sign", SIGN.format("all of them"), _kicks, -1, -1
-    ),
-    "kicks-x-reversed": _columns(
-        "the horizontal kicks have the wrong sign", SIGN.format("them"), _kicks, -1, 1
-    ),
-    "kicks-y-reversed": _columns(
-        "the vertical kicks have the wrong sign", SIGN.format("them"), _kicks, 1, -1
-    ),
-    "kicks-in-mrad": _columns(
-        "the kicks are in mrad", UNIT.format("them", "rad"), _kicks, 1e-3, 1e-3
-    ),
-    "kicks-in-urad": _columns(
-        "the kicks are in µrad", UNIT.format("them", "rad"), _kicks, 1e-6, 1e-6
-    ),
-    "kicks-in-krad": _columns(
-        "the kicks are a thousand times too small", UNIT.format("them", "rad"), _kicks, 1e3, 1e3
-    ),
-    "kicks-doubled": _columns(
-        "the kicks are half of those that were made",
-        "give the whole step, from one side to the other",
-        _kicks,
-        2,
-        2,
-    ),
-    "kicks-halved": _columns(
-        "the kicks are twice those that were made",
-        "give the step that the orbit change belongs to",
-        _kicks,
-        0.5,
-        0.5,
-    ),
-    "correctors-shifted=1": _columns(
-        "the columns of each plane stand one corrector too late",
-        "give each its own corrector's name",
-        _columns_shifted,
-        1,
-    ),
-    "correctors-shifted=-1": _columns(
-        "the columns of each plane stand one corrector too early",
-        "give each its own corrector's name",
-        _columns_shifted,
-        -1,
-    ),
-    "rf-reversed": _of(
-        (OrbitResponse, Dispersion),
-        "the RF's step has the wrong sign",
-        SIGN.format("step_hz"),
-        _rf,
-        -1,
-    ),
-    "rf-doubled": _columns(
-        "the RF's step is half of the one that was made", "give the whole step", _rf, 2
-    ),
-    "rf-halved": _columns(
-        "the RF's step is twice the one that was made",
-        "give the step that the orbit change belongs to",
-        _rf,
-        0.5,
-    ),
-    "rf-in-mm": _columns("the RF's orbit is in mm", UNIT.format("it", "m"), _rf_orbit, 1e-3),
-    "rf-in-km": _columns(
-        "the RF's orbit is a thousand times too small", UNIT.format("it", "m"), _rf_orbit, 1e3
-    ),
-    "turns-backwards": _of(
-        (TurnByTurn,),
-        "the turns are numbered backwards",
-        "number them from the kick on",
-        _last_first,
-    ),
-    **{
-        f"tune{name}-folded": _of(
-            (TuneReading,),
-            words,
-            f"give {what}: a spectrum does not separate Q from 1 - Q",
-            _folded,
-            x,
-            y,
-        )
-        for name, words, what, x, y in (
-            ("-x", "Qx is 1 - Qx", "1 - Qx", True, False),
-            ("-y", "Qy is 1 - Qy", "1 - Qy", False, True),
-            ("s", "both tunes are 1 - Q", "1 - Q", True, True),
-        )
-    },
-}
+ASSUMPTIONS = {name: _of(*row) for name, *row in _TABLE}
 """What may be assumed, by name."""

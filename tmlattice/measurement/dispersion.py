@@ -1,6 +1,6 @@
 """The change of the closed orbit for steps of the RF frequency."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -14,26 +14,21 @@ from tmlattice.measurement.monitors import (
     check_energy,
     check_values,
     noise_table,
-    places_of,
-    spread,
 )
 from tmlattice.measurement.orbit_response import RfStep, check_rf
-from tmlattice.measurement.shown import Shown
+from tmlattice.measurement.shown import OfMonitors
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Dispersion(Shown):
+class Dispersion(OfMonitors):
     """Orbit changes for one or more steps of the RF.
 
     Attributes:
         steps: each with its orbit change, m (not m per relative energy), [monitor, 2], NaN where
             missing.
-        monitors: names, in the order of the orbits.
-        noise: rms of one orbit change, m, [monitor, 2], NaN where unknown; None: all unknown. A
-            pair (x, y), or a mapping of pairs by monitor, is taken too.
-        lattice, energy: what the data state about them (GeV); hints.
+        noise: rms of one orbit change, and the other attributes: see `Measurement`.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, a step of 0 Hz, or no
@@ -67,8 +62,6 @@ class Dispersion(Shown):
             step: of the frequency, Hz; one number, or one a step.
             frequency: of the RF, Hz.
             harmonic: number of RF periods in a turn.
-            unit: of x and y.
-            noise: see the attributes.
 
         Raises:
             MeasurementError: shapes that do not fit, or numbers that cannot be.
@@ -108,34 +101,11 @@ class Dispersion(Shown):
         """The orbit changes of all steps, m, [step, monitor, 2], NaN where missing."""
         return np.stack([np.asarray(step.orbit) for step in self.steps])
 
-    def in_order_of(self, monitors: Sequence[str]) -> "Dispersion":
-        """The same with other monitors, such as a ring's: NaN where one was not read.
-
-        Raises:
-            UnknownNameError: this measurement has a monitor that is not among them.
-        """
-        places, number = places_of("monitor", monitors, self.monitors), len(monitors)
-        return replace(
-            self,
-            steps=tuple(replace(s, orbit=spread(s.orbit, places, number)) for s in self.steps),
-            monitors=tuple(monitors),
-            noise=spread(self.noise, places, number),
-        )
+    def read_with(self, change: Callable[[Array], Array]) -> dict[str, Any]:
+        """Return the steps with a change of their orbits, [..., monitor, 2]."""
+        steps = (replace(step, orbit=change(np.asarray(step.orbit))) for step in self.steps)
+        return {"steps": tuple(steps)}
 
     def select(self, monitors: Sequence[str]) -> "Dispersion":
-        """A part of the monitors, in the order asked for.
-
-        Raises:
-            UnknownNameError: one that is not there.
-            MeasurementError: nothing is left.
-        """
-        here = places_of("monitor", self.monitors, monitors)
-        return replace(
-            self,
-            steps=tuple(
-                replace(s, orbit=orbit[here])
-                for s, orbit in zip(self.steps, self.orbits, strict=True)
-            ),
-            monitors=tuple(self.monitors[i] for i in here),
-            noise=None if self.noise is None else self.noise[here],
-        )
+        """A part of the monitors, see `at_monitors`."""
+        return self.at_monitors(monitors)

@@ -23,13 +23,6 @@ def read_document(
 ) -> dict[str, Any]:
     """A JSON file of the format `name`, as its schema has it.
 
-    Args:
-        path: the file.
-        schema: file name in `tmlattice/schemas`, without `.schema.json`.
-        name: what `format` has to be.
-        version: the one that can be read.
-        first: looks before the schema does, which takes its time over long lists.
-
     Raises:
         MeasurementError: no such file, not UTF-8, not JSON (with the line), another format or
             version, or not as the schema has it (with the place).
@@ -86,11 +79,8 @@ class Digest:
 
 
 def check_table(document: dict[str, Any], table: Path) -> None:
-    """Whether a table is whole, and belongs to its document, where that holds a digest.
-
-    Raises:
-        MeasurementError: it cannot be read, or is another.
-    """
+    """Whether a table is whole, and belongs to its document, where that holds a digest;
+    MeasurementError: it cannot be read, or is another."""
     if (stated := document.get("table_sha256")) is None:
         return
     digest = Digest()

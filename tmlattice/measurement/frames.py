@@ -15,17 +15,13 @@ from typing import Any
 import numpy as np
 
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement.folder import RESPONSE, AnyMeasurement, read_measurement
+from tmlattice.measurement.folder import AnyMeasurement, read_measurement
+from tmlattice.measurement.kinds import KINDS
 from tmlattice.measurement.orbit_response import OrbitResponse
 from tmlattice.measurement.rows import read_rows
-from tmlattice.measurement.stored_files import KINDS, ORBITS, STEPS, TUNES, TURNS
 from tmlattice.measurement.write import write_measurement
 
 ATTRIBUTE = "measurement"
-_COLUMNS = {
-    "trajectory": TURNS, "turn_by_turn": TURNS, "closed_orbit": ORBITS, "dispersion": STEPS,
-    "tunes": TUNES, "orbit_response": RESPONSE,
-}  # fmt: skip
 
 
 def to_dataframe(measured: AnyMeasurement) -> Any:
@@ -35,20 +31,17 @@ def to_dataframe(measured: AnyMeasurement) -> Any:
     a closed orbit; step, monitor, x, y of a dispersion measurement; corrector, monitor, x, y, kick
     (rad; Hz of the rows of "rf"), plane of an orbit response; shot, quantity, value, error of
     tunes. The rest stands in `attrs`: `from_dataframe` reads an equal measurement back.
-
-    Raises:
-        MeasurementError: a reading above 0.2 m.
     """
     import pandas as pd
 
     with TemporaryDirectory() as folder:
         write_measurement(folder, measured)
         document = json.loads((Path(folder) / "measurement.json").read_text(encoding="utf-8"))
-        columns = _COLUMNS[document["kind"]]
-        rows = read_rows(Path(folder) / _table(document["kind"]), columns)
+        kind = KINDS[document["kind"]]
+        rows = read_rows(Path(folder) / kind.table, kind.columns)
     texts = {name: np.array(own, dtype=object)[at] for name, (own, at) in rows.names.items()}
-    numbers = dict(zip(columns[-2:], rows.xy.T, strict=True))
-    frame = pd.DataFrame({name: (rows.whole | texts | numbers)[name] for name in columns})
+    numbers = dict(zip(kind.columns[-2:], rows.xy.T, strict=True))
+    frame = pd.DataFrame({name: (rows.whole | texts | numbers)[name] for name in kind.columns})
     del document["table_sha256"]
     units = {"x": "m", "y": "m"} if "x" in frame.columns else {}
     if isinstance(measured, OrbitResponse):
@@ -78,7 +71,7 @@ def to_xarray(measured: AnyMeasurement) -> Any:
         MeasurementError: a reading above 0.2 m, or xarray is not installed.
     """
     frame = to_dataframe(measured)
-    axes = list(_COLUMNS[frame.attrs[ATTRIBUTE]["kind"]][:-2])
+    axes = list(KINDS[frame.attrs[ATTRIBUTE]["kind"]].columns[:-2])
     of_columns = [frame.pop(name) for name in ("kick", "plane") if name in frame.columns]
     try:
         data = frame.set_index(axes).to_xarray()
@@ -95,20 +88,18 @@ def to_xarray(measured: AnyMeasurement) -> Any:
 
 
 def of_document(frame: Any) -> AnyMeasurement | None:
-    """The measurement of a frame of `to_dataframe`; None: it states none, or is no such table.
-
-    Raises:
-        MeasurementError: rows that cannot be read.
-    """
+    """The measurement of a frame of `to_dataframe`; None: it states none, or is no such table;
+    MeasurementError: rows that cannot be read."""
     document = frame.attrs.get(ATTRIBUTE)
     if isinstance(document, str):
         try:
             document = json.loads(document)
         except ValueError as error:
             raise MeasurementError(f"attrs['{ATTRIBUTE}'] is no JSON ({error})") from error
-    if not isinstance(document, dict) or document.get("kind") not in _COLUMNS:
+    if not isinstance(document, dict) or document.get("kind") not in KINDS:
         return None
-    columns = list(_COLUMNS[document["kind"]])
+    kind = KINDS[document["kind"]]
+    columns = list(kind.columns)
     if not set(columns) <= set(frame.columns):
         return None
     with TemporaryDirectory() as folder:
@@ -116,14 +107,8 @@ def of_document(frame: Any) -> AnyMeasurement | None:
         (place / "measurement.json").write_text(json.dumps(document), encoding="utf-8")
         table = StringIO()
         frame[columns].to_csv(table, index=False, quoting=csv.QUOTE_MINIMAL, lineterminator="\n")
-        (place / _table(document["kind"])).write_text(table.getvalue(), encoding="utf-8")
+        (place / kind.table).write_text(table.getvalue(), encoding="utf-8")
         try:
             return read_measurement(place)
         except MeasurementError as error:
             raise MeasurementError(str(error).replace(folder, type(frame).__name__)) from error
-
-
-def _table(kind: str) -> str:
-    if kind in KINDS:
-        return KINDS[kind].table
-    return "response.csv" if kind == "orbit_response" else "readings.csv"

@@ -4,7 +4,7 @@ Matching ignores case, and `name::0` stands for a name that stands once.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from tmlattice.measurement.arrays import METRES
 
 Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
-Values = TypeVar("Values", Array, None, Array | None)
 
 SETTINGS = ("kick", "k1_relative", "k2_relative", "frequency_relative")
 """What may be changed on purpose: rad, relative strengths, and the RF's relative frequency."""
@@ -30,15 +29,8 @@ HIGHEST_ENERGY = 1e6
 
 
 class Names:
-    """Places by name.
-
-    Args:
-        kind: what they are names of, for the errors.
-        names: each once.
-
-    Raises:
-        MeasurementError: an empty name, one with a line break, or the same name twice.
-    """
+    """Places by name; MeasurementError: an empty name, one with a line break, or the same name
+    twice."""
 
     def __init__(self, kind: str, names: Iterable[str]) -> None:
         self.kind = kind
@@ -94,7 +86,6 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
     Args:
         noise: a pair (x, y) for all monitors, an array [monitor, 2], a mapping of pairs by
             monitor, or None; m, NaN where unknown.
-        monitors: their names.
 
     Returns:
         [monitor, 2], m, NaN where unknown; None where nothing is.
@@ -135,11 +126,8 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
 
 # --- what records have in common ------------------------------------------------------------------
 def check_values(values: Array, one: str) -> None:
-    """All are of a beam in some unit, one at least is there.
-
-    Raises:
-        MeasurementError: "a reading is infinite", where `one` is "reading".
-    """
+    """All are of a beam in some unit, one at least is there; MeasurementError: "a reading is
+    infinite", where `one` is "reading"."""
     large = np.abs(values) > IN_ANY_UNIT
     if large.any():
         article = "an" if one[0] in "aeiou" else "a"
@@ -150,11 +138,8 @@ def check_values(values: Array, one: str) -> None:
 
 
 def check_size(readings: Array, monitors: Sequence[str]) -> None:
-    """Readings [..., monitor, 2] are such that a reader takes them.
-
-    Raises:
-        MeasurementError: one above 0.2 m.
-    """
+    """Readings [..., monitor, 2] are such that a reader takes them; MeasurementError: one above 0.2
+    m."""
     large = np.abs(readings) > LARGEST_READING  # false for NaN
     if large.any():
         *_, monitor, plane = np.argwhere(large)[0]
@@ -216,11 +201,7 @@ def checked_shots(
 
 
 def shot_places(shots: Sequence[int], wanted: Sequence[int]) -> list[int]:
-    """Where the wanted ids stand.
-
-    Raises:
-        MeasurementError: one that is not there.
-    """
+    """Where the wanted ids stand; MeasurementError: one that is not there."""
     index = {shot: i for i, shot in enumerate(shots)}
     missing = [shot for shot in wanted if shot not in index]
     if missing:
@@ -229,19 +210,13 @@ def shot_places(shots: Sequence[int], wanted: Sequence[int]) -> list[int]:
 
 
 def places_of(kind: str, known: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Where the wanted monitors, or correctors, stand among the known ones.
-
-    Raises:
-        UnknownNameError: one that is not there.
-    """
+    """Where the wanted monitors, or correctors, stand among the known ones."""
     names = Names(kind, known)
     return [names[name] for name in wanted]
 
 
-def spread(values: Values, places: Sequence[int], number: int) -> Values:
-    """[..., monitor, 2] among `number` monitors: NaN where there was none; None stays None."""
-    if values is None:
-        return values
+def spread(values: Array, places: Sequence[int], number: int) -> Array:
+    """[..., monitor, 2] among `number` monitors: NaN where there was none."""
     full = np.full((*values.shape[:-2], number, 2), np.nan)
     full[..., places, :] = values
     return full

@@ -1,6 +1,6 @@
 """The change of the stored beam's closed orbit for a step of one corrector at a time."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -15,9 +15,8 @@ from tmlattice.measurement.monitors import (
     check_values,
     noise_table,
     places_of,
-    spread,
 )
-from tmlattice.measurement.shown import Shown
+from tmlattice.measurement.shown import OfMonitors
 
 Array = NDArray[np.float64]
 
@@ -59,25 +58,19 @@ def check_rf(rf: RfStep) -> None:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OrbitResponse(Shown):
+class OrbitResponse(OfMonitors):
     """Measured orbit changes.
 
     The RF frequency is constant while a corrector is stepped, so a horizontal step also shifts
     the beam energy a little.
 
     Attributes:
-        correctors: names, one a column.
-        planes: "x" or "y", the plane in which each kicks.
+        correctors, planes: names, one a column, and "x" or "y", the plane in which each kicks.
         kicks: the steps, rad, [column].
-        monitors: names.
         response: the orbit change for that kick, m (not m/rad), [column, monitor, 2], NaN where
             missing.
-        noise: rms of a reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
-            (x, y), or a mapping of pairs by monitor, is taken too.
+        noise: rms of an orbit change, and the other attributes: see `Measurement`.
         rf: the RF's step, or None.
-        lattice, energy: what the data state about them (GeV); hints.
-        devices: names that the control system has for monitors and correctors, by the names here;
-            empty: unknown.
 
     Raises:
         MeasurementError: shapes that do not fit, or numbers that cannot be.
@@ -115,8 +108,6 @@ class OrbitResponse(Shown):
             monitors, correctors: names, or elements of a ring.
             kicks: rad, one for all or one a corrector.
             planes: "x" or "y" for all, or one a corrector; None: as the elements' kinds state.
-            unit: of x and y.
-            noise, rf: see the attributes.
 
         Raises:
             MeasurementError: shapes that do not fit, or planes that are unknown.
@@ -182,21 +173,12 @@ class OrbitResponse(Shown):
         check_values(np.concatenate(orbits), "orbit change")
         self._keep(noise=noise_table(self.noise, self.monitors))
 
-    def in_order_of(self, monitors: Sequence[str]) -> "OrbitResponse":
-        """The same with other monitors, such as a ring's: NaN where one was not read.
-
-        Raises:
-            UnknownNameError: this measurement has a monitor that is not among them.
-        """
-        places, number = places_of("monitor", monitors, self.monitors), len(monitors)
-        orbit = None if self.rf is None else spread(self.rf.orbit, places, number)
-        return replace(
-            self,
-            response=spread(self.response, places, number),
-            monitors=tuple(monitors),
-            noise=spread(self.noise, places, number),
-            rf=None if self.rf is None else replace(self.rf, orbit=orbit),
-        )
+    def read_with(self, change: Callable[[Array], Array]) -> dict[str, Any]:
+        """Return response and RF step with a change of all orbits, [..., monitor, 2]."""
+        rf = self.rf
+        if rf is not None and rf.orbit is not None:
+            rf = replace(rf, orbit=change(rf.orbit))
+        return {"response": change(self.response), "rf": rf}
 
     def select(
         self, correctors: Sequence[str] | None = None, monitors: Sequence[str] | None = None
@@ -216,16 +198,4 @@ class OrbitResponse(Shown):
                 kicks=self.kicks[column],
                 response=self.response[column],
             )
-        if monitors is not None:
-            place = places_of("monitor", self.monitors, monitors)
-            rf = part.rf
-            if rf is not None and rf.orbit is not None:
-                rf = replace(rf, orbit=rf.orbit[place])
-            part = replace(
-                part,
-                monitors=tuple(self.monitors[i] for i in place),
-                response=part.response[:, place],
-                noise=None if self.noise is None else self.noise[place],
-                rf=rf,
-            )
-        return part
+        return part if monitors is None else part.at_monitors(monitors)

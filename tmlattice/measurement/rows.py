@@ -32,7 +32,6 @@ class Rows:
     """The columns of a table, one entry a row.
 
     Attributes:
-        path: of the file.
         whole: columns of whole numbers by name, [row].
         names: columns of names: the names, each once, and their places, [row].
         xy: the other two columns: x, y in m, or a value and its error, [row, 2]; NaN where a
@@ -52,15 +51,8 @@ class Rows:
         return _error(self.path, row, text)
 
     def check(self, *keys: str, metres: bool = True) -> None:
-        """No row stands twice, no turn is negative, no reading is in millimetres.
-
-        Args:
-            keys: the columns by which a row is known.
-            metres: the numbers are readings.
-
-        Raises:
-            MeasurementError: with the line.
-        """
+        """No row stands twice, no turn is negative, no reading is in millimetres; MeasurementError:
+        with the line."""
         for name, column in self.whole.items():
             if name == "turn" and column.min() < 0:
                 row = int((column < 0).argmax())
@@ -92,7 +84,6 @@ def read_rows(path: Path, header: Sequence[str], optional: Sequence[str] | None 
 
     Args:
         path: a CSV file in UTF-8.
-        header: names of its columns, in their order.
         optional: where given, the columns may be in any order and case, those named here may be
             absent, and others are passed over.
 
@@ -176,11 +167,8 @@ def match_names(
 
 
 def dense(rows: Rows, shot: Integers, shots: int, monitor: Integers, monitors: int) -> Array:
-    """Readings [shot, turn, monitor, 2] of rows, NaN where there is none.
-
-    Raises:
-        MeasurementError: a turn so late that the array would be all but empty.
-    """
+    """Readings [shot, turn, monitor, 2] of rows, NaN where there is none; MeasurementError: a turn
+    so late that the array would be all but empty."""
     turn = rows.whole.get("turn", np.zeros(len(rows), dtype=np.int64))
     turns = int(turn.max()) + 1
     if shots * turns * monitors > max(_MOST_CELLS, 100 * len(rows)):

@@ -1,6 +1,6 @@
 """Shots as monitors read them; those of a stored beam are closed orbits and turns after a kick."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
@@ -16,16 +16,14 @@ from tmlattice.measurement.monitors import (
     check_values,
     checked_shots,
     noise_table,
-    places_of,
     shot_places,
-    spread,
 )
-from tmlattice.measurement.shown import Shown
+from tmlattice.measurement.shown import OfMonitors
 
 Array = NDArray[np.float64]
 
 
-class Shots(Shown):
+class Shots(OfMonitors):
     """A record with shots, settings, monitors and noise; see `ClosedOrbit`.
 
     Its field `READ` holds what was read, [*`AXES`, monitor, 2]; the first axis is the shot. Its
@@ -54,8 +52,6 @@ class Shots(Shown):
             x, y: turns [shot, turn, monitor], closed orbits [shot, monitor], or without their first
                 axes; NaN where missing; None: not read.
             monitors: names, or elements of a ring.
-            unit: of x and y.
-            noise, settings, shots: see the attributes.
 
         Raises:
             MeasurementError: shapes that do not fit, or numbers that cannot be.
@@ -88,20 +84,9 @@ class Shots(Shown):
             shots=shots,
         )
 
-    def in_order_of(self, monitors: Sequence[str]) -> Self:
-        """The same with other monitors, such as a ring's: NaN where one was not read.
-
-        Raises:
-            UnknownNameError: this measurement has a monitor that is not among them.
-        """
-        own: Any = self
-        places, number = places_of("monitor", monitors, own.monitors), len(monitors)
-        changed = {
-            self.READ: spread(getattr(own, self.READ), places, number),
-            "monitors": tuple(monitors),
-            "noise": spread(own.noise, places, number),
-        }
-        return replace(own, **changed)  # type: ignore[no-any-return]
+    def read_with(self, change: Callable[[Array], Array]) -> dict[str, Any]:
+        """Return the readings with a change, [..., monitor, 2]."""
+        return {self.READ: change(getattr(self, self.READ))}
 
     def select(
         self, shots: Sequence[int] | None = None, monitors: Sequence[str] | None = None
@@ -112,14 +97,12 @@ class Shots(Shown):
             UnknownNameError: a monitor that is not there.
             MeasurementError: a shot that is not there, or nothing is left.
         """
-        own: Any = self
-        at = shot_places(own.shots, own.shots if shots is None else shots)
-        here = places_of("monitor", own.monitors, own.monitors if monitors is None else monitors)
-        of_shots = {name: getattr(own, name) for name in self.OF_SHOTS}
+        own: Any = self if monitors is None else self.at_monitors(monitors)
+        if shots is None:
+            return own  # type: ignore[no-any-return]
+        at = shot_places(own.shots, shots)
+        of_shots = {name: getattr(own, name) for name in (self.READ, *self.OF_SHOTS)}
         changed = {
-            self.READ: getattr(own, self.READ)[at][..., here, :],
-            "monitors": tuple(own.monitors[i] for i in here),
-            "noise": None if own.noise is None else own.noise[here],
             "settings": tuple(own.settings[i] for i in at) if own.settings else (),
             "shots": tuple(own.shots[i] for i in at),
             **{name: None if values is None else values[at] for name, values in of_shots.items()},
@@ -133,12 +116,7 @@ class ClosedOrbit(Shots):
 
     Attributes:
         orbit: (x, y) in m, [shot, monitor, 2]; NaN where missing.
-        monitors: names, in the order of the readings.
-        noise: rms of one (averaged) reading, m, [monitor, 2], NaN where unknown; None: all unknown.
-            A pair (x, y), or a mapping of pairs by monitor, is taken too.
-        settings: of each shot, see `Measurement`; () for the design's in every shot.
-        shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data state about them (GeV); hints.
+        noise: rms of one (averaged) reading, and the other attributes: see `Measurement`.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or no reading at all.
@@ -166,14 +144,7 @@ class TurnByTurn(Shots):
 
     Attributes:
         readings: (x, y) in m, [shot, turn, monitor, 2]; NaN where missing, as behind a lost beam.
-        monitors: names, in the order of the readings.
-        noise: rms of one reading, m, [monitor, 2], NaN where unknown; None: all unknown. A pair
-            (x, y), or a mapping of pairs by monitor, is taken too.
-        settings: of each shot, see `Measurement`; () for the design's in every shot.
-        shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data state about them (GeV); hints.
-        devices: names that the control system has for monitors and correctors, by the names here;
-            empty: unknown.
+            The other attributes are those of `Measurement`.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, no reading at all, or

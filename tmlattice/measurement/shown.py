@@ -1,13 +1,17 @@
 """What every measurement shows of itself."""
 
-from collections.abc import Mapping
-from dataclasses import is_dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import is_dataclass, replace
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmlattice.late import ClassMethod, Method
+from tmlattice.measurement.monitors import places_of, spread
 from tmlattice.speaks import Speaks, counted, last_part
+
+Array = NDArray[np.float64]
 
 
 class Shown(Speaks):
@@ -81,6 +85,40 @@ class Shown(Speaks):
             rows["tunes"] = "; ".join(pairs)
         rows["lattice"] = last_part(own.get("lattice") or "")
         return "", rows
+
+
+class OfMonitors(Shown):
+    """A measurement by monitors; `read_with` is its own."""
+
+    def read_with(self, change: Callable[[Array], Array]) -> dict[str, Any]:
+        """Return fields with a change of everything that was read, [..., monitor, 2]."""
+        raise NotImplementedError
+
+    def in_order_of(self, monitors: Sequence[str]) -> Self:
+        """The same with other monitors, such as a ring's: NaN where one was not read.
+
+        Raises:
+            UnknownNameError: this measurement has a monitor that is not among them.
+        """
+        places = places_of("monitor", monitors, vars(self)["monitors"])
+        return self._of(monitors, lambda values: spread(values, places, len(monitors)))
+
+    def at_monitors(self, monitors: Sequence[str]) -> Self:
+        """A part of the monitors, in the order asked for.
+
+        Raises:
+            UnknownNameError: one that is not there.
+            MeasurementError: nothing is left.
+        """
+        known = vars(self)["monitors"]
+        here = places_of("monitor", known, monitors)
+        return self._of([known[i] for i in here], lambda values: values[..., here, :])
+
+    def _of(self, monitors: Sequence[str], change: Callable[[Array], Array]) -> Self:
+        own: Any = self
+        noise = None if own.noise is None else change(own.noise)
+        changed = {**self.read_with(change), "monitors": tuple(monitors), "noise": noise}
+        return replace(own, **changed)  # type: ignore[no-any-return]
 
 
 def same(one: Any, other: Any) -> bool:

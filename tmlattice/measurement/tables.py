@@ -36,13 +36,11 @@ def read_table(
     columns are passed over. An empty field is a missing reading. UTF-8, separated by commas.
 
     Args:
-        path: the file.
         launches: nominal (x, px, y, py[, delta]) of the shots in the order of their numbers,
             [shot, 4 or 5], m and rad; a table has none, and without them they are 0.
         noise: rms of a reading, see `Measurement`.
         launch_sigma: see `Measurement`.
         monitors: the ring's names, checked where given; the names are then the ring's.
-        unit: of x and y.
 
     Raises:
         MeasurementError: one sentence with the file, the line and the correction.
@@ -81,7 +79,6 @@ def read_turn_by_turn(
     """Read a turn-by-turn file through the package `turn_by_turn`; each bunch is a shot.
 
     Args:
-        path: the file.
         datatype: its kind, one of `KINDS` (SDDS, HDF5, TFS and text files of these machines and
             codes).
         launches: nominal (x, px, y, py[, delta]) of the bunches, [shot, 4 or 5]; else 0.

@@ -62,8 +62,7 @@ class Measurement(Shots):
             "k1_relative", "k2_relative", or "frequency_relative" under the name "rf"; () for
             the design's in every shot.
         shots: their ids; () for 0, 1, ...
-        lattice: what the data state about the lattice; a hint.
-        energy: what the data state about the beam energy, GeV; a hint.
+        lattice, energy: what the data state about them (GeV); hints.
         devices: names that the control system has for monitors and correctors, by the names here;
             empty: unknown.
 
@@ -104,8 +103,6 @@ class Measurement(Shots):
             x, y: [shot, turn, monitor], [turn, monitor] or [monitor]; NaN where missing; None: not
                 read.
             monitors: names, or elements of a ring.
-            unit: of x and y.
-            noise, settings, shots: see the attributes.
             launches: [shot, 4 or 5], m and rad; None: unknown.
             launch_sigma: their rms, see the attributes; None: unknown.
 
@@ -174,7 +171,6 @@ class Measurement(Shots):
         """A part of the measurement, shots and monitors in the order asked for; None: all.
 
         Args:
-            shots: ids.
             monitors: names.
             turns: from 0. A turn keeps its place, for turn 0 is the first: turns that are not
                 named are NaN, those behind the last named one are cut.
@@ -203,7 +199,6 @@ class Measurement(Shots):
             holdout: part of the shots to hold out, in [0, 1), rounded to whole shots: one at
                 least where it is not 0, and one at least stays in the fit. Only shots with
                 a reading are held out.
-            seed: of the draw.
 
         Returns:
             Fit, held out; the second is None where nothing is held out: a holdout of 0, or one

@@ -25,11 +25,8 @@ class TuneReading(Shown):
         tune: (x, y), [shot, 2], NaN where not measured; of one shot [2] is taken too.
         tune_error: its rms, [shot, 2], NaN where unknown; None: all unknown.
         chromaticity: (x, y), dQ / d delta, not divided by the tune, [shot, 2], NaN where not
-            measured; None: not measured.
-        chromaticity_error: its rms, as `tune_error`.
-        settings: of each shot, see `Measurement`; () for the design's in every shot.
-        shots: their ids; () for 0, 1, ...
-        lattice, energy: what the data state about them (GeV); hints.
+            measured; None: not measured. `chromaticity_error` is its rms.
+        settings, shots, lattice, energy: see `Measurement`.
 
     Raises:
         MeasurementError: shapes that do not fit, numbers that cannot be, or nothing measured.

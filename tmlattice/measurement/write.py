@@ -1,6 +1,5 @@
 """Writing the measurement folder, format version 1: see `measurement.folder`."""
 
-import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -13,19 +12,10 @@ from numpy.typing import NDArray
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
 from tmlattice.measurement.documents import Digest
-from tmlattice.measurement.folder import RESPONSE, RF, AnyMeasurement
+from tmlattice.measurement.folder import AnyMeasurement
 from tmlattice.measurement.header import finite, header
+from tmlattice.measurement.kinds import KINDS, TURNS, plain_settings, quoted, reading_lines
 from tmlattice.measurement.monitors import Names, Settings, check_settings, check_size, noise_table
-from tmlattice.measurement.orbit_response import OrbitResponse
-from tmlattice.measurement.stored_files import (
-    KINDS,
-    TURNS,
-    check_readable,
-    fields,
-    plain_settings,
-    quoted,
-    reading_lines,
-)
 from tmlattice.measurement.trajectory import COORDINATES, Measurement
 
 Array = NDArray[np.float64]
@@ -36,7 +26,6 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
 
     Args:
         folder: made where it is not there.
-        measurement: of any kind.
         force: a measurement that is there already is replaced.
 
     Raises:
@@ -44,19 +33,20 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
         MeasurementError: a reading that no reader would take (above 0.2 m), or a folder that
             holds a measurement.
     """
-    if isinstance(measurement, OrbitResponse):
-        check_free(folder, force)
-        _write_response(Path(folder), measurement)
-        return
     if not isinstance(measurement, Measurement):
         check_free(folder, force)
-        check_readable(measurement)
         (kind,) = (kind for kind in KINDS.values() if kind.record is type(measurement))
         with output_folder(Path(folder)) as temporary:
             table = temporary / kind.table
+            assert kind.write is not None
             with table.open("w", encoding="utf-8", newline="") as file:
                 document = kind.write(file, measurement)
-            _write_signed(temporary, document, table)
+            digest = Digest()
+            with table.open("rb") as written:
+                while part := written.read(1 << 20):
+                    digest.add(part)
+            signed = {**document, "table_sha256": digest.told()}
+            write_json(temporary / "measurement.json", signed)
         return
     m = measurement
     with measurement_writer(
@@ -73,11 +63,8 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
 
 
 def check_free(folder: str | Path, force: bool = False) -> None:
-    """Old data are kept: a folder is written to when it holds no measurement, or by force.
-
-    Raises:
-        MeasurementError: it holds one.
-    """
+    """Old data are kept: a folder is written to when it holds no measurement, or by force;
+    MeasurementError: it holds one."""
     if force:
         return
     for name in ("measurement.json", "readings.csv", "response.csv", "tunes.csv"):
@@ -86,61 +73,6 @@ def check_free(folder: str | Path, force: bool = False) -> None:
                 f"'{folder}' holds a measurement already ({name}); name another folder, or replace "
                 "it with --force (in Python: force=True)"
             )
-
-
-def _write_response(folder: Path, response: OrbitResponse) -> None:
-    orbits = [(name, response.response[i]) for i, name in enumerate(response.correctors)]
-    document = header("orbit_response", response)
-    document["columns"] = [
-        {"corrector": name, "plane": plane, "kick": float(kick)}
-        for name, plane, kick in zip(
-            response.correctors, response.planes, response.kicks, strict=True
-        )
-    ]
-    if response.rf is not None:
-        document["rf"] = {
-            "frequency_hz": float(response.rf.frequency),
-            "harmonic": int(response.rf.harmonic),
-            "step_hz": float(response.rf.step),
-        }
-        if response.rf.orbit is not None:
-            document["dispersion"] = True
-            orbits.append((RF, response.rf.orbit))
-    with output_folder(folder) as temporary:
-        table = temporary / "response.csv"
-        write_response_table(table, response.monitors, orbits)
-        _write_signed(temporary, document, table)
-
-
-def _write_signed(folder: Path, document: dict[str, Any], table: Path) -> None:
-    """measurement.json next to its table, with the digest that links them."""
-    digest = Digest()
-    with table.open("rb") as file:
-        while part := file.read(1 << 20):
-            digest.add(part)
-    write_json(folder / "measurement.json", {**document, "table_sha256": digest.told()})
-
-
-def write_response_table(
-    path: Path, monitors: Sequence[str], orbits: Sequence[tuple[str, Array]]
-) -> None:
-    """Write orbit changes as the table of an orbit response's folder.
-
-    Args:
-        path: the file.
-        monitors: names.
-        orbits: a corrector's name, or "rf", and its orbit change, m, [monitor, 2].
-
-    Raises:
-        MeasurementError: an orbit change that no reader would take (above 0.2 m).
-    """
-    with path.open("w", encoding="utf-8", newline="") as file:
-        write = csv.writer(file, lineterminator="\n").writerow
-        write(RESPONSE)
-        for name, orbit in orbits:
-            check_size(orbit, monitors)
-            for monitor, xy in zip(monitors, orbit.tolist(), strict=True):
-                write((name, monitor, *fields(xy)))
 
 
 class MeasurementWriter:
@@ -187,9 +119,8 @@ class MeasurementWriter:
         """Write one shot; nothing of it is kept but its id.
 
         Args:
-            shot: its id.
-            launch: nominal x, px, y, py, delta, [5] (or [4], delta 0).
-            launch_sigma: their rms, [5] (or [4], delta exact); None: unknown.
+            launch, launch_sigma: nominal x, px, y, py, delta, [5] (or [4]), and their rms; None:
+                unknown.
             settings: see `Measurement`; None or {} for the design's.
             readings: m, [turn, monitor, 2], NaN where missing.
 
@@ -261,13 +192,8 @@ def measurement_writer(
     The folder appears, whole, when the block ends; after an exception or Ctrl-C nothing is left.
 
     Args:
-        folder: made where it is not there.
-        monitors: names, in the order of the readings.
-        noise: rms of a reading, m: a pair (x, y), [monitor, 2], a mapping by monitor, or None.
-        lattice: name or path, a hint for the reader.
-        energy: GeV.
+        monitors, noise, lattice, energy, devices: see `Measurement`.
         force: a measurement that is there already is replaced.
-        devices: names of the control system, see `Measurement`.
 
     Raises:
         OutputError: it cannot be written.

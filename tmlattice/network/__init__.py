@@ -10,8 +10,12 @@ from tmlattice.errors import missing_package
 
 try:
     from tmlattice.network.free_layers import FreeLayers
-    from tmlattice.network.network import TaylorNetwork, plain_readings
-    from tmlattice.network.stored import load_network, save_network
+    from tmlattice.network.network import (
+        TaylorNetwork,
+        load_network,
+        plain_readings,
+        save_network,
+    )
     from tmlattice.network.symplectic import penalty_parts, symplectic_penalty
     from tmlattice.network.symplectic_network import SymplecticNetwork
 except ModuleNotFoundError as error:  # torch, which a diagnosis does not need

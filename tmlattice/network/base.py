@@ -26,11 +26,8 @@ class NetworkChain(torch.nn.Module, LayerChain):
         )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Apply `.to`, `.float`, `.cuda`, ... to every tensor.
-
-        Raises:
-            TypeError: another type than float64, or a device without sweeps.
-        """
+        """Apply `.to`, `.float`, `.cuda`, ... to every tensor; TypeError: another type than
+        float64, or a device without sweeps."""
         after = fn(torch.empty(0, dtype=torch.float64, device=self.W0.device))
         if after.dtype != torch.float64:
             raise TypeError(
@@ -60,11 +57,6 @@ class NetworkChain(torch.nn.Module, LayerChain):
         return np.asarray(self._launch(launch).detach().cpu().numpy())
 
     def readings(self, launch: ArrayLike | Tensor) -> Array:
-        """Return (x, y) at every monitor on one pass as an array, [batch, monitor, 2], m.
-
-        Raises:
-            BeamLostError: names the layer where a trajectory was lost.
-            ValueError: a launch of another shape.
-        """
+        """Return (x, y) at every monitor on one pass as an array, [batch, monitor, 2], m."""
         with torch.no_grad():
             return np.asarray(self(launch).cpu().numpy())

@@ -55,13 +55,8 @@ def _multiprocessors(tensor: Tensor) -> int:
 
 
 def track(launch: Tensor, w: Tensor, turns: int) -> Tensor:
-    """Return states [batch, turns + 1, n] at the start of every turn, from launch [batch, n].
-
-    Args:
-        launch: on the card.
-        w: all layers of the turn, as `reference.packed`.
-        turns: at least 1.
-    """
+    """Return states [batch, turns + 1, n] at the start of every turn, from launch [batch, n]
+    (turns: at least 1)."""
     n = launch.shape[1]
     history = launch.new_empty(turns + 1, n, len(launch))
     history[0] = launch.T

@@ -61,11 +61,8 @@ def _by_degree(n: int) -> list[tuple[slice, Array]]:
 
 
 def field(generator: Array) -> tuple[Array, Array, Array]:
-    """Return c [layer, n], A [layer, n, n], Q [layer, n, n (n + 1) / 2] of S grad H by layer.
-
-    Args:
-        generator: [layer, coefficient].
-    """
+    """Return c [layer, n], A [layer, n, n], Q [layer, n, n (n + 1) / 2] of S grad H by layer
+    (generator: [layer, coefficient])."""
     n = dimension_of(generator.shape[-1])
     c, A, Q = (
         (generator[:, own] @ matrix).reshape(len(generator), n, -1) for own, matrix in _by_degree(n)
@@ -82,11 +79,8 @@ def pull_field(c: Array, A: Array, Q: Array) -> Array:
 
 
 def dimension_of(coefficients: int) -> int:
-    """Return the number of coordinates of a generator with this many coefficients.
-
-    Raises:
-        ValueError: no generator of degree three has this number.
-    """
+    """Return the number of coordinates of a generator with this many coefficients; ValueError: no
+    generator of degree three has this number."""
     for n in (4, 6):
         if len(exponents(n)) == coefficients:
             return n
@@ -94,11 +88,8 @@ def dimension_of(coefficients: int) -> int:
 
 
 def nearest_symplectic(W1: Array) -> Array:
-    """Return symplectic matrices near W1 [layer, n, n], by Newton's iteration for the polar part.
-
-    Raises:
-        ValueError: a matrix too far from symplectic (names the layer).
-    """
+    """Return symplectic matrices near W1 [layer, n, n], by Newton's iteration for the polar part;
+    ValueError: a matrix too far from symplectic (names the layer)."""
     S = symplectic_form(W1.shape[-1])
     W = W1
     for _ in range(30):

@@ -1,7 +1,9 @@
-"""The network: weights stacked over layers, readings of a launch, tracking over many turns."""
+"""The network: weights stacked over layers, readings of a launch, tracking; its file."""
 
 from enum import StrEnum
 from importlib import import_module
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,11 @@ from torch import Tensor
 
 from tmlattice.beam import sweeps
 from tmlattice.beam.aperture import APERTURE, bounded, lost_beam
-from tmlattice.beam.chain import Chain
+from tmlattice.beam.chain import Chain, first_pass
 from tmlattice.beam.sweeps import curved
-from tmlattice.errors import missing_package, unknown_choice
+from tmlattice.errors import TmlatticeError, choice, missing_package
+from tmlattice.input_files import zip_of
+from tmlattice.lattice.ring import Ring
 from tmlattice.maps import RingMaps
 from tmlattice.network.autograd import BackEnd, Sweep, Tensors
 from tmlattice.network.base import NetworkChain
@@ -38,23 +42,11 @@ class CompiledSweep:
 
     def forward(self, launch: Tensor, weights: Tensors) -> tuple[Tensor, Tensor, Tensor]:
         """One pass through all layers."""
-        batch, n = launch.shape
-        W0, W1, W2 = (w.detach().numpy() for w in weights)
-        size = sweeps.size_of(n, batch)
-        packed = sweeps.pack(launch.detach().numpy(), len(size[1]))
-        states = np.empty((len(packed), len(W0) + 1, *packed.shape[1:]))
-        states[:, 0] = packed
-        sweeps.run(sweeps.forward, len(packed), size, W0, W1, W2, curved(W2), states)
-        maps = self.maps
-        readings = np.empty((len(packed), len(maps.at), 2, len(size[1])))
-        out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
-        sweeps.run(sweeps.read, len(packed), size, *out, states, readings)
-        end = sweeps.unpack(states[:, -1], batch)
-        return (
-            torch.from_numpy(sweeps.unpack(readings, batch)),
-            torch.from_numpy(end),
-            torch.from_numpy(states),
-        )
+        own = [w.detach().numpy() for w in weights]
+        states, readings = first_pass(own, self.maps, launch.detach().numpy())
+        both = (sweeps.unpack(values, len(launch)) for values in (readings, states[:, -1]))
+        read, end = map(torch.from_numpy, both)
+        return read, end, torch.from_numpy(states)
 
     def backward(
         self, launch: Tensor, weights: Tensors, kept: Tensor, pulls: Tensors, wanted: bool
@@ -87,9 +79,6 @@ class TaylorNetwork(NetworkChain, Chain):
 
     `network.to("cuda")` moves it, and all its computations, to a graphics card.
 
-    Args:
-        maps: weights and read-outs of a ring.
-
     Attributes:
         W0: [layer, n], parameter.
         W1: [layer, n, n], parameter.
@@ -120,10 +109,7 @@ class TaylorNetwork(NetworkChain, Chain):
             self.register_buffer(name, fixed, persistent=False)
 
     def symplectic(self) -> SymplecticNetwork:
-        """Return the same ring in layers that are symplectic for any parameters.
-
-        See `SymplecticNetwork`.
-        """
+        """Return the same ring in layers that are symplectic for any parameters."""
         return SymplecticNetwork.from_network(self)
 
     def weights(self) -> tuple[Array, Array, Array]:
@@ -172,8 +158,7 @@ class TaylorNetwork(NetworkChain, Chain):
             ChoiceError: another value of `on_lost`.
             ValueError: a launch of another shape, or no turn.
         """
-        if on_lost not in (known := [choice.value for choice in OnLost]):
-            raise unknown_choice("on_lost", on_lost, known)
+        on_lost = choice("on_lost", on_lost, OnLost)
         if turns is not None and turns < 1:
             raise ValueError(f"{turns} turns have no reading; read at least one")
         x = self._launch(launch)
@@ -184,7 +169,7 @@ class TaylorNetwork(NetworkChain, Chain):
             readings, end = self._pass(x)
             alive = self._inside(end.detach())
             if not alive.all():
-                if on_lost == OnLost.RAISE:
+                if on_lost is OnLost.RAISE:
                     first = int(alive.to(torch.int8).argmin())
                     raise lost_beam(self.states(x[[first]])[0], first, self.maps, turn)
                 x, rows = x[alive], rows[alive]
@@ -246,3 +231,31 @@ def plain_readings(network: TaylorNetwork, launch: Tensor) -> Tensor:
     sweep = network.sweep()
     weights = network.W0, network.W1, network.W2
     return plain_pass(launch, weights, sweep.r, sweep.start)[0]
+
+
+def save_network(network: torch.nn.Module, path: Path) -> None:
+    """Write the parameters (W0, W1, W2) with torch, without the lattice."""
+    content = BytesIO()
+    torch.save(network.state_dict(), content)  # to memory: torch's error for a full disk is unclear
+    path.write_bytes(content.getvalue())
+
+
+def load_network(ring: Ring, path: Path) -> TaylorNetwork:
+    """Return the network of a ring with the weights of a file (tensors alone: no code is run).
+
+    Raises:
+        TmlatticeError: no such file, no network's, or one of a ring of other magnets.
+    """
+    wanted = (
+        f"the weights of a network of '{ring.name}'; name the network.pt that `tmlattice tune-fit` "
+        "wrote for this lattice"
+    )
+    content = zip_of(path, TmlatticeError, wanted)
+    try:
+        weights = torch.load(content, map_location="cpu", weights_only=True)
+        dimension = int(weights["W0"].shape[1])
+        network = TaylorNetwork.from_ring(ring, dimension)
+        network.load_state_dict(weights)
+    except Exception as error:
+        raise TmlatticeError(f"'{path}' does not contain {wanted}") from error
+    return network

@@ -235,9 +235,6 @@ def symplectic_coefficients(W1: Tensor, W2: Tensor) -> Array:
     Returns:
         [layer, (n + 1) (n + 2) / 2, n (n - 1) / 2]: by the monomial (1; x1, ..., xn; x1^2, x1 x2,
         ..., xn^2), then by the entry (b, c), b < c, row by row.
-
-    Raises:
-        ValueError: n is not 2, 4 or 6.
     """
     n = W1.shape[1]
     out = np.empty((len(W1), *_no_design(n).shape[1:]))

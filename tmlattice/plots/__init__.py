@@ -2,12 +2,12 @@
 
 from tmlattice.plots.optics import plot_betas, plot_phase_space
 from tmlattice.plots.strip import lattice_strip
-from tmlattice.plots.study import plot_study
 from tmlattice.plots.tune_fit import (
     plot_loss,
     plot_orbit,
     plot_orbit_fit,
     plot_spectrum,
+    plot_study,
     plot_tune_fit_spectrum,
 )
 from tmlattice.plots.weights import plot_weights

@@ -12,12 +12,8 @@ LAST = ("ambiguous", "unknown", "none")
 
 
 def plot_confusion(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:
-    """Draw the confusion matrix: the share of each first effect of the diagnosis, by true effect.
-
-    Args:
-        result: of `score`, tier A or B.
-        ax: where to draw; else a new one.
-    """
+    """Draw the confusion matrix: the share of each first effect of the diagnosis, by true
+    effect."""
     table = result["confusion"]
     rows = list(table)
     wrong = {name for entry in table.values() for name in entry} - set(LAST)

@@ -13,12 +13,17 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.scan import free_threshold
-from tmlattice.plots.names import brief
-from tmlattice.plots.parts import plot_parts
-from tmlattice.plots.plan import plot_plan
-from tmlattice.plots.readings import AFTER, BEFORE, mark, plot_readings, readings_caption
+from tmlattice.plots.plan import brief, plot_plan
+from tmlattice.plots.readings import (
+    AFTER,
+    BEFORE,
+    mark,
+    plot_parts,
+    plot_readings,
+    readings_caption,
+)
 from tmlattice.plots.response import response_figures
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import above_strip, lattice_strip
 from tmlattice.speaks import micrometres
 
 Array = NDArray[np.float64]
@@ -117,17 +122,12 @@ ROOM = 60.0
 """m, on both sides of a finding that is drawn near by."""
 
 
-def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
-    """Draw the statistic of every hypothesis along the ring, before any finding.
-
-    Args:
-        diagnosis: of `diagnose`.
-        figure: an empty one; else a new one.
-    """
-    figure = plt.figure(figsize=(11, 6), layout="constrained") if figure is None else figure
-    grid = figure.subplots(
-        2, 2, sharey="row", sharex="col", height_ratios=[6, 0.8], width_ratios=[8, 1]
-    )
+def plot_scan(diagnosis: Diagnosis) -> Figure:
+    """Draw the statistic of every hypothesis along the ring, before any finding."""
+    figure, grid = plt.subplots(
+        2, 2, figsize=(11, 6), layout="constrained", sharey="row", sharex="col",
+        height_ratios=[6, 0.8], width_ratios=[8, 1],
+    )  # fmt: skip
     ax, side, strip = grid[0, 0], grid[0, 1], grid[1, 0]
     grid[1, 1].axis("off")
     found = diagnosis.explanation.first
@@ -147,16 +147,9 @@ def plot_scan(diagnosis: Diagnosis, figure: Figure | None = None) -> Figure:
 
 
 def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None = None) -> Figure:
-    """Draw the statistic around one finding, with the BPMs, on a linear scale.
-
-    Args:
-        diagnosis: of `diagnose`.
-        finding: one of its findings, with a place.
-        figure: an empty one; else a new one.
-    """
+    """Draw the statistic around one finding that has a place, with the BPMs, on a linear scale."""
     assert finding.where is not None
-    figure = plt.figure(figsize=(11, 5), layout="constrained") if figure is None else figure
-    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[6, 0.8])
+    figure, (ax,) = above_strip(diagnosis.ring, (11, 5), [6], figure)
     low, high = around(diagnosis, finding)
     _draw_scan(ax, diagnosis, 7.0)
     seen = [line.get_ydata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
@@ -182,8 +175,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
         loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
         markerscale=1.3,
     )  # fmt: skip
-    lattice_strip(diagnosis.ring, strip)
-    mark(strip, diagnosis)
+    mark(figure.axes[-1], diagnosis)
     ax.set_xlim(low, high)
     return figure
 
@@ -298,15 +290,8 @@ LABEL = 34
 
 
 def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
-    """Draw the rms residual of held-out readings against the number of findings.
-
-    Args:
-        diagnosis: with held-out shots.
-        ax: where to draw; else a new one.
-
-    Raises:
-        ValueError: no shot was held out.
-    """
+    """Draw the rms residual of held-out readings against the number of findings; a ValueError if
+    no shot was held out."""
     if diagnosis.heldout is None:
         raise ValueError("no shot was held out")
     ax = gap_axes(diagnosis) if ax is None else ax
@@ -378,12 +363,7 @@ MOST = 15
 
 
 def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
-    """Draw the probabilities of the explanations of one finding.
-
-    Args:
-        finding: with a credible set.
-        ax: where to draw; else a new one.
-    """
+    """Draw the probabilities of the explanations of one finding."""
     if ax is None:
         _, ax = plt.subplots()
     members = finding.credible_set[:MOST]

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from tmlattice.lattice import Ring
 from tmlattice.optics import OffMomentum, Optics, Twiss
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import above_strip
 
 
 def plot_betas(
@@ -16,19 +16,14 @@ def plot_betas(
     twiss: Twiss,
     dispersion: OffMomentum | None = None,
     span: tuple[float, float] | None = None,
-    figure: Figure | None = None,
 ) -> Figure:
     """Betas, and the dispersion where it is given, with the lattice below.
 
     Args:
         ring: whose magnets are drawn.
-        twiss: of `twiss`.
-        dispersion: of `off_momentum`.
         span: from and to which s, m; else the whole ring.
-        figure: an empty one; else a new one.
     """
-    figure = plt.figure(figsize=(11, 4.2), layout="constrained") if figure is None else figure
-    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
+    figure, (ax,) = above_strip(ring, (11, 4.2), [5])
     s, beta = twiss.along()
     for plane, colour in enumerate(("C0", "C3")):
         name = "xy"[plane]
@@ -46,9 +41,8 @@ def plot_betas(
         side.set_ylabel("dispersion [m]")
         lines = [*lines, *side.get_lines()]
     ax.legend(handles=lines, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False)
-    lattice_strip(ring, strip)
     if span is not None:
-        strip.set_xlim(*span)
+        ax.set_xlim(*span)
     return figure
 
 

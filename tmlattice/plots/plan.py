@@ -1,6 +1,6 @@
 """The ring from above, with the findings."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.lattice.survey import Survey, survey
-from tmlattice.plots.names import brief, plural
 from tmlattice.plots.strip import COLOURS
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Small:
+class Small(NamedTuple):
     """Small symbols next to the orbit, and their offset as a share of the ring's size, outside
     positive."""
 
@@ -34,6 +32,21 @@ LETTER, LINE, BESIDE = 0.022, 0.06, 0.06
 size."""
 
 CULPRIT, SUSPECT = "#d1105a", "#c58a00"
+
+
+LONGEST = 22
+"""Letters of a name that fit."""
+
+
+def brief(name: str) -> str:
+    """A name; of a long one the end, which is where names differ."""
+    return name if len(name) <= LONGEST else f"…{name[-LONGEST:]}"
+
+
+def plural(kind: str) -> str:
+    """Of a kind of elements."""
+    kind = "BPM" if kind == "monitor" else kind
+    return f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
 
 
 def groups(diagnosis: Diagnosis) -> dict[str, list[int]]:
@@ -112,12 +125,7 @@ def label(number: int, finding: Finding) -> str:
 
 def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw the ring from above: magnets along the orbit, BPMs and correctors small, findings
-    marked.
-
-    Args:
-        diagnosis: of `diagnose`.
-        ax: where to draw; else a new one.
-    """
+    marked."""
     if ax is None:
         _, ax = plt.subplots(figsize=(6.5, 6.5), layout="constrained")
     plan = survey(diagnosis.ring)

@@ -1,15 +1,16 @@
-"""The readings of one shot along the ring, and what the models leave of them."""
+"""Readings along the ring, and what models and corrections leave of them."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from tmlattice.correction.result import Correction
+from tmlattice.correction.targets import TARGETS
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import RingEffect, find
 from tmlattice.inference.newton import fit
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import above_strip, plain_log
 
 Array = NDArray[np.float64]
 
@@ -65,18 +66,17 @@ def design_readings(diagnosis: Diagnosis) -> Array:
     return view.before if alone.point.lost else np.asarray(alone.point.view.readings)
 
 
-def plot_readings(
-    diagnosis: Diagnosis, figure: Figure | None = None, shot: int | None = None
-) -> Figure:
-    """Draw first-turn readings of a shot of the fit, and the residuals of the design and the
-    estimated ring.
+def worst_shot(diagnosis: Diagnosis, model: Array) -> int:
+    """The shot of the fit with the largest residual of a model, [shot, reading, 2], m."""
+    data = diagnosis.trajectories.data
+    left = np.where(data.valid, data.readings - model, 0.0) ** 2 * data.active[:, None, None]
+    return int(np.nan_to_num(left).sum(axis=(1, 2)).argmax())
 
-    Args:
-        diagnosis: of `diagnose`.
-        figure: an empty one; else a new one.
-        shot: its place among those of the fit; else the one with the largest residual.
-    """
-    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
+
+def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
+    """Draw first-turn readings of a shot of the fit (else of the one with the largest residual),
+    and the residuals of the design and the estimated ring."""
+    figure, grid = above_strip(diagnosis.ring, (11, 8.2), [3, 2, 3, 2])
     view = diagnosis.trajectories
     data = view.data
     explained = diagnosis.verdict != "distributed"
@@ -85,13 +85,10 @@ def plot_readings(
         models.append(view.after)
     monitors = diagnosis.ring.monitors
     readings = np.where(data.valid, data.readings, np.nan)
-    if shot is None:
-        left = np.nan_to_num(readings - models[0]) ** 2 * data.active[:, None, None]
-        shot = int(left.sum(axis=(1, 2)).argmax())
+    shot = worst_shot(diagnosis, models[0]) if shot is None else shot
     first = slice(0, len(monitors))
     s = np.array([monitor.s for monitor in monitors])
     read, dropped = readings[shot, first], view.dropped[shot, first]
-    grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
     names = (diagnosis.starting_model, "with the findings")
     styles = ((BEFORE, "-"), (AFTER, "-"))
     for plane, name in enumerate("xy"):
@@ -128,8 +125,7 @@ def plot_readings(
     if before is not None:
         title += f"; the {names[0]}'s launch from the {int(before.sum())} BPMs before"
     grid[0].set_title(title, loc="left", fontsize="medium")
-    lattice_strip(diagnosis.ring, grid[4])
-    mark(grid[4], diagnosis)
+    mark(figure.axes[-1], diagnosis)
     return figure
 
 
@@ -152,3 +148,51 @@ def mark(ax: Axes, diagnosis: Diagnosis) -> None:
             ax.axvspan(*finding.where, color="gold", alpha=0.4, linewidth=0, zorder=0)
         elif finding.s is not None:
             ax.axvline(finding.s, color="0.45", linestyle=":", linewidth=1.1, zorder=0.5)
+
+
+def plot_parts(diagnosis: Diagnosis) -> Figure:
+    """Draw the rms residual at each BPM in units of the noise, a panel a measurement."""
+    shown = [part for part in diagnosis.parts if np.isfinite(part.left).any()]
+    count = len(shown)
+    figure, axes = above_strip(diagnosis.ring, (11, 1.6 + 1.8 * count), [3.0] * count)
+    places = {monitor.name: monitor.s for monitor in diagnosis.ring.monitors}
+    for ax, part in zip(axes, shown, strict=True):
+        s = np.array([places[diagnosis.ring[name].name] for name in part.monitors])
+        order = np.argsort(s)
+        before, after = np.maximum(part.left[:, order], 1e-2)
+        ax.plot(s[order], before, ".-", color=BEFORE, lw=0.8, ms=4, label=diagnosis.starting_model)
+        ax.plot(s[order], after, ".-", color=AFTER, lw=0.8, ms=4, label="with the findings")
+        ax.axhline(1.0, color="k", linestyle="--", linewidth=1)
+        plain_log(ax)
+        ax.set_ylabel("residual / noise")
+        ax.set_title(part.label, loc="left", fontsize="medium")
+        ax.grid(alpha=0.25)
+        mark(ax, diagnosis)
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    return figure
+
+
+CAPTION = "At the BPMs now, and expected after the correction, with 68 % intervals."
+
+
+def plot_correction(correction: Correction) -> Figure:
+    """The errors of the shown target at the BPMs now and expected, a panel a plane, the lattice
+    below."""
+    figure, axes = above_strip(correction.ring, (11, 5.2), [3, 3])
+    target = TARGETS[correction.shown]
+    scale, unit = (100.0, "%") if target.unit == "relative" else (1e3, "mm")
+    shown = [(correction.profile[0], BEFORE, "now")]
+    if not correction.refused:
+        shown.append((correction.profile[1], AFTER, "expected"))
+    for plane, ax in enumerate(axes):
+        for values, colour, label in shown:
+            middle, low, high = scale * np.array(values)[:, plane].T
+            ax.errorbar(
+                correction.s, middle, (middle - low, high - middle), color=colour, label=label,
+                fmt="o" if label == "now" else "s", ms=4, elinewidth=1, alpha=0.8,
+            )  # fmt: skip
+        ax.axhline(0.0, color="k", lw=0.7)
+        ax.set_ylabel(f"{target.words} {'xy'[plane]} [{unit}]", fontsize="small")
+        ax.grid(alpha=0.25)
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    return figure

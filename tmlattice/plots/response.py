@@ -8,8 +8,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.lattice import Element
 from tmlattice.optics import twiss
-from tmlattice.plots.strip import lattice_strip, plain_log
+from tmlattice.plots.strip import above_strip, plain_log
+
+RESIDUALS = (
+    ("heldout_rms_in_plane", "in-plane", "C0"),
+    ("heldout_rms_position", "in-plane, with position jump", "tab:cyan"),
+    ("heldout_rms_coupling", "coupling", "C3"),
+    ("dispersion_rms", "RF response", "C2"),
+)
+"""Held-out residuals of a step: attribute, label, colour."""
+
+
+def gradient_errors(result: Diagnosis) -> list[tuple[Element, float, float]]:
+    """Quadrupoles, their relative gradient errors and standard errors, %."""
+    return [
+        (result.ring[c.element or ""], 100 * c.amount, 100 * sigma)
+        for c, sigma in zip(result.causes, result.errors, strict=True)
+        if c.effect == "quadrupole_gradient"
+    ]
 
 
 def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
@@ -102,13 +120,8 @@ def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
         ax = plt.subplots(figsize=(9, 4))[1]
     steps = result.steps
     at = np.arange(len(steps))
-    for name, label, style in (
-        ("heldout_rms_in_plane", "in-plane", "o-C0"),
-        ("heldout_rms_position", "in-plane, with position jump", "o--C0"),
-        ("heldout_rms_coupling", "coupling", "s-C3"),
-        ("dispersion_rms", "RF response", "^-C2"),
-    ):
-        ax.plot(at, [1e6 * getattr(step, name) for step in steps], style, label=label)
+    for name, label, colour in RESIDUALS:
+        ax.plot(at, [1e6 * getattr(s, name) for s in steps], "o-", color=colour, label=label)
     sigma = 1e6 * result.gap["noise"]
     ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
     plain_log(ax)
@@ -122,29 +135,20 @@ def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
 
 def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
     """Relative gradient errors with their errors, above the lattice."""
-    figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
-    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
-    rows = [
-        (result.ring[c.element or ""].s, c.amount, sigma)
-        for c, sigma in zip(result.causes, result.errors, strict=True)
-        if c.effect == "quadrupole_gradient"
-    ]
-    s, amount, sigma = np.array(rows).T
+    figure, (ax,) = above_strip(result.ring, (11, 4), [5], figure)
+    s, amount, sigma = np.array([(e.s, a, sigma) for e, a, sigma in gradient_errors(result)]).T
     ax.errorbar(
-        s, 100 * amount, 100 * sigma, fmt=".", color="tab:red", ecolor="0.6", markersize=3,
-        elinewidth=0.8,
-    )  # fmt: skip
+        s, amount, sigma, fmt=".", color="tab:red", ecolor="0.6", markersize=3, elinewidth=0.8
+    )
     ax.axhline(0, color="0.4", linewidth=0.5)
     ax.set_ylabel("gradient error [%]")
     ax.grid(alpha=0.25)
-    lattice_strip(result.ring, strip)
     return figure
 
 
-def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
+def plot_beta_beat(result: Diagnosis) -> Figure:
     """Beta of the result relative to the design, above the lattice."""
-    figure = plt.figure(figsize=(11, 4), layout="constrained") if figure is None else figure
-    ax, strip = figure.subplots(2, 1, sharex=True, height_ratios=[5, 0.8])
+    figure, (ax,) = above_strip(result.ring, (11, 4), [5])
     (s, before), (_, after) = (twiss(r).along() for r in (result.ring, result.corrected))
     for plane, colour in enumerate(("C0", "C3")):
         beat = 100 * (after[:, plane] / before[:, plane] - 1)
@@ -152,5 +156,4 @@ def plot_beta_beat(result: Diagnosis, figure: Figure | None = None) -> Figure:
     ax.set_ylabel(f"beta / {result.starting_model} - 1 [%]")
     ax.grid(alpha=0.25)
     ax.legend(frameon=False)
-    lattice_strip(result.ring, strip)
     return figure

@@ -32,15 +32,8 @@ MOST = 8
 
 
 def plot_ring(ring: Ring, span: tuple[float, float] | None = None) -> Figure:
-    """Draw betas along the ring, with its lattice below.
-
-    Args:
-        ring: with a closed orbit and tunes.
-        span: from and to which s, m; else the whole ring.
-
-    Raises:
-        UnstableRingError: it has no betas.
-    """
+    """Draw betas along the ring, with its lattice below (span: from and to which s, m; else the
+    whole ring)."""
     figure = plot_betas(ring, twiss(ring), span=span)
     figure.axes[0].set_title(ring.name, loc="right", fontsize="medium")
     return figure
@@ -50,7 +43,6 @@ def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
     """Draw one of the figures of the report.
 
     Args:
-        diagnosis: of `diagnose`.
         name: of the figure, such as "scan", "readings" or "gap"; else the scan along the ring, or
             the maps of an orbit response.
 
@@ -74,13 +66,8 @@ def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
 
 
 def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = None) -> Figure:
-    """Draw the readings, x above y.
-
-    Args:
-        measured: of any kind.
-        ring: along which, with its lattice below (all that `load_ring` takes); else by the number
-            of the monitor.
-    """
+    """Draw the readings, x above y (ring: along which, with its lattice below (all that `load_ring`
+    takes); else by the number of the monitor)."""
     known = None if ring is None else load_ring(ring)
     if isinstance(measured, TuneReading):
         return _tunes(measured, known)

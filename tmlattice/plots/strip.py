@@ -1,9 +1,11 @@
 """The lattice strip under anything that is plotted against s."""
 
-from typing import Any
+from collections.abc import Sequence
 
+import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -22,14 +24,20 @@ METHOD_COLOURS = {"adam": "C3", "sparse": "C2", "map": "C1"}
 """Colours of the methods of a fit, in every figure."""
 
 
-def lattice_strip(ring: Ring, ax: Axes) -> Axes:
-    """Draw the magnets of a ring along s: bends blue, quadrupoles red (up focuses in x),
-    sextupoles green, wigglers purple.
+def above_strip(
+    ring: Ring, size: tuple[float, float], heights: Sequence[float], figure: Figure | None = None
+) -> tuple[Figure, list[Axes]]:
+    """Panels of these heights with the lattice below, in an empty figure or in a new one of this
+    size: the figure, and the panels."""
+    figure = plt.figure(figsize=size, layout="constrained") if figure is None else figure
+    *axes, strip = figure.subplots(len(heights) + 1, 1, sharex=True, height_ratios=[*heights, 0.8])
+    lattice_strip(ring, strip)
+    return figure, axes
 
-    Args:
-        ring: what to draw.
-        ax: a low, wide axes; it shares s with the figure above it.
-    """
+
+def lattice_strip(ring: Ring, ax: Axes) -> Axes:
+    """Draw the magnets of a ring along s into a low, wide axes: bends blue, quadrupoles red (up
+    focuses in x), sextupoles green, wigglers purple."""
     widest = ring.length / 600  # so that a short magnet is still seen on a whole ring
     for kind, colour in COLOURS.items():
         boxes = []
@@ -59,9 +67,8 @@ def extent(element: Element) -> tuple[float, float]:
     return (0.0, 1.0) if _sign(element) > 0 else (-1.0, 0.0)
 
 
-def _sign(element: Any) -> float:
-    strength = element.k1 if element.kind == "quadrupole" else element.k2
-    return float(strength)
+def _sign(element: Element) -> float:
+    return element.k1 if element.kind == "quadrupole" else element.k2
 
 
 def plain_log(ax: Axes) -> None:

@@ -119,11 +119,9 @@ def plot_pendulum(done: "PendulumStudy") -> Figure:
 
 def plot_magnets(done: "MagnetStudy", ring: "Ring") -> Figure:
     """What third order adds to the first turn, along the ring."""
-    from tmlattice.plots.strip import lattice_strip
+    from tmlattice.plots.strip import above_strip
 
-    figure, axes = plt.subplots(
-        3, 1, figsize=(11, 7), sharex=True, height_ratios=[3, 3, 0.8], layout="constrained"
-    )
+    figure, axes = above_strip(ring, (11, 7), [3, 3])
     for plane, name in enumerate("xy"):
         for i, turn in reversed(list(enumerate(done.turns))):
             difference = 1e6 * (turn.third - turn.second)[:, plane]
@@ -131,7 +129,6 @@ def plot_magnets(done: "MagnetStudy", ring: "Ring") -> Figure:
             axes[plane].plot(turn.s, difference, f"C{3 * i}-", linewidth=1, label=label)
         _finish(axes[plane], "", f"{name}: third less\nsecond order [µm]")
     axes[0].set_title("One turn launched at x = y: what third order adds")
-    lattice_strip(ring, axes[2])
     return figure
 
 

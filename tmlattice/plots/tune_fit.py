@@ -1,6 +1,6 @@
-"""Figures of a tune fit: the readings along the ring, the loss, the spectra."""
+"""Figures of tune fits: the readings along the ring, the loss, the spectra; errors of many."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
@@ -11,25 +11,20 @@ from numpy.typing import ArrayLike
 
 from tmlattice.harmonics import levelled, normalised
 from tmlattice.optics import Optics, one_turn_optics
-from tmlattice.plots.strip import METHOD_COLOURS, lattice_strip
+from tmlattice.plots.strip import METHOD_COLOURS, above_strip
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tmlattice.fitting import FitResult, TuneFit
+    from tmlattice.fitting.study import Case
+    from tmlattice.lattice import Ring
 
 
 def plot_orbit(
     s: ArrayLike, position: ArrayLike, ax: Axes | None = None, label: str = "", style: str = "-"
 ) -> Axes:
-    """Position of the beam at the monitors.
-
-    Args:
-        s: [monitor], m.
-        position: one plane, [monitor], m.
-        ax: where to draw; else a new one.
-        label, style: of the line.
-    """
+    """Position of the beam at the monitors in one plane: `s` and `position` [monitor], m."""
     if ax is None:
         _, ax = plt.subplots()
     ax.plot(np.asarray(s), 1e3 * np.asarray(position), style, label=label, linewidth=0.9, ms=2.5)
@@ -37,17 +32,12 @@ def plot_orbit(
     return ax
 
 
-def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
-    """What the monitors read, the design's orbit and each method's, their residuals, the lattice.
-
-    Args:
-        outcome: of `tune_fit`.
-        figure: an empty one; else a new one.
-    """
-    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
+def plot_orbit_fit(outcome: "TuneFit") -> Figure:
+    """What the monitors read, the design's orbit and each method's, their residuals, the
+    lattice."""
+    figure, grid = above_strip(outcome.ring, (11, 8.2), [3, 2, 3, 2])
     noise = "" if outcome.noise is None else f", noise {1e6 * outcome.noise:.1f} µm"
     magnet = None if outcome.magnet is None else outcome.ring[outcome.magnet]
-    grid = figure.subplots(5, 1, sharex=True, height_ratios=[3, 2, 3, 2, 0.8])
     for plane, name in enumerate("xy"):
         orbit, residual = grid[2 * plane], grid[2 * plane + 1]
         measured = outcome.measured[:, plane]
@@ -85,7 +75,6 @@ def plot_orbit_fit(outcome: "TuneFit", figure: Figure | None = None) -> Figure:
             f"First turn with {outcome.magnet} changed by {100 * outcome.change:+g} % "
             f"(dotted, s = {magnet.s:.1f} m)"
         )
-    lattice_strip(outcome.ring, grid[4])
     return figure
 
 
@@ -98,8 +87,6 @@ def plot_loss(
     """Loss and weighted penalty of every epoch.
 
     Args:
-        fit: of `fine_tune`.
-        ax: where to draw; else a new one.
         floor: the loss that noise alone would leave, m^2.
         others: the loss of other methods, m^2, by name.
     """
@@ -135,9 +122,7 @@ def plot_spectrum(
     Args:
         states: at the start of each turn, [turns, n].
         plane: 0 for x, 1 for y.
-        ax: where to draw; else a new one.
         optics: for the normalisation, which separates Q from 1 - Q.
-        colour: of the line.
     """
     if ax is None:
         _, ax = plt.subplots()
@@ -176,3 +161,36 @@ def plot_tune_fit_spectrum(outcome: "TuneFit", axes: "tuple[Axes, Axes]") -> Non
                     zorder=4 if name == "true" else 3,
                 )  # fmt: skip
         ax.legend(loc="upper right", fontsize="small")
+
+
+SMALLEST = 1e-9
+"""Errors below are drawn here: the axis is logarithmic."""
+
+
+def plot_study(ring: "Ring", cases: "Sequence[Case]", figure: Figure | None = None) -> Figure:
+    """|dQx| and |dQy| of every case against the place of its magnet, one colour a method.
+
+    Cases with an unstable ring, or without a prediction, are crosses at the foot.
+    """
+    figure, grid = above_strip(ring, (11, 7), [3, 3], figure)
+    methods = list(dict.fromkeys(case.method for case in cases))
+    without = sorted({c.s for c in cases if c.absolute_error is None and np.isfinite(c.s)})
+    for plane, name in enumerate("xy"):
+        ax = grid[plane]
+        for colour, method in enumerate(methods):
+            good = [c for c in cases if c.method == method and c.absolute_error is not None]
+            errors = [max(c.absolute_error[plane], SMALLEST) for c in good if c.absolute_error]
+            label = method
+            if errors:
+                label += f", median {np.median(errors):.1e}"
+                ax.axhline(float(np.median(errors)), color=f"C{colour}", linewidth=0.8, alpha=0.6)
+            ax.plot([c.s for c in good], errors, ".", color=f"C{colour}", ms=4, label=label)
+        if without:
+            ax.plot(without, np.full(len(without), 0.03), "x", color="0.5", ms=4,
+                    transform=ax.get_xaxis_transform(), label="no tune")  # fmt: skip
+        ax.set_yscale("log")
+        ax.set_ylabel(f"|dQ{name}|")
+        ax.grid(alpha=0.25)
+        ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=5, fontsize="small")
+    figure.suptitle("Tune error after fine-tuning, by the place of the changed magnet")
+    return figure

@@ -2,11 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import above_strip
 
 if TYPE_CHECKING:
     from tmlattice.fitting.weights import WeightReading
@@ -17,23 +16,13 @@ BINS = 120
 _COLOURS = ("tab:blue", "0.55", "tab:orange")
 
 
-def plot_weights(
-    reading: "WeightReading", figure: Figure | None = None, mark: str | None = None
-) -> Figure:
-    """Raw change, normalised score and shares of the parts of every layer, and the lattice.
-
-    Args:
-        reading: of `read_network`.
-        figure: an empty one; else a new one.
-        mark: an element to show, such as the true cause.
-    """
+def plot_weights(reading: "WeightReading", mark: str | None = None) -> Figure:
+    """Raw change, normalised score and shares of the parts of every layer, and the lattice; an
+    element `mark` is dotted, such as the true cause."""
     from tmlattice.fitting.weight_parts import PARTS
 
-    figure = plt.figure(figsize=(11, 8.2), layout="constrained") if figure is None else figure
-    raw, score, size, share, strip = figure.subplots(
-        5, 1, sharex=True, height_ratios=[2, 2.6, 2, 2, 0.8]
-    )
     ring, split = reading.ring, reading.split
+    figure, (raw, score, size, share) = above_strip(ring, (11, 8.2), [2, 2.6, 2, 2])
     s = np.array([magnet.s for magnet in ring.magnets])
     raw.vlines(s, 0, reading.raw, color="k", linewidth=0.6)
     raw.set_ylabel("raw change\n[m, rad, ...]")
@@ -71,5 +60,4 @@ def plot_weights(
         ax.grid(alpha=0.25)
     dotted = "" if mark is None else f" (dotted: {mark}, s = {ring[mark].s:.1f} m)"
     raw.set_title(f"Weights after fine-tuning, layer by layer{dotted}")
-    lattice_strip(ring, strip)
     return figure

@@ -31,12 +31,7 @@ def scaled(effect: str, amount: float) -> tuple[float, str]:
 
 
 def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
-    """An amount in a readable unit, with its error to two digits.
-
-    Args:
-        effect: of the catalogue.
-        amount, sigma: in the effect's unit.
-    """
+    """An amount in a readable unit, with its error to two digits."""
     if find(effect).discrete:
         return find(effect).forms.get(amount, "")
     factor, unit = scaled(effect, amount)
@@ -80,11 +75,6 @@ def degenerate_text(effect: str, support: Support) -> str:
 
 
 def all_of(places: Sequence[str | None], devices: Mapping[str, str]) -> str:
-    """The elements that share an amount.
-
-    Args:
-        places: their names; None: the beam.
-        devices: names of the control system.
-    """
+    """The elements that share an amount (places: their names; None: the beam)."""
     first = labelled(places[0] or "the beam", devices)
     return first if len(places) == 1 else f"{first} and {len(places) - 1} alike"

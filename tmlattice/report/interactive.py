@@ -32,8 +32,8 @@ from tmlattice.plots.diagnosis import (
     over_decades,
     thresholds,
 )
-from tmlattice.plots.names import plural
-from tmlattice.plots.readings import AFTER, BEFORE, design_readings
+from tmlattice.plots.readings import AFTER, BEFORE, design_readings, worst_shot
+from tmlattice.plots.response import RESIDUALS, gradient_errors
 from tmlattice.report.amounts import amount_text, words
 from tmlattice.speaks import micrometres
 
@@ -190,7 +190,7 @@ def plan(diagnosis: Diagnosis) -> Figure:
         colour = plan_view.SMALL[kind].colour if small else strip_view.COLOURS[kind]
         at = plan_view.beside(view, kind, places)
         own = [ring.elements[i] for i in places]
-        trace = _trace(at[:, 0], at[:, 1], plural(kind), colour, mode="markers",
+        trace = _trace(at[:, 0], at[:, 1], plan_view.plural(kind), colour, mode="markers",
                        size=3 if small else 4, hover=f"<br>{kind}",
                        text=[f"{e.name}\ns = {e.s:.2f} m" for e in own])  # fmt: skip
         trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
@@ -242,10 +242,7 @@ def readings(diagnosis: Diagnosis) -> Figure:
     models = {diagnosis.starting_model: (design_readings(diagnosis), BEFORE)}
     if diagnosis.verdict != "distributed":
         models["with the findings"] = (view.after, AFTER)
-    left = (
-        np.nan_to_num(read - models[diagnosis.starting_model][0]) ** 2 * data.active[:, None, None]
-    )
-    shot = int(left.sum(axis=(1, 2)).argmax())
+    shot = worst_shot(diagnosis, models[diagnosis.starting_model][0])
     s, names = zip(*((monitor.s, monitor.name) for monitor in monitors), strict=True)
     traces = []
     for plane, name in enumerate("xy"):
@@ -303,12 +300,8 @@ def _amount(effect: str, power_of_it: float) -> str:
 
 
 def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figure:
-    """The gain in chi-square of each hypothesis alone, before any finding.
-
-    Args:
-        diagnosis: with a scan.
-        span: from and to which s, m: then linear, to separate neighbours.
-    """
+    """The gain in chi-square of each hypothesis alone, before any finding (span: from and to which
+    s, m: then linear, to separate neighbours)."""
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
     s = middles(diagnosis)
     low, high = span or (0.0, diagnosis.ring.length)
@@ -390,12 +383,7 @@ def steps(diagnosis: Diagnosis) -> Figure:
     kept = diagnosis.steps
     at = list(range(len(kept)))
     traces = []
-    for name, label, colour in (
-        ("heldout_rms_in_plane", "in-plane", "C0"),
-        ("heldout_rms_position", "in-plane, with position jump", "tab:cyan"),
-        ("heldout_rms_coupling", "coupling", "C3"),
-        ("dispersion_rms", "RF response", "C2"),
-    ):
+    for name, label, colour in RESIDUALS:
         values = [1e6 * getattr(step, name) for step in kept]
         trace = _trace(at, values, label, colour, text=[step.effect for step in kept],
                        hover=f"<br>{label} %{{y:.3g}} µm")  # fmt: skip
@@ -414,16 +402,11 @@ def steps(diagnosis: Diagnosis) -> Figure:
 
 def gradients(diagnosis: Diagnosis) -> Figure:
     """Relative gradient error of each quadrupole, with its standard error."""
-    rows = [
-        (c.element or "", diagnosis.ring[c.element or ""].s, 100 * c.amount, 100 * sigma)
-        for c, sigma in zip(diagnosis.causes, diagnosis.errors, strict=True)
-        if c.effect == "quadrupole_gradient"
-    ]
-    hover = [f"{name}\n{amount:+.4f} ± {error:.4f} %" for name, _, amount, error in rows]
-    trace = _trace([r[1] for r in rows], [r[2] for r in rows], "gradient error", "tab:red",
-                   mode="markers", size=5, text=hover, hover="<br>s = %{x:.2f} m",
-                   showlegend=False)  # fmt: skip
-    trace["error_y"] = {"array": _short([r[3] for r in rows], 3), "thickness": 1, "width": 0}
+    elements, amounts, errors = zip(*gradient_errors(diagnosis), strict=True)
+    hover = [f"{e.name}\n{a:+.4f} ± {sigma:.4f} %" for e, a, sigma in gradient_errors(diagnosis)]
+    trace = _trace([e.s for e in elements], amounts, "gradient error", "tab:red", mode="markers",
+                   size=5, text=hover, hover="<br>s = %{x:.2f} m", showlegend=False)  # fmt: skip
+    trace["error_y"] = {"array": _short(errors, 3), "thickness": 1, "width": 0}
     return _above_strip(diagnosis, [trace], "gradient error [%]")
 
 

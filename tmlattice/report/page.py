@@ -147,7 +147,7 @@ def draw(diagnosis: Diagnosis, folder: Path, correction: Correction | None = Non
 
 def draw_correction(correction: Correction | None, folder: Path) -> list[Picture]:
     """Draw the figure of a correction as a PNG file in the folder."""
-    from tmlattice.plots.correction import CAPTION, plot_correction
+    from tmlattice.plots.readings import CAPTION, plot_correction
 
     if correction is None:
         return []
@@ -179,14 +179,7 @@ def page(
     provenance: dict[str, Any] | None = None,
     correction: Correction | None = None,
 ) -> str:
-    """The report as HTML.
-
-    Args:
-        diagnosis: of `diagnose`.
-        pictures: of `draw`.
-        provenance: where it should state more than the diagnosis' own.
-        correction: of the diagnosis, where there is one.
-    """
+    """The report as HTML."""
     parts = files("tmlattice.report")
     stated = diagnosis.provenance if provenance is None else provenance
     return render(

@@ -40,14 +40,8 @@ MOST = 8
 
 
 def report_text(diagnosis: Diagnosis, width: int = WIDTH, most: int | None = None) -> str:
-    """Return the report as plain text.
-
-    Args:
-        diagnosis: of `diagnose`.
-        width: columns.
-        most: lines at most, as on a terminal: the least important parts are left out, and the last
-            line names them. None: the whole report.
-    """
+    """Return the report as plain text (most: lines at most, as on a terminal: the least important
+    parts are left out, and the last line names them. None: the whole report)."""
     parts = [part for part in _parts(diagnosis, width) if part.lines]
     kept, left = set(range(len(parts))), []
     if most is not None:

@@ -23,15 +23,11 @@ def save(diagnosis: Diagnosis, folder: str | PathLike[str]) -> Path:
     """Write `report.html`, `report.txt`, `diagnosis.json` with its lattice, and the figures.
 
     Args:
-        diagnosis: of `diagnose`.
         folder: made where it is not there; files of these names are replaced, all or none, and
             those of a correction are removed.
 
     Returns:
         The report's path, `report.html`.
-
-    Raises:
-        OutputError: it cannot be written.
     """
     place = Path(folder)
     with output_folder(place, FILES) as temporary:
@@ -67,15 +63,10 @@ def render(
     not hold what they show.
 
     Args:
-        path: a folder of `save` or `save_correction`, or the JSON file.
         out: the folder to write to; None: the same.
 
     Returns:
         The diagnosis, see `Diagnosis.load`; or the correction.
-
-    Raises:
-        MeasurementError, LatticeError: see `Diagnosis.load`.
-        OutputError: it cannot be written.
     """
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
     place, correction = folder if out is None else Path(out), None
@@ -103,14 +94,10 @@ def save_correction(correction: Correction, folder: str | PathLike[str]) -> Path
     `report.html`.
 
     Args:
-        correction: of `correct`.
         folder: made where it is not there; files of these names are replaced, all or none.
 
     Returns:
         The report's path, `report.html`.
-
-    Raises:
-        OutputError: it cannot be written.
     """
     place = Path(folder)
     with output_folder(place) as temporary:

@@ -185,12 +185,7 @@ LARGE_TITLE = "large distributed errors"
 
 
 def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Notes on what limits the diagnosis: (title, text).
-
-    Args:
-        diagnosis: of `diagnose`.
-        provenance: its own, or one that also states what was assumed of files.
-    """
+    """Notes on what limits the diagnosis: (title, text)."""
     for warning in diagnosis.warnings:
         yield "warning", warning
     if large := large_text(diagnosis):

@@ -25,7 +25,7 @@ from scipy.integrate import solve_ivp
 
 from tmlattice.maps import TaylorMap, ode_of_taylor_map, recentred, taylor_map_of_ode
 from tmlattice.maps.ode import OdeError
-from tmlattice.systems.comparison import Comparison
+from tmlattice.systems import Comparison
 from tmlattice.systems.learning import MapFit, fit_map, follow, weights_of
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.maps import TaylorMap, taylor_map_of_ode
-from tmlattice.systems.comparison import Comparison
+from tmlattice.systems import Comparison
 from tmlattice.systems.learning import follow, map_of_weights, weights_of
 
 Array = NDArray[np.float64]
@@ -123,7 +123,6 @@ def predicted_masses(masses: Sequence[float], forest: bool = True, seed: int = 0
     Args:
         masses: kg.
         forest: whether to train one; it needs scikit-learn, and is skipped without it.
-        seed: of the forest.
     """
     truth = velocity(FALL, np.array(masses)[:, None])
     starts = np.stack([np.zeros(len(masses)), 100 / np.array(masses)], axis=1)

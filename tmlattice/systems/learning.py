@@ -90,7 +90,6 @@ def fit_step_by_step(solution: ArrayLike, order: int) -> TaylorMap:
 
     Args:
         solution: [step, n], or several solutions of one length [solution, step, n].
-        order: of the map.
     """
     solution = np.asarray(solution, dtype=float)
     n = solution.shape[-1]
@@ -166,8 +165,10 @@ def fit_map(
             found[k] = gradient[columns]
             gradient = jacobians[k] @ gradient
             gradient[image, range(weights)] += powers[k, monomial]
-        left = found[picked] / sigma[picked][:, None]
-        return left if spread is None else np.concatenate([left, _diagonal(1 / spread, len(p))])
+        left: Array = found[picked] / sigma[picked][:, None]
+        if spread is not None:
+            left = np.concatenate([left, np.eye(weights, len(p)) / spread[:, None]])
+        return left
 
     begin = np.zeros(weights + len(free_start))
     first_states = follow(*unpacked(begin), len(y) - 1)
@@ -187,9 +188,3 @@ def fit_map(
     covariance = (axes[kept].T / singular[kept] ** 2) @ axes[kept]
     left = y - follow(learned, begun, len(y) - 1)[:, columns]
     return MapFit(learned, begun, left, covariance, mask, int(found.nfev))
-
-
-def _diagonal(values: Array, width: int) -> Array:
-    block = np.zeros((len(values), width))
-    np.fill_diagonal(block, values)
-    return block

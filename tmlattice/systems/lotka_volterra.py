@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.errors import missing_package
 from tmlattice.maps import TaylorMap, right_hand_side, taylor_map_of_ode
-from tmlattice.systems.comparison import Comparison
+from tmlattice.systems import Comparison
 from tmlattice.systems.learning import fit_step_by_step, follow, weights_of
 
 if TYPE_CHECKING:
@@ -119,7 +119,6 @@ def race(
         epochs: rows of the table; the last is how long all train.
         cells: of the LSTMs; the perceptron has 64 hidden values.
         regularizations: of "none", "L2", "dropout".
-        seed: of the first weights and of dropout.
         progress: whether to show a bar.
     """
     try:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmlattice.errors import BeamLostError
 from tmlattice.maps import TaylorMap, element_map, part_maps, taylor_map_of_ode
-from tmlattice.systems.comparison import Comparison
+from tmlattice.systems import Comparison
 
 if TYPE_CHECKING:
     from tmlattice.lattice.ring import Element, Ring
@@ -205,7 +205,6 @@ def third_order_turn(ring: "Ring", launch: ArrayLike) -> ThirdOrderTurn:
     """Return one turn of a launch (x, px, y, py) by maps of second and third order.
 
     Args:
-        ring: with monitors.
         launch: [4], m and rad.
 
     Raises:

@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from tmlattice.maps import TaylorMap, ode_of_taylor_map, taylor_map_of_ode
-from tmlattice.systems.comparison import Comparison
+from tmlattice.systems import Comparison
 from tmlattice.systems.learning import MapFit, fit_map, follow, weights_of
 
 Array = NDArray[np.float64]
