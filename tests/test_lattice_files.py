@@ -354,7 +354,7 @@ def test_files_with_no_ring_end_in_one_sentence(tmp_path):
     with pytest.raises(LatticeError, match="AT lattice"):
         load_ring(write(tmp_path, "c.json", '{"some": "thing"}'))
     savemat(tmp_path / "d.mat", {"x": np.arange(3.0)})
-    with pytest.raises(LatticeError, match="cannot be read as an AT lattice"):
+    with pytest.raises(LatticeError, match="has no single lattice .none of x"):
         load_ring(tmp_path / "d.mat")
     with pytest.raises(LatticeError, match="cannot be read as a MATLAB file"):
         load_ring(write(tmp_path, "e.mat", "no matlab"))
@@ -483,10 +483,13 @@ def test_energy_of_a_lattice_of_at_without_one_is_given(tmp_path):
     ring = np.empty((2, 1), object)
     ring[0, 0] = {"FamName": "q", "PassMethod": "QuadLinearPass", "Length": 0.4, "K": 1.1}
     ring[1, 0] = {"FamName": "d", "PassMethod": "DriftPass", "Length": 0.5}
-    savemat(tmp_path / "old.mat", {"THERING": ring})
+    savemat(tmp_path / "old.mat", {"THERING": ring, "GLOBVAL": {"LatticeFile": "old"}})
     with pytest.raises(LatticeError, match="states no beam energy; give energy="):
         load_ring(tmp_path / "old.mat")
     assert load_ring(tmp_path / "old.mat", energy=2.5).energy == 2.5
+    savemat(tmp_path / "two.mat", {"RING": ring, "THERING": ring})
+    with pytest.raises(LatticeError, match=r"no single lattice \(RING, THERING\)"):
+        load_ring(tmp_path / "two.mat", energy=2.5)
 
 
 def test_a_family_of_matlab_may_have_a_word_of_ats(tmp_path):

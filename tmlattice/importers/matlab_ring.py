@@ -29,6 +29,7 @@ from tmlattice.importers.imported import gev, is_positive
 from tmlattice.lattice import Ring
 from tmlattice.lattice.at_file import passes_freely, ring_from_at
 from tmlattice.lattice.checks import check_ring
+from tmlattice.lattice.mat_file import lattice_in
 
 _LETTER = {"x": "h", "y": "v"}
 _MAD = {"x": "HKICKER", "y": "VKICKER"}
@@ -70,27 +71,11 @@ def elements_of(
     Raises:
         LatticeError: none is one, or more than one are, or no energy is stated.
     """
-    found = {
-        name: value
-        for name, value in content.items()
-        if isinstance(value, list)
-        and len(value) > 1
-        and all(isinstance(e, Mapping) and "PassMethod" in e for e in value)
-        and sequence in (None, name)
-    }
-    if len(found) != 1:
-        which = ", ".join(found) if found else f"none of {', '.join(content) or 'its variables'}"
-        raise LatticeError(
-            f"'{path}' has no single lattice ({which}); name its variable: `sequence` in "
-            "[lattice] of tmlattice.toml"
-        )
-    ((name, elements),) = found.items()
+    elements = content[lattice_in(content, path, sequence)]
     fields = [dict(e) for e in elements if str(e.get("Class", "")).lower() != "ringparam"]
     stated = [e["Energy"] for e in elements if is_positive(e.get("Energy"))]
     if energy is None and not stated:
-        raise LatticeError(
-            f"the lattice '{name}' of '{path}' states no energy; name it: --energy, in GeV"
-        )
+        raise LatticeError(f"the lattice of '{path}' states no energy; name it: --energy, in GeV")
     cavities = [
         e for e in fields if is_positive(e.get("Frequency")) and is_positive(e.get("HarmNumber"))
     ]

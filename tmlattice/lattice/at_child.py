@@ -127,7 +127,8 @@ while len(head := source.read(8)) == 8:
         element, energy = pickle.loads(source.read(struct.unpack("<q", head)[0]))
         beam = {"energy": energy, "particle": at.Particle("relativistic")}
         kick = element.track(np.zeros(6), **beam).reshape(1, 6)
-        reply = np.vstack([at.find_elem_m66(element, XYStep=1e-6, **beam), kick]).astype("<f8").tobytes()
+        matrix = at.find_elem_m66(element, XYStep=1e-6, **beam)
+        reply = np.vstack([matrix, kick]).astype("<f8").tobytes()
     except Exception as error:
         reply = " ".join(f"{type(error).__name__}: {error}".split())[:200].encode()
     sink.write(struct.pack("<q", len(reply)) + reply)

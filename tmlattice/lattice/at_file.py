@@ -37,7 +37,7 @@ from tmlattice.lattice.at_child import check_methods, map_of
 from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
 from tmlattice.lattice.madx_language import split
-from tmlattice.lattice.mat_file import check_mat
+from tmlattice.lattice.mat_file import lattice_in, read_mat
 from tmlattice.lattice.parts import assembled
 from tmlattice.lattice.places import Place, corrector, corrector_pair, rotation
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
@@ -84,11 +84,11 @@ def read_at(
     """
     import at
 
-    options: dict[str, Any] = {"use": sequence} if sequence else {}
+    options: dict[str, Any] = {}
     if energy is not None:
         options["energy"] = 1e9 * energy
     if path.suffix.lower() == ".mat":
-        check_mat(path)
+        options["use"] = lattice_in(read_mat(path), path, sequence)
     try:
         with quiet_at() as caught, nothing_run(), TemporaryDirectory() as folder:
             source = path
@@ -173,7 +173,8 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     converted: list[Place] = []
     known: dict[int, list[Place]] = {}
     errors: dict[int, dict[str, float]] = {}
-    lattice = lattice.disable_6d(at.LongtMotion, copy=True)
+    with quiet_at():
+        lattice = lattice.disable_6d(at.LongtMotion, copy=True)
     check_methods(lattice)
     for element in lattice:
         if id(element) not in known:
