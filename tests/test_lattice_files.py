@@ -354,7 +354,7 @@ def test_files_with_no_ring_end_in_one_sentence(tmp_path):
     with pytest.raises(LatticeError, match="AT lattice"):
         load_ring(write(tmp_path, "c.json", '{"some": "thing"}'))
     savemat(tmp_path / "d.mat", {"x": np.arange(3.0)})
-    with pytest.raises(LatticeError, match="has no single lattice .none of x"):
+    with pytest.raises(LatticeError, match="no single lattice"):
         load_ring(tmp_path / "d.mat")
     with pytest.raises(LatticeError, match="cannot be read as a MATLAB file"):
         load_ring(write(tmp_path, "e.mat", "no matlab"))

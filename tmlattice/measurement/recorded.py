@@ -1,0 +1,86 @@
+"""Readings that a recorder adds or cuts: a shot that is recorded twice, and readings that are
+clipped at the end of a range.
+
+>>> data, sentences = recorded(data, [monitor.name for monitor in ring.monitors])
+"""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmlattice.errors import first_of
+from tmlattice.measurement.assume import in_beam_order, with_read
+from tmlattice.measurement.lost_beam import beam_lost, exact
+from tmlattice.measurement.shots import TurnByTurn
+from tmlattice.measurement.trajectory import Measurement
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Data = TypeVar("Data")
+
+FEWEST = 8
+"""Readings of a shot, from which another one of noise is not the same to the last digit."""
+OFTEN = 5
+"""Readings at exactly the largest value for each at another value of the upper half, from which
+that is the end of a range: at the peaks of an oscillation there are at most 2.5."""
+SHOWN = 8
+"""Names in a sentence at most."""
+
+
+def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]:
+    """The data without repeated shots and with clipped readings NaN, and a sentence about each.
+
+    Args:
+        data: of any kind; only readings of shots with noise are changed.
+        ring_monitors: names, in beam order.
+    """
+    own: Any = data
+    if getattr(own, "READ", "") != "readings" or exact(own) or not ring_monitors:
+        return data, []
+    own = in_beam_order(own, ring_monitors)
+    said = []
+    first: dict[Any, int] = {}
+    read = []
+    for k, (shot, readings) in enumerate(zip(own.shots, own.readings, strict=True)):
+        there = np.isfinite(readings)
+        if there.sum() >= FEWEST:
+            read.append(shot)
+            settings = str(own.settings[k]) if own.settings else ""
+            first.setdefault((settings, np.where(there, readings, np.inf).tobytes()), shot)
+    kept = [*first.values()]
+    twice = [shot for shot in read if shot not in kept]
+    if twice and len(kept) > 1:
+        own = own.select(shots=[shot for shot in own.shots if shot not in twice])
+        said.append(
+            f"{len(twice)} of {len(read)} shots repeat another to the last digit, and are left "
+            f"out: {first_of([str(shot) for shot in twice], SHOWN)}; record each shot once"
+        )
+    signal = beam_lost(own).without if isinstance(own, Measurement | TurnByTurn) else own
+    ends = _ends(signal.readings)
+    if ends.any():
+        names = [own.monitors[m] for m in np.unique(np.nonzero(ends)[-2])]
+        largest = np.unique(np.abs(own.readings[ends]))
+        said.append(
+            f"{ends.sum()} readings are clipped at {first_of([f'{v:g}' for v in largest], 4)} m, "
+            f"the end of a range, and are left out, of {first_of(names, SHOWN)}; widen the range"
+        )
+        own = with_read(own, lambda values: np.where(ends, np.nan, values))
+    return own, said
+
+
+def _ends(readings: Array) -> Flags:
+    """Which readings [.., monitor, 2] are at the largest or smallest value of their plane, where
+    that is read again and again."""
+    ends = np.zeros(readings.shape, dtype=bool)
+    flat = readings.reshape(-1, *readings.shape[-2:])
+    stuck = (len(flat) > 1) & ((flat == flat[:1]) | np.isnan(flat)).all(axis=0)
+    for plane in range(2):
+        for side in (1, -1):
+            values = np.where(stuck[:, plane], np.nan, side * readings[..., plane])
+            own, counts = np.unique(values[values > 0], return_counts=True)
+            others = counts[:-1][own[:-1] > own[-1] / 2] if len(own) else counts
+            if len(others) and counts[-1] >= OFTEN * others.max():
+                ends[..., plane] |= values == own[-1]
+    return ends
