@@ -1,5 +1,5 @@
-"""Readings that a recorder adds or cuts: a shot that is recorded twice, and readings that are
-clipped at the end of a range.
+"""Readings that a recorder adds or cuts: shots recorded twice, turns that repeat one reading, and
+readings that are clipped at the end of a range.
 
 >>> data, sentences = recorded(data, [monitor.name for monitor in ring.monitors])
 """
@@ -25,12 +25,17 @@ FEWEST = 8
 OFTEN = 5
 """Readings at exactly the largest value for each at another value of the upper half, from which
 that is the end of a range: at the peaks of an oscillation there are at most 2.5."""
+TURNS = 16
+"""Successive turns with exactly one reading, from which a BPM has no signal in them."""
+HALF = 0.5
+"""Share of such readings of a plane, from which it is the beam that has none."""
 SHOWN = 8
 """Names in a sentence at most."""
 
 
 def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]:
-    """The data without repeated shots and with clipped readings NaN, and a sentence about each.
+    """The data without repeated shots, with repeated and clipped readings NaN, and a sentence about
+    each.
 
     Args:
         data: of any kind; only readings of shots with noise are changed.
@@ -57,6 +62,15 @@ def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]
             f"{len(twice)} of {len(read)} shots repeat another to the last digit, and are left "
             f"out: {first_of([str(shot) for shot in twice], SHOWN)}; record each shot once"
         )
+    if isinstance(own, TurnByTurn):
+        again = _again(own.readings)
+        if again.any():
+            names = [own.monitors[m] for m in np.unique(np.nonzero(again)[-2])]
+            said.append(
+                f"{again.sum()} readings are the same as those before for {TURNS} turns and more, "
+                f"and are left out, of {first_of(names, SHOWN)}; correct these BPMs"
+            )
+            own = with_read(own, lambda values: np.where(again, np.nan, values))
     signal = beam_lost(own).without if isinstance(own, Measurement | TurnByTurn) else own
     ends = _ends(signal.readings)
     if ends.any():
@@ -68,6 +82,19 @@ def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]
         )
         own = with_read(own, lambda values: np.where(ends, np.nan, values))
     return own, said
+
+
+def _again(readings: Array) -> Flags:
+    """Which readings [shot, turn, monitor, 2] are of a run of the same, where other BPMs read."""
+    again = np.zeros(readings.shape, dtype=bool)
+    if readings.shape[1] < TURNS:
+        return again
+    same = readings[:, 1:] == readings[:, :-1]
+    runs = np.lib.stride_tricks.sliding_window_view(same, TURNS - 1, axis=1).all(axis=-1)
+    for turn in range(TURNS):
+        again[:, turn : turn + runs.shape[1]] |= runs
+    most = again.mean(axis=(1, 2), keepdims=True) > HALF  # the beam was lost, or not there
+    return np.asarray(again & ~most)
 
 
 def _ends(readings: Array) -> Flags:
