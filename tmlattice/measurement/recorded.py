@@ -71,7 +71,8 @@ def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]
                 f"and are left out, of {first_of(names, SHOWN)}; correct these BPMs"
             )
             own = with_read(own, lambda values: np.where(again, np.nan, values))
-    signal = beam_lost(own).without if isinstance(own, Measurement | TurnByTurn) else own
+    lossy: Any = own
+    signal = beam_lost(lossy).without if isinstance(own, Measurement | TurnByTurn) else own
     ends = _ends(signal.readings)
     if ends.any():
         names = [own.monitors[m] for m in np.unique(np.nonzero(ends)[-2])]
