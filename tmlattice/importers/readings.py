@@ -38,16 +38,8 @@ more have no room in a beam pipe, and those of a micrometre are noise."""
 
 SHOTS = ("shot", "shots", "shot_id", "cycle", "time", "timestamp", "date", "datetime")
 TURNS = (
-    "turn",
-    "turns",
-    "turn_number",
-    "turn_no",
-    "turn_n",
-    "n_turn",
-    "nturn",
-    "turn_index",
-    "turn_id",
-)
+    "turn", "turns", "turn_number", "turn_no", "turn_n", "n_turn", "nturn", "turn_index", "turn_id",
+)  # fmt: skip
 MONITORS = ("monitor", "bpm", "device", "name", "element", "pv", "channel")
 VALUES = ("value", "val", "reading", "position")
 PLANES = ("plane", "axis")
