@@ -228,6 +228,21 @@ def test_monitors_and_readings_of_their_own_are_noted(small_ring, healthy):
     assert len(found) == 5
 
 
+def test_shots_recorded_twice_and_clipped_readings_are_left_out(small_ring, healthy):
+    launches, readings = (np.repeat(own, 2, 0) for own in (healthy.launches, healthy.readings))
+    twice = Measurement(launches, readings, healthy.monitors, healthy.noise)
+    (found,) = told(check_data(small_ring, twice), "note")
+    assert (found.name, len(twice.shots)) == ("recording", 2 * len(healthy.shots))
+    assert f"{len(healthy.shots)} of {len(twice.shots)} shots repeat another" in found.sentence
+    end = np.quantile(np.abs(healthy.readings[..., 0]), 0.9)
+    clipped = np.clip(healthy.readings, -end, end)
+    count = np.count_nonzero(np.abs(clipped) == end)
+    (found,) = told(check_data(small_ring, replace(healthy, readings=clipped)), "note")
+    assert found.sentence.startswith(f"{count} readings are clipped at {end:g} m")
+    with pytest.raises(MeasurementError, match=r"clipped at"):
+        diagnose(small_ring, replace(healthy, readings=np.clip(healthy.readings, -1e-5, 1e-5)))
+
+
 def test_launches_far_from_the_stated_ones_are_noted(small_ring, healthy):
     data = replace(healthy, launches=healthy.launches + np.array([1e-3, 0, 0, 0, 0]))
     data = replace(data, launch_sigma=healthy.launch_sigma / 10)

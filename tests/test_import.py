@@ -2,6 +2,7 @@
 
 import json
 import re
+import struct
 
 import at
 import h5py
@@ -737,6 +738,13 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
     found = bring_in([tmp_path / "c.sdds"], Options(lattice=lattice[0]))
     assert found.measurement.monitors == ("bpm::0", "bpm::6")
     assert "'BPM.OF.ANOTHER'" in " ".join(found.doubts)
+    big = tbt.TbtData([tbt.TransverseData(X=1e3 * x, Y=1e3 * y)], 20)
+    tbt.write(tmp_path / "um.sdds", big, datatype="lhc")
+    whole = (tmp_path / "a.sdds").read_bytes()
+    (tmp_path / "19.sdds").write_bytes(whole.replace(struct.pack(">i", 20), struct.pack(">i", 19)))
+    for name, why in (("um", r"are above 0\.2 m"), ("19", r"into shape \(3,1,19\)")):
+        with pytest.raises(TmlatticeError, match=why):
+            bring_in([tmp_path / f"{name}.sdds"], Options(lattice=lattice[0]))
     (tmp_path / "b.sdds").write_text("nothing")
     unknown = "is no file that is known: for its columns name the lattice"
     with pytest.raises(TmlatticeError, match=unknown):

@@ -16,7 +16,7 @@ from test_import import (  # noqa: F401  (a fixture)
 )
 
 from tmlattice.errors import MeasurementError
-from tmlattice.importers import Options, bring_in, matlab_ring
+from tmlattice.importers import Options, bring_in
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
 
@@ -470,19 +470,3 @@ def test_a_lattice_in_a_file_of_its_own(tmp_path, simulated, energy):  # noqa: F
     scipy.io.savemat(tmp_path / "loco.mat", {**variables, "RINGData": {"Lattice": own}})
     with pytest.raises(MeasurementError, match="holds a lattice, and"):
         bring_in(both, Options())
-
-
-def test_tunes_that_are_not_ats_are_a_doubt(with_change, monkeypatch):
-    """Whatever is lost of a lattice moves the tunes."""
-    assert not with_change(lambda v: None).doubts
-    usual = matlab_ring.ring_from_at
-
-    def lossy(lattice, name, energy):
-        weaker = lattice.deepcopy()
-        for element in weaker:
-            if element.FamName == "QF":
-                element.PolynomB[1] *= 1.02
-        return usual(weaker, name, energy)
-
-    monkeypatch.setattr(matlab_ring, "ring_from_at", lossy)
-    assert any("AT's of the same elements" in said for said in with_change(lambda v: None).doubts)

@@ -242,7 +242,7 @@ def test_more_than_the_readings(small_ring, data, tmp_path, change, words):
 def test_turns_that_are_counted_from_another_number(small_ring, data, tmp_path):
     path = wide(tmp_path / "a.csv", data.select(shots=[0]), lambda m, p: f"{m} {p} [mm]")
     head, row = path.read_text().splitlines()
-    path.write_text(f"Turn #{head[4:]}\n17{row[1:]}\n18{row[1:]}\n")
+    path.write_text(f"Turn No{head[4:]}\n17{row[1:]}\n18{row[1:]}\n")
     readings = bring_in([path], Options(ring=small_ring)).measurement.readings
     assert readings.shape[:2] == (1, 2)
     np.testing.assert_allclose(readings[0, 0], data.readings[0, 0], atol=1e-12)

@@ -57,6 +57,16 @@ def test_turns_in_another_order(small_ring, sound, said):
     assert said in wrong_in(small_ring, turns(sound["turn_by_turn"], CHANGES[said]))
 
 
+def test_turns_of_a_monitor_without_signal_are_left_out(small_ring, sound):
+    readings = sound["turn_by_turn"].readings.copy()
+    readings[0, readings.shape[1] // 2 + 5 :, 3] = 0.0
+    data = replace(sound["turn_by_turn"], readings=readings)
+    found = {check.name: check.sentence for check in check_data(small_ring, data).reported}
+    count = 2 * (readings.shape[1] - readings.shape[1] // 2 - 5)
+    assert found["recording"].startswith(f"{count} readings are the same as those before")
+    assert data.monitors[3] in found["recording"]
+
+
 def test_turns_that_are_numbered_backwards(small_ring, sound):
     data = turns(sound["turn_by_turn"], lambda values: values[:, ::-1])
     assert "numbered backwards" in wrong_in(small_ring, data)

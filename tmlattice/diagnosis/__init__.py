@@ -21,6 +21,7 @@ from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse, in_words
+from tmlattice.measurement.recorded import recorded
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose"]
 
@@ -94,10 +95,10 @@ def diagnose(
     from threadpoolctl import threadpool_limits
 
     one = 1 if _readings(measurement) < MANY else None
-    measurement, messages = _in_the_lattice(ring, measurement)
+    measurement, messages = _usable(ring, measurement)
     given: dict[str, Any] = {"reference": reference, "heldout": heldout}
     for name, own in given.items():
-        given[name], more = _in_the_lattice(ring, own)
+        given[name], more = _usable(ring, own)
         messages += [f"the {name}: {sentence}" for sentence in more if sentence not in messages]
     given |= {"holdout": holdout, "max_effects": max_effects, "background": background,
               "known": known, "radiation": radiation, "missing": missing}  # fmt: skip
@@ -106,17 +107,25 @@ def diagnose(
                 "progress": progress}  # fmt: skip
     every = [*(measurement.values() if isinstance(measurement, Mapping) else [measurement])]
     _each_once(measurement)
-    with threadpool_limits(one, "blas"):
-        found = _diagnosed(ring, measurement, options)
+    try:
+        with threadpool_limits(one, "blas"):
+            found = _diagnosed(ring, measurement, options)
+    except MeasurementError as error:
+        if not messages:
+            raise
+        raise MeasurementError("; ".join([str(error), *messages])) from error
     found = with_devices(found, devices_of(ring, every))
     return replace(found, warnings=(*messages, *found.warnings)) if messages else found
 
 
-def _in_the_lattice(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
-    """The measurement, or several by name, without what is not in the lattice."""
+def _usable(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
+    """The measurement, or several by name, without what is not in the lattice, repeated shots and
+    clipped readings."""
     if not isinstance(measured, Mapping):
-        return in_the_lattice(ring, measured)
-    parts = {name: in_the_lattice(ring, own) for name, own in measured.items()}
+        own, absent = in_the_lattice(ring, measured)
+        own, cut = recorded(own, [monitor.name for monitor in ring.monitors])
+        return own, [*absent, *cut]
+    parts = {name: _usable(ring, own) for name, own in measured.items()}
     messages = [
         f"{name}: {sentence}" if len(parts) > 1 else sentence
         for name, (_, some) in parts.items()

@@ -44,6 +44,7 @@ from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, rea
 from tmlattice.measurement.kinds import STORED
 from tmlattice.measurement.lost_beam import beam_lost, exact
 from tmlattice.measurement.monitors import LARGEST_READING, Names
+from tmlattice.measurement.recorded import recorded
 from tmlattice.observe.compared import ANOTHER, Compared, OfResponse, compared
 from tmlattice.observe.global_errors import CERTAIN, OfTurns, Search, Verdict
 from tmlattice.observe.noise import PASSES, noise_scatter
@@ -108,10 +109,12 @@ def check_data(
 
     begun = time.perf_counter()
     data, absent = in_the_lattice(ring, data)
-    checks = [*(note("names", sentence) for sentence in absent), _stated(ring, data)]
+    names = [monitor.name for monitor in ring.monitors]
+    data, cut = recorded(data, names)
+    checks = [*(note("names", sentence) for sentence in absent),
+              *(note("recording", sentence) for sentence in cut), _stated(ring, data)]  # fmt: skip
     few = signals.few(ring, data)
     if few is None:
-        names = [monitor.name for monitor in ring.monitors]
         data = assume(in_beam_order(data, names), assumed, names)
         if isinstance(data, Measurement):
             checks += _of_first_turns(ring, data, expected_radiation(ring) if radiation else ())

@@ -11,7 +11,13 @@ from typing import Any, cast
 import numpy as np
 
 from tmlattice.by_name import by_name, is_frame
-from tmlattice.errors import MeasurementError, TmlatticeError, plain, unknown_name
+from tmlattice.errors import (
+    MeasurementError,
+    OtherFormatError,
+    TmlatticeError,
+    plain,
+    unknown_name,
+)
 from tmlattice.importers.columns import (
     CSV,
     HDF5,
@@ -309,11 +315,16 @@ def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
         stated = with_unit(options.stated, options.unit, None)
         unit = cast("Unit | None", "um" if stated.unit == "µm" else stated.unit)
         return bring_turns(path, ring, options.turns, unit, stated)
-    except MeasurementError:
+    except MeasurementError as error:
         if options.turns or ring is None or path.suffix.lower() not in SDDS:
             raise
+        columns = read_columns(path)
+        if not isinstance(error, OtherFormatError):  # turns, with something wrong in them
+            raise
+        if any(column.name.endswith("PositionsConcentratedAndSorted") for column in columns):
+            raise (error.__cause__ or error) from None
         stated = with_unit(options.stated, options.unit, options.noise)
-        return bring_readings(label(path), read_columns(path), ring, stated)
+        return bring_readings(label(path), columns, ring, stated)
 
 
 def _with_conventions(brought: Imported, ring: Ring | None, options: Options) -> Imported:

@@ -147,7 +147,7 @@ def bring_hdf5(
         of_rf,
         *placed.messages,
     )
-    return Imported(measured, placed.ring, said, placed.doubts)
+    return Imported(measured, placed.ring, said)
 
 
 def _with(parts: Sequence[tuple[Path, Mapping[str, Any]]], name: str) -> Mapping[str, Any] | None:

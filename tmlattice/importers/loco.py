@@ -111,7 +111,6 @@ def bring_loco(
         replace(placed.ring, model=model),
         assumed=(*conventions(flags, measured), *of_form, *of_lists, of_lattice, *placed.messages),
         doubts=(
-            *placed.doubts,
             *_computed(data, content.get("LocoModel"), good),
             *_unkicked(correctors, kickers),
         ),

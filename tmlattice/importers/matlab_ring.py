@@ -29,10 +29,8 @@ from tmlattice.importers.imported import gev, is_positive
 from tmlattice.lattice import Ring
 from tmlattice.lattice.at_file import passes_freely, ring_from_at
 from tmlattice.lattice.checks import check_ring
-from tmlattice.optics import ring_tunes
+from tmlattice.lattice.mat_file import lattice_in
 
-AS_AT = 2e-3
-"""By which tunes of the model may differ from AT's own: edges and integrators make 1e-4."""
 _LETTER = {"x": "h", "y": "v"}
 _MAD = {"x": "HKICKER", "y": "VKICKER"}
 
@@ -73,27 +71,11 @@ def elements_of(
     Raises:
         LatticeError: none is one, or more than one are, or no energy is stated.
     """
-    found = {
-        name: value
-        for name, value in content.items()
-        if isinstance(value, list)
-        and len(value) > 1
-        and all(isinstance(e, Mapping) and "PassMethod" in e for e in value)
-        and sequence in (None, name)
-    }
-    if len(found) != 1:
-        which = ", ".join(found) if found else f"none of {', '.join(content) or 'its variables'}"
-        raise LatticeError(
-            f"'{path}' has no single lattice ({which}); name its variable: `sequence` in "
-            "[lattice] of tmlattice.toml"
-        )
-    ((name, elements),) = found.items()
+    elements = content[lattice_in(content, path, sequence)]
     fields = [dict(e) for e in elements if str(e.get("Class", "")).lower() != "ringparam"]
     stated = [e["Energy"] for e in elements if is_positive(e.get("Energy"))]
     if energy is None and not stated:
-        raise LatticeError(
-            f"the lattice '{name}' of '{path}' states no energy; name it: --energy, in GeV"
-        )
+        raise LatticeError(f"the lattice of '{path}' states no energy; name it: --energy, in GeV")
     cavities = [
         e for e in fields if is_positive(e.get("Frequency")) and is_positive(e.get("HarmNumber"))
     ]
@@ -131,14 +113,12 @@ class Placed:
         monitors: names of the monitors, in the order of `Roles.monitors`.
         correctors: names by place and plane.
         messages: what was done to the lattice; sentences.
-        doubts: whether the model is what AT makes of the same elements; sentences.
     """
 
     ring: Ring
     monitors: tuple[str, ...]
     correctors: Mapping[tuple[int, str], str]
     messages: tuple[str, ...]
-    doubts: tuple[str, ...]
 
 
 Key = TypeVar("Key", int, str)
@@ -216,31 +196,7 @@ def ring_of_elements(
             *(f"{what} ({count})" for what, count in messages.items()),
             *(str(warning.message) for warning in told),
         ),
-        doubts=tuple(_unlike_at(lattice, ring)),
     )
-
-
-def _unlike_at(lattice: Any, ring: Ring) -> list[str]:
-    """Where the tunes of the model are not AT's own: something of the lattice was lost."""
-    import at
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            own = at.get_tune(lattice.disable_6d(copy=True))[:2]
-        except Exception:  # AT tracks no orbit through it, in its own ways
-            return []
-    if not np.isfinite(own).all():
-        return []
-    tunes = ring_tunes(ring)
-    if tunes is None:
-        return ["the model stores no beam, and AT's of the same elements does: do not trust it"]
-    ours, theirs = (np.sort(np.cos(2 * np.pi * np.array(q))) for q in (tunes, own))
-    if np.abs(ours - theirs).max() < 2 * np.pi * AS_AT:
-        return []
-    shown = [", ".join(f"{q % 1:.4f}" for q in pair) for pair in (tunes, own)]
-    return [f"the model's tunes are {shown[0]}, AT's of the same elements {shown[1]}: see what was "
-            "left out of the lattice"]  # fmt: skip
 
 
 def _names(ring: Ring, families: Sequence[str], places: Iterable[int]) -> dict[int, str]:

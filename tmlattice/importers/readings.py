@@ -37,7 +37,9 @@ SIZES = ((0.02, "m"), (30.0, "mm"), (3e4, "um"), (np.inf, "nm"))
 more have no room in a beam pipe, and those of a micrometre are noise."""
 
 SHOTS = ("shot", "shots", "shot_id", "cycle", "time", "timestamp", "date", "datetime")
-TURNS = ("turn", "turns", "turn_number")
+TURNS = (
+    "turn", "turns", "turn_number", "turn_no", "turn_n", "n_turn", "nturn", "turn_index", "turn_id",
+)  # fmt: skip
 MONITORS = ("monitor", "bpm", "device", "name", "element", "pv", "channel")
 VALUES = ("value", "val", "reading", "position")
 PLANES = ("plane", "axis")

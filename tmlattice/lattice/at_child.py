@@ -5,14 +5,16 @@ count that does not fit, ends the process that tracks it. That process is a chil
 death becomes a sentence. Which pass methods are loaded at all is a fixed list: `shipped_methods`.
 """
 
+import atexit
+import os
 import pickle
 import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -49,81 +51,73 @@ def check_methods(elements: Iterable[Any]) -> None:
             )
 
 
-class Tracker:
-    """A child process that computes first-order maps; it is started by the first element.
+def map_of(element: Any, energy: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The matrix of an AT element, [6, 6], and what it adds to a particle on the axis, [6], in AT's
+    coordinates, (.., delta, ct). The child is started by the first element, and ends with us.
 
-    >>> with Tracker(3e9) as tracker:
-    ...     matrix, kick = tracker.map(element)             # [6, 6], [6], AT's coordinates
+    >>> matrix, kick = map_of(element, 3e9)
+
+    Args:
+        element: of AT.
+        energy: eV, of a particle that is as fast as light.
+
+    Raises:
+        LatticeError: AT cannot track it, dies over it, or does not come back.
     """
+    check_methods([element])
+    with _ONE_AT_A_TIME:
+        reply = _asked(pickle.dumps((element, energy)))
+    if len(reply) == 42 * 8:
+        numbers = np.frombuffer(reply, "<f8").reshape(7, 6)
+        return numbers[:6], numbers[6]
+    why = reply.decode("utf-8", "replace") or "its tracking does not come back"
+    raise LatticeError(
+        f"AT cannot track the element '{element.FamName!s:.40}' ({why:.200}); correct it"
+    )
 
-    def __init__(self, energy: float) -> None:
-        self._energy = energy
-        self._child: subprocess.Popen[bytes] | None = None
 
-    def __enter__(self) -> "Tracker":
-        return self
+_ONE_AT_A_TIME = threading.Lock()
+_children: dict[int, subprocess.Popen[bytes]] = {}
+"""By the process that asks: a fork has one of its own."""
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if self._child is not None:
-            self._child.kill()
-            self._child.communicate()
 
-    def map(self, element: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The matrix of an AT element, [6, 6], and what it adds to a particle on the axis, [6], in
-        AT's coordinates, (.., delta, ct).
-
-        Raises:
-            LatticeError: AT cannot track it, dies over it, or does not come back.
-        """
-        check_methods([element])
-        reply = self._asked(pickle.dumps((element, self._energy)))
-        if len(reply) == 42 * 8:
-            numbers = np.frombuffer(reply, "<f8").reshape(7, 6)
-            return numbers[:6], numbers[6]
-        why = reply.decode("utf-8", "replace") or "its tracking does not come back"
-        raise LatticeError(
-            f"AT cannot track the element '{element.FamName!s:.40}' ({why:.200}); correct it"
+def _asked(message: bytes) -> bytes:
+    """The child's answer; nothing where it is dead or silent."""
+    if (child := _children.get(os.getpid())) is None:
+        child = _children[os.getpid()] = subprocess.Popen(
+            [sys.executable, "-P", "-c", _CHILD],  # nothing of the working directory
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
         )
+        atexit.register(_end, child)
+    assert child.stdin is not None
+    assert child.stdout is not None
+    late = threading.Timer(SECONDS, child.kill)
+    late.start()
+    try:
+        child.stdin.write(struct.pack("<q", len(message)) + message)
+        child.stdin.flush()
+        head = child.stdout.read(8)
+        reply = child.stdout.read(struct.unpack("<q", head)[0]) if len(head) == 8 else b""
+    except BrokenPipeError:
+        reply = b""
+    finally:
+        late.cancel()
+    if not reply:
+        del _children[os.getpid()]
+        _end(child)
+    return reply
 
-    def _asked(self, message: bytes) -> bytes:
-        """The child's answer; nothing where it is dead or silent."""
-        import threading
 
-        if self._child is None:
-            self._child = subprocess.Popen(
-                [sys.executable, "-P", "-c", _CHILD],  # nothing of the working directory
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-            )
-        child = self._child
-        assert child.stdin is not None
-        assert child.stdout is not None
-        late = threading.Timer(SECONDS, child.kill)
-        late.start()
-        try:
-            child.stdin.write(struct.pack("<q", len(message)) + message)
-            child.stdin.flush()
-            head = child.stdout.read(8)
-            reply = child.stdout.read(struct.unpack("<q", head)[0]) if len(head) == 8 else b""
-        except BrokenPipeError:
-            reply = b""
-        finally:
-            late.cancel()
-        if not reply:
-            self._child = None
-            child.kill()
-            child.communicate()
-        return reply
+def _end(child: subprocess.Popen[bytes]) -> None:
+    child.kill()
+    child.communicate()
 
 
 _CHILD = """
 import os, pickle, struct, sys, warnings
+sys.modules["matplotlib"] = None  # AT would load it
 source, sink = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
 os.dup2(2, 1)  # what AT prints is no answer
 warnings.simplefilter("ignore")
@@ -133,7 +127,8 @@ while len(head := source.read(8)) == 8:
         element, energy = pickle.loads(source.read(struct.unpack("<q", head)[0]))
         beam = {"energy": energy, "particle": at.Particle("relativistic")}
         kick = element.track(np.zeros(6), **beam).reshape(1, 6)
-        reply = np.vstack([at.find_elem_m66(element, **beam), kick]).astype("<f8").tobytes()
+        matrix = at.find_elem_m66(element, XYStep=1e-6, **beam)
+        reply = np.vstack([matrix, kick]).astype("<f8").tobytes()
     except Exception as error:
         reply = " ".join(f"{type(error).__name__}: {error}".split())[:200].encode()
     sink.write(struct.pack("<q", len(reply)) + reply)

@@ -24,7 +24,8 @@ KIND_OF: dict[int, Kind] = {1: "quadrupole", 2: "sextupole", 3: "octupole"}
 
 
 def strengths_of(element: Any) -> NDArray[np.complex128]:
-    """B + i A of the orders that AT uses, scaled, four at least, kicks included, [order]."""
+    """B + i A of the orders that AT uses, scaled, four at least, kicks included, [order]; a linear
+    pass method has the normal gradient alone."""
     B = np.atleast_1d(np.asarray(getattr(element, "PolynomB", [0.0]), dtype=float))
     A = np.atleast_1d(np.asarray(getattr(element, "PolynomA", [0.0]), dtype=float))
     orders = max(len(B), len(A), 4)
@@ -38,6 +39,9 @@ def strengths_of(element: Any) -> NDArray[np.complex128]:
     kick[: len(given)] = np.sin(given)
     total[0] += complex(-kick[0], kick[1]) / (float(getattr(element, "Length", 0.0)) or 1.0)
     total *= float(getattr(element, "FieldScaling", 1.0))
+    if "Linear" in element.PassMethod:
+        total[[0, *range(2, orders)]] = 0.0
+        total[1] = total[1].real
     return total
 
 
@@ -118,13 +122,13 @@ def straight_magnet(
 
 
 def thin(
-    element: Any, family: str, mad: str, roll: float, left_out: Counter[str]
+    element: Any, family: str, length: float, roll: float, left_out: Counter[str]
 ) -> tuple[Kind, Any]:
-    """A thin multipole, of integrated fields."""
-    strengths = strengths_of(element)
+    """A multipole of integrated fields."""
+    strengths = strengths_of(element) / (length or 1.0)
     if np.any(strengths[3:]):
         left_out["thin multipoles above the sextupole"] += 1
-    return "multipole", _combined(strengths, 0.0, roll, family)
+    return "multipole", _combined(strengths, length, roll, family)
 
 
 def _combined(strengths: Any, length: float, roll: float, family: str) -> Any:

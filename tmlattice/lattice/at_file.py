@@ -33,11 +33,11 @@ from numpy.typing import NDArray
 
 from tmlattice.errors import LatticeError, plain
 from tmlattice.input_files import content_of, decoded
-from tmlattice.lattice.at_child import Tracker, check_methods
+from tmlattice.lattice.at_child import check_methods, map_of
 from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with_coils
 from tmlattice.lattice.expressions import nothing_run
 from tmlattice.lattice.madx_language import split
-from tmlattice.lattice.mat_file import check_mat
+from tmlattice.lattice.mat_file import lattice_in, read_mat
 from tmlattice.lattice.parts import assembled
 from tmlattice.lattice.places import Place, corrector, corrector_pair, rotation
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
@@ -48,12 +48,20 @@ Array = NDArray[np.float64]
 
 ACTS = frozenset({
     "BEAMBEAM", "CHANGEREF", "NLLENS", "SROTATION", "TRANSLATION", "XROTATION", "YROTATION",
-    "CRABCAVITY", "ELSEPARATOR", "RFMULTIPOLE", "SOLENOID",
+    "CRABCAVITY", "ELSEPARATOR", "RFMULTIPOLE", "SOLENOID", "VARIABLETHINMULTIPOLE",
 })  # fmt: skip
-"""MAD-X's classes that AT's reader of MAD-X makes a drift of, although they act."""
+"""Classes of MAD-X and AT that are a drift in the static optics of AT, although they act."""
 
 COARSE = 1e-3
 """|k1| l^2 / steps^4 of a magnet above which AT's integrator is wrong by 3e-5 of a tune."""
+
+SHORT = ("IdentityPass", "ThinMPolePass")
+"""Pass methods that skip the length of an element."""
+
+FINE = 100
+"""Steps in which AT integrates a magnet without an error that counts."""
+SAME, SAME_KICK = 1e-5, 1e-9
+"""Of a matrix (1 or 1/m) and a kick (m or rad): elements that agree within these are the same."""
 
 _VERTICAL = re.compile(r"^(f?v|c[hy]?v|pcv|pkv|c_?y|ky)|vcor|vkick|vcm|_v(_|\d|$)", re.IGNORECASE)
 _HORIZONTAL = re.compile(r"^(f?h|c[vx]?h|pch|pkh|c_?x|kx)|hcor|hkick|hcm|_h(_|\d|$)", re.IGNORECASE)
@@ -76,11 +84,11 @@ def read_at(
     """
     import at
 
-    options: dict[str, Any] = {"use": sequence} if sequence else {}
+    options: dict[str, Any] = {}
     if energy is not None:
         options["energy"] = 1e9 * energy
     if path.suffix.lower() == ".mat":
-        check_mat(path)
+        options["use"] = lattice_in(read_mat(path), path, sequence)
     try:
         with quiet_at() as caught, nothing_run(), TemporaryDirectory() as folder:
             source = path
@@ -155,6 +163,8 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     Warns:
         Of orders above the second, which are left out.
     """
+    import at
+
     energy_gev = float(lattice.energy) / 1e9 if energy is None else energy
     rest = float(lattice.particle.rest_energy) / 1e9
     light = rest < 2 * ELECTRON_GEV  # an electron, or AT's particle that is as fast as light
@@ -163,19 +173,19 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     converted: list[Place] = []
     known: dict[int, list[Place]] = {}
     errors: dict[int, dict[str, float]] = {}
+    with quiet_at():
+        lattice = lattice.disable_6d(at.LongtMotion, copy=True)
     check_methods(lattice)
-    energy_ev = design.map_energy * 1e9
-    with Tracker(energy_ev) as tracker:
-        for element in lattice:
-            if id(element) not in known:
-                family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
-                entrance, exit_ = _frame(element, family, design.map_energy)
-                bare = _without_frame(element) if entrance else element
-                own = _places(bare, family, design.map_energy, left_out, tracker)
-                if shift := _shift(bare):
-                    errors |= {id(source): shift for _, _, source in own}
-                known[id(element)] = [*entrance, *own, *exit_]
-            converted += known[id(element)]
+    for element in lattice:
+        if id(element) not in known:
+            family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
+            entrance, exit_ = _frame(element, family, design.map_energy)
+            bare = _without_frame(element) if entrance else element
+            own = _places(bare, family, design.map_energy, left_out)
+            if shift := _shift(bare):
+                errors |= {id(source): shift for _, _, source in own}
+            known[id(element)] = [*entrance, *own, *exit_]
+        converted += known[id(element)]
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
     if left_out:
@@ -222,9 +232,7 @@ def _shift(element: Any) -> dict[str, float]:
     return {k: v for k, v in (("dx", -T1[0]), ("dy", -T1[2])) if v}
 
 
-def _places(
-    element: Any, family: str, energy: float, left_out: Counter[str], tracker: Tracker
-) -> list[Place]:
+def _places(element: Any, family: str, energy: float, left_out: Counter[str]) -> list[Place]:
     """What one AT element is in the ring: one element, but for correctors of both planes and bends
     with coils."""
     import at
@@ -233,41 +241,47 @@ def _places(
     mad = mad or str(getattr(element, "origin", "")).upper()
     if isinstance(element, at.Corrector) and not _acts(element):
         return _correctors(element, family, mad)
-    kind, source = _convert(element, family, mad, energy, left_out, tracker)
+    kind, source = _convert(element, family, mad, energy, left_out)
     own: list[Place] = [(family, kind, source)]
     if kind == "bend":
         own = with_coils(element, family, source)
-    if kind not in ("matrix", "wiggler"):  # those are all that AT makes of the element
-        own = _with_fringes(element, family, own, energy, tracker)
+    method = element.PassMethod
+    warned = method.startswith("Str") if kind == "bend" else source.l and method in SHORT
+    if _fields(element) and not passes_freely(element) and not warned:
+        return _as_tracked(element, family, own, energy, left_out)
     return own
 
 
-def _with_fringes(
-    element: Any, family: str, own: list[Place], energy: float, tracker: Tracker
+def _as_tracked(
+    element: Any,
+    family: str,
+    own: list[Place],
+    energy: float,
+    left_out: Counter[str],
 ) -> list[Place]:
-    """An element between the matrices of its linear quadrupole fringes (AT's model 2)."""
-    sides = [s for s in ("Entrance", "Exit") if getattr(element, f"FringeQuad{s}", 0) == 2]
-    if not sides or not all(hasattr(element, f"fringeInt{sign}0") for sign in "MP"):
+    """An element, and behind it a matrix of what AT tracks otherwise: linear fringes, fields that
+    a pass method lacks or has about another axis. AT integrates in steps that are fine enough."""
+    fine = element.deepcopy()
+    vars(fine).pop("T1", None)
+    vars(fine).pop("T2", None)
+    fine.NumIntSteps = max(FINE, int(np.ravel(getattr(element, "NumIntSteps", 1))[0]))
+    wanted, kick = map_of(fine, 1e9 * energy)
+    turn, matrix, shift = _from_ocelot(energy), np.eye(6), np.zeros(6)
+    for _, _, source in own:
+        for r, b in zip(source.R(energy), source.B(energy), strict=True):
+            matrix, shift = r @ matrix, r @ shift + np.ravel(b)
+    rest = wanted @ turn @ np.linalg.inv(matrix) @ np.linalg.inv(turn)
+    rest[4:, 4:] = np.eye(2)  # how late a slow particle comes is OCELOT's
+    across = (kick - rest @ turn @ shift) * [1, 1, 1, 1, 0, 0]
+    if np.abs((rest - np.eye(6))[:4, :5]).max() < SAME and np.abs(across).max() < SAME_KICK:
         return own
-
-    def without(*off: str) -> Array:
-        other = element.deepcopy()
-        for side in off:
-            setattr(other, f"FringeQuad{side}", 0)
-        return tracker.map(other)[0]
-
-    bare = np.linalg.inv(without("Entrance", "Exit"))
-    fringes = {"Entrance": bare @ without("Exit"), "Exit": without("Entrance") @ bare}
-    made: dict[str, Place] = {
-        side: (f"{family}_fringe", *_matrix(fringes[side], f"{family}_fringe", 0.0, energy))
-        for side in sides
-    }
-    first, last = ([made[s]] if s in made else [] for s in ("Entrance", "Exit"))
-    return [*first, *own, *last]
+    name = f"{family}_rest"
+    left_out[f"what {element.PassMethod} has beyond the model and a first-order matrix"] += 1
+    return [*own, (name, *_matrix(rest, name, 0.0, energy, across if across.any() else None))]
 
 
 def _convert(
-    element: Any, family: str, mad: str, energy: float, left_out: Counter[str], tracker: Tracker
+    element: Any, family: str, mad: str, energy: float, left_out: Counter[str]
 ) -> tuple[Kind, Any]:
     """Kind and OCELOT element of one AT element."""
     import at
@@ -283,8 +297,8 @@ def _convert(
     if mad == "INSTRUMENT" and isinstance(element, at.Monitor):  # AT's MAD-X reader has it so
         return "marker", ocelot.Marker(eid=family)
     acts, method = _acts(element), element.PassMethod
-    if length and method == "IdentityPass":
-        left_out["that AT's IdentityPass skips the length of an element"] += 1
+    if length and method in SHORT:
+        left_out[f"that AT's {method} skips the length of an element"] += 1
     steps = float(np.ravel(getattr(element, "NumIntSteps", 10.0))[0])
     gradient = abs(strengths_of(element)[1]) if acts else 0.0
     if "Symplectic4" in method and gradient * length**2 > COARSE * max(steps, 1.0) ** 4:
@@ -296,8 +310,8 @@ def _convert(
             return "monitor", ocelot.Monitor(l=length, eid=family)  # from before the class
         if _fields(element):
             left_out[f"fields of magnets whose pass method is {method}"] += 1
-        if mad in ACTS:
-            left_out[f"what {mad.lower()} does"] += 1
+        for name in ACTS & {mad, type(element).__name__.upper()}:
+            left_out[f"what {name.lower()} does"] += 1
         if length:
             return "drift", ocelot.Drift(l=length, eid=family)
         return "marker", ocelot.Marker(eid=family)
@@ -306,8 +320,8 @@ def _convert(
         if roll:
             matrix = R2 @ matrix @ R1
         return _matrix(matrix, family, length, energy)
-    if isinstance(element, at.ThinMultipole) and not isinstance(element, at.Multipole):
-        return thin(element, family, mad, roll, left_out)
+    if method == "ThinMPolePass":
+        return thin(element, family, length, roll, left_out)
     angle, ahead = getattr(element, "BendingAngle", 0.0), method.startswith("Str")
     if angle or (isinstance(element, at.Dipole) and not ahead):
         if method.startswith(_FIELDS):
@@ -316,7 +330,7 @@ def _convert(
             return bend(element, family, length, roll, left_out)
     elif (acts or isinstance(element, at.Multipole)) and method.startswith(_FIELDS):
         return straight(element, family, length, mad, roll, left_out)
-    matrix, kick = tracker.map(element)
+    matrix, kick = map_of(element, 1e9 * energy)
     if method == "ChangePRefPass" and kick[4]:
         raise LatticeError(f"'{family}' changes the reference momentum ({method}); take it out")
     across = kick * [1, 1, 1, 1, 0, 0]
@@ -330,7 +344,7 @@ def _convert(
     return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source
 
 
-_FIELDS = ("Str", "Bnd", "Bend", "Quad", "Exact", "ThinMPole", "VariableThin")
+_FIELDS = ("Str", "Bnd", "Bend", "Quad", "Exact", "ThinMPole")
 """What the pass methods begin with that take an element's fields."""
 
 
@@ -346,8 +360,9 @@ def _acts(element: Any) -> bool:
 
 def passes_freely(element: Any) -> bool:
     """Whether AT passes an element as if nothing were there, whatever its class and its fields: by
-    a drift, an aperture, a monitor of the beam's moments, or noise of the radiation."""
-    free = ("Drift", "Identity", "QuantDiff", "Aperture", "Moments")
+    a drift, an aperture, a monitor of the beam's moments, noise of the radiation, or fields that
+    change from turn to turn."""
+    free = ("Drift", "Identity", "QuantDiff", "Aperture", "Moments", "VariableThin")
     return any(word in element.PassMethod for word in free)
 
 
@@ -373,19 +388,24 @@ def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     return corrector_pair(family, length, x, y)
 
 
+def _from_ocelot(energy: float) -> Array:
+    """From OCELOT's coordinates (.., tau, p) to AT's (.., delta, ct), [6, 6]."""
+    beta = math.sqrt(1.0 - (ELECTRON_GEV / energy) ** 2)
+    turn = np.eye(6)
+    turn[4:, 4:] = [[0.0, 1 / beta], [1.0, 0.0]]
+    return turn
+
+
 def _matrix(
     r: Array, family: str, length: float, energy: float, b: Array | None = None
 ) -> tuple[Kind, Any]:
     from tmlattice.lattice.ocelot import elements as ocelot
 
-    gamma = energy / ELECTRON_GEV
-    beta = math.sqrt(1.0 - 1.0 / gamma**2)
-    to_ocelot = np.eye(6)
-    to_ocelot[4:, 4:] = [[0.0, 1.0], [beta, 0.0]]
+    turn = _from_ocelot(energy)
     source = ocelot.Matrix(l=length, eid=family)
-    source.r = to_ocelot @ r @ np.linalg.inv(to_ocelot)
+    source.r = np.linalg.inv(turn) @ r @ turn
     if source.r[4, 4] == 0.0 and source.r[5, 5] == 0.0:
         source.r[4, 4] = source.r[5, 5] = 1.0
     if b is not None:
-        source.b = (to_ocelot @ b).reshape(6, 1)
+        source.b = np.linalg.solve(turn, b).reshape(6, 1)
     return ("wiggler" if "wig" in family else "matrix"), source

@@ -134,7 +134,7 @@ class Arithmetic:
         function = _named(name, names)
         if not any(function is known for known in self._functions):
             raise ValueError(f"'{name}' is no function that a lattice may call")
-        if any(keyword.arg is None or keyword.arg.startswith("_") for keyword in node.keywords):
+        if any(keyword.arg is None or keyword.arg.startswith("__") for keyword in node.keywords):
             raise ValueError(f"'{name}' is called in a way that is not read")
         given = [self._of(argument, names) for argument in node.args]
         named = {str(k.arg): self._of(k.value, names) for k in node.keywords}

@@ -4,7 +4,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,15 +63,6 @@ def read_apart(
     return content
 
 
-def check_mat(path: Path) -> None:
-    """Read a MATLAB file in a child process, so that one that crashes its reader is known.
-
-    Raises:
-        LatticeError: it is not there, is no MATLAB file, or its reader does not come back.
-    """
-    read_mat(path)
-
-
 def read_mat(path: Path, variables: Sequence[str] | None = None) -> dict[str, Any]:
     """The variables of a MATLAB file: structures are dictionaries, cells and arrays of structures
     are lists, and dimensions of one are squeezed out.
@@ -85,3 +76,32 @@ def read_mat(path: Path, variables: Sequence[str] | None = None) -> dict[str, An
     """
     content: dict[str, Any] = read_apart("matlab", path, "a MATLAB file", LatticeError, variables)
     return content
+
+
+def lattice_in(content: Mapping[str, Any], path: Path, sequence: str | None) -> str:
+    """The name of the variable of a MATLAB file that is a lattice of AT.
+
+    Args:
+        content: of `read_mat`.
+        path: of the file.
+        sequence: the variable, where several are.
+
+    Raises:
+        LatticeError: none is one, or more than one are.
+    """
+    found = [
+        name
+        for name, value in content.items()
+        if isinstance(value, list)
+        and len(value) > 1
+        and all(isinstance(e, Mapping) for e in value)
+        and any("PassMethod" in e for e in value)
+        and sequence in (None, name)
+    ]
+    if len(found) == 1:
+        return found[0]
+    which = ", ".join(found) if found else f"none of {', '.join(content) or 'its variables'}"
+    raise LatticeError(
+        f"'{path}' has no single lattice ({plain(which, 200)}); name its variable with sequence= "
+        "(`sequence` in [lattice] of tmlattice.toml)"
+    )
