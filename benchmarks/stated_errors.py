@@ -6,8 +6,7 @@ hierarchical fit with a known truth the pull is (amount - truth) / stated error.
 JSON object a line, a machine each) has all pulls by effect, each with its share from the data, the
 faulty quadrupole's number, and the largest pulls; rows that FILE holds already are not measured
 again. Errors that make a closed orbit are left out, for a machine corrects it; `--orbit` has them
-too: of the gradients that an orbit of millimetres makes in sextupoles the hierarchical fit has no
-model.
+too, uncorrected.
 
 Rings come from the tests, from accelerator-toolbox, and from TMLATTICE_DATA if it is there.
 """

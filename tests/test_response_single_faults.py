@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from shared import parted
 
 from tmlattice import Cause, diagnose
-from tmlattice.diagnosis.families.dispersion import orbit_families
+from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.small_errors import sizes_in, small_errors
@@ -87,7 +87,7 @@ def test_a_pattern_of_kicks_moves_the_response_as_at_has_it(small_ring):
 
     design = seen()
     at = begin(design, split_columns(design, 0.2, np.random.default_rng(0))).at
-    for family in orbit_families(small_ring, at.model):
+    for family in (HorizontalOrbit(), VerticalOrbit()):
         value = np.zeros(family.size(design))
         value[0] = 0.05
         put = family.put(at.errors, value, design).ring

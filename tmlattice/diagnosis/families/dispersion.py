@@ -10,9 +10,9 @@ exceeds the quadrupoles' own errors. Single kicks are degenerate, so the numbers
 patterns: the combinations of usual errors of bends and quadrupoles that focus most.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from tmlattice.beam.kicks import (
 )
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.effects import Cause, background_rms, directions, find
-from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
@@ -221,84 +220,110 @@ TOGETHER = 32
 """Number of errors whose derivatives are computed at a time."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Orbit(_PatternFamily):
-    """Patterns of kicks.
+class OrbitPatterns(NamedTuple):
+    """Patterns of usual errors, the strongest first.
 
     Attributes:
-        causes: errors that kick.
-        patterns: usual amounts of each, [pattern, error].
+        causes: the errors.
+        amounts: of each, [pattern, error].
+        orbits: in sextupoles, m, [pattern, sextupole].
     """
 
     causes: tuple[Hypothesis, ...]
-    patterns: Array
+    amounts: Array
+    orbits: Array
 
-    trust, rms = 1.0, 1.0  # in units of usual errors
+
+def orbit_patterns(model: ResponseModel, plane: int, effects: Sequence[str]) -> OrbitPatterns:
+    """Return the patterns of usual errors whose closed orbit focuses most in sextupoles."""
+    magnets = model.ring.magnets
+    strength = np.array([e.k2 * e.length if e.kind == "sextupole" else 0.0 for e in magnets])
+    exits = np.flatnonzero(strength) + 1
+    usual = background_rms(dict.fromkeys(effects))
+    causes = tuple((name, place) for name in usual for place in find(name).places(model.ring))
+    size = np.array([usual[name] for name, _ in causes])
+    kicks = directions(model.layers, causes)
+    rows = model.tangents[exits][:, 2 * plane]
+    orbits = np.zeros((len(causes), len(exits)))
+    by_layer = orbits_of_kicks(model, kicks.layer, exits, rows, kicks.D0)
+    np.add.at(orbits, kicks.owner, by_layer.T)
+    patterns, focusing, _ = np.linalg.svd(
+        size[:, None] * orbits * strength[exits - 1], full_matrices=False
+    )
+    kept = focusing > LEAST_FOCUSING * focusing.max(initial=0.0)
+    amounts = patterns.T[kept] * size
+    return OrbitPatterns(causes, amounts, amounts @ orbits)
+
+
+class _Orbit(_PatternFamily):
+    """Amplitudes of orbit patterns, in units of usual errors."""
+
+    trust, rms = 1.0, 1.0
+    plane: ClassVar[int]
+
+    def patterns(self, data: ResponseData) -> OrbitPatterns:
+        """The patterns in the design."""
+        memory = data.ring.memory
+        if self.name not in memory:
+            memory[self.name] = orbit_patterns(data.design, self.plane, self.effects)
+        found: OrbitPatterns = memory[self.name]
+        return found
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
-        return len(self.patterns)
+        return len(self.patterns(data).amounts)
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """Derivatives by all errors."""
-        out = np.zeros((len(self.patterns), at.data.orbits[..., 0].size))
-        for start in range(0, len(self.causes), TOGETHER):
-            some = self.causes[start : start + TOGETHER]
-            slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, some)]
-            out += self.patterns[:, start : start + TOGETHER] @ np.stack(slopes)
+        causes, amounts, _ = self.patterns(at.data)
+        out = np.zeros((len(values), at.data.orbits[..., 0].size))
+        for start in range(0, len(causes), TOGETHER):
+            some = slice(start, start + TOGETHER)
+            slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, causes[some])]
+            out += amounts[:, some] @ np.stack(slopes)
         return np.asarray(out.reshape(-1, *at.data.shape) * at.gain(self.block))
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The errors of bends and quadrupoles."""
-        amounts = (values @ self.patterns).tolist()
-        causes = [Cause(*one, amount) for one, amount in zip(self.causes, amounts, strict=True)]
-        return replace(errors, ring=(*errors.ring, *(c for c in causes if c.amount)))
+        causes, amounts, _ = self.patterns(data)
+        own = zip(causes, (values @ amounts).tolist(), strict=True)
+        return replace(errors, ring=(*errors.ring, *(Cause(*h, a) for h, a in own if a)))
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """Amounts of all errors."""
-        return [dict(zip(self.causes, pattern, strict=True)) for pattern in self.patterns.tolist()]
+        causes, amounts, _ = self.patterns(data)
+        return [dict(zip(causes, pattern, strict=True)) for pattern in amounts.tolist()]
 
 
 class HorizontalOrbit(_Orbit):
-    """The horizontal orbit, which focuses in sextupoles."""
+    """The horizontal closed orbit, which focuses in sextupoles."""
 
     name, effects = "horizontal orbit", ("dipole_field", "quadrupole_offset_x")
-    block, variable = 0, "horizontal orbit"
+    block, variable, plane = 0, "horizontal orbit", 0
+    title = "horizontal closed orbit in sextupoles"
 
 
 class VerticalOrbit(_Orbit):
-    """The vertical orbit, which couples in sextupoles."""
+    """The vertical closed orbit, which couples in sextupoles."""
 
     name, effects = "vertical orbit", ("dipole_roll", "quadrupole_offset_y")
-    block, variable = 1, "vertical orbit"
+    block, variable, plane = 1, "vertical orbit", 1
+    title = "vertical closed orbit in sextupoles"
 
 
-def orbit_families(ring: Ring, model: ResponseModel) -> list[Family]:
-    """Return a family for each plane; none without sextupoles.
+def orbits_in_sextupoles(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
+    """Yield a message for each plane in which the closed orbit acts in sextupoles.
 
     Args:
-        ring: the design.
-        model: of the design.
+        values: fitted, by variable.
+        data: the response.
     """
-    magnets = ring.magnets
-    strong = [i for i, e in enumerate(magnets) if e.kind == "sextupole" and e.k2]
-    if not strong:
-        return []
-    strength = np.array([magnets[i].k2 * magnets[i].length for i in strong])
-    exits = np.array(strong) + 1
-    found: list[Family] = []
-    kinds: tuple[Any, ...] = (HorizontalOrbit, VerticalOrbit)
-    for plane, kind in enumerate(kinds):
-        usual = background_rms(dict.fromkeys(kind.effects))
-        causes = tuple((name, place) for name in usual for place in find(name).places(ring))
-        size = np.array([usual[name] for name, _ in causes])
-        kicks = directions(model.layers, causes)
-        rows = model.tangents[exits][:, 2 * plane]
-        orbits = np.zeros((len(strong), len(causes)))
-        by_layer = orbits_of_kicks(model, kicks.layer, exits, rows, kicks.D0)
-        np.add.at(orbits.T, kicks.owner, by_layer.T)
-        _, focusing, patterns = np.linalg.svd(strength[:, None] * orbits * size, False)
-        kept = focusing > LEAST_FOCUSING * focusing.max(initial=0.0)
-        if kept.any():
-            found.append(kind(causes, patterns[kept] * size))
-    return found
+    for family, field in ((HorizontalOrbit(), "gradients"), (VerticalOrbit(), "skew gradients")):
+        own = values.get(family.variable, np.zeros(0))
+        if own.any():
+            size = np.sqrt(np.mean((own @ family.patterns(data).orbits) ** 2))
+            yield (
+                f"the closed orbit is {1e3 * size:.2g} mm rms off the centres of sextupoles in "
+                f"{'xy'[family.plane]}, as their {field} show; the data do not separate the errors "
+                "of bends and quadrupoles that make it"
+            )

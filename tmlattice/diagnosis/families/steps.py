@@ -14,7 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.dispersion import HorizontalKicks, VerticalKicks
+from tmlattice.diagnosis.families.dispersion import (
+    HorizontalKicks,
+    HorizontalOrbit,
+    VerticalKicks,
+    VerticalOrbit,
+)
 from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.diagnosis.families.fields import (
     BendGradient,
@@ -338,6 +343,8 @@ STEPS = (
     Trial((MonitorRoll(),), 0, 1),
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),
+    Trial((HorizontalOrbit(),), 2, 0),
+    Trial((VerticalOrbit(),), 0, 2),
     Trial((HorizontalKicks(),), 2, 0),
     Trial((EnergyOffset(),), 2, 0),
     Trial((VerticalKicks(),), 0, 2),

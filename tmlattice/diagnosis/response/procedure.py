@@ -22,7 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
-from tmlattice.diagnosis.families.dispersion import dispersion_beside, dispersion_by_kicks
+from tmlattice.diagnosis.families.dispersion import (
+    dispersion_beside,
+    dispersion_by_kicks,
+    orbits_in_sextupoles,
+)
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import (
@@ -354,8 +358,9 @@ def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
 
 
 def _warnings(fit: StepwiseFit) -> tuple[str, ...]:
-    """Warnings about additional dispersion and outliers."""
-    messages = dispersion_by_kicks(fit.state.values, fit.state.data)
+    """Warnings about the closed orbit's effects and outliers."""
+    of_orbit = (orbits_in_sextupoles, dispersion_by_kicks)
+    messages = (one for make in of_orbit for one in make(fit.state.values, fit.state.data))
     return (*messages, *outlier_readings(fit.state))
 
 

@@ -4,7 +4,7 @@
 >>> sizes_in(linear(state, 0))
 
 They are the background model of a fault: the families of a hierarchical fit, and the closed orbit
-by kicks (`orbit_modes`). All readings are fitted; of held-out correctors the half of the BPMs that
+in sextupoles. All readings are fitted; of held-out correctors the half of the BPMs that
 determines their kicks. Priors are Gaussian, and the largest number of a family is omitted from its
 scale, because it may be the fault.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from tmlattice.diagnosis.families.dispersion import orbit_families
+from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import (
     FamilyGradient,
@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 USUAL: tuple[Family, ...] = (
     CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), OtherGradient(),
-    MonitorRoll(), CorrectorRoll(), SkewGradient(),
+    MonitorRoll(), CorrectorRoll(), SkewGradient(), HorizontalOrbit(), VerticalOrbit(),
 )  # fmt: skip
 """Families of every ring."""
 ANEW = 20_000
@@ -115,9 +115,8 @@ def _halves(split: Split) -> Flags:
 
 def _families(design: State, more: Sequence[Family]) -> list[Family]:
     """Usual families, and those accepted in the fit."""
-    known = [*USUAL, *orbit_families(design.data.ring, design.at.model)]
-    names = [family.name for family in known]
-    known += [family for family in more if family.name not in names]
+    names = [family.name for family in USUAL]
+    known = [*USUAL, *(family for family in more if family.name not in names)]
     return [f for f in known if design.reads(f.block) and f.size(design.data)]
 
 
