@@ -67,19 +67,8 @@ def patterns_of_kicks(at: Predicted, plane: int) -> Patterns:
     return Patterns((shapes[:, kept] * size[kept]).T, own, kicks[kept])
 
 
-class _PatternFamily(Family):
-    """Amplitudes of patterns of kicks, which the data do not separate into single ones."""
-
+class _Kicks(Family):
     per, single = "ring", False
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """No causes: single kicks are degenerate."""
-        return []
-
-
-class _Kicks(_PatternFamily):
     trust, rms = 1e-3, USUAL
     plane: ClassVar[int]
 
@@ -130,6 +119,12 @@ class _Kicks(_PatternFamily):
             dispersion=errors.dispersion + more,
             at_correctors=errors.at_correctors + values @ patterns.at_correctors,
         )
+
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
+        """No causes: single kicks are degenerate."""
+        return []
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """No effect of the catalogue."""
@@ -255,9 +250,10 @@ def orbit_patterns(model: ResponseModel, plane: int, effects: Sequence[str]) -> 
     return OrbitPatterns(causes, amounts, amounts @ orbits)
 
 
-class _Orbit(_PatternFamily):
+class _Orbit(Family):
     """Amplitudes of orbit patterns, in units of usual errors."""
 
+    per, single = "ring", False
     trust, rms = 1.0, 1.0
     plane: ClassVar[int]
 
@@ -289,10 +285,23 @@ class _Orbit(_PatternFamily):
         own = zip(causes, (values @ amounts).tolist(), strict=True)
         return replace(errors, ring=(*errors.ring, *(Cause(*h, a) for h, a in own if a)))
 
-    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Amounts of all errors."""
+    def causes_of(
+        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
+    ) -> list[StatedCause]:
+        """The most probable errors; what no pattern has of one keeps its usual size."""
         causes, amounts, _ = self.patterns(data)
-        return [dict(zip(causes, pattern, strict=True)) for pattern in amounts.tolist()]
+        usual = background_rms(dict.fromkeys(self.effects))
+        squares = np.array([usual[name] ** 2 for name, _ in causes]) - np.sum(amounts**2, axis=0)
+        error = np.sqrt(np.maximum(squares, 0.0) + sigma**2 @ amounts**2)
+        own = zip(causes, (values @ amounts).tolist(), error.tolist(), strict=True)
+        return [(Cause(*h, amount), e) for h, amount, e in own]
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Amounts of all errors, the strongest first."""
+        causes, amounts, _ = self.patterns(data)
+        order = np.argsort(-np.abs(amounts), axis=1).tolist()
+        own = zip(amounts.tolist(), order, strict=True)
+        return [{causes[i]: pattern[i] for i in first} for pattern, first in own]
 
 
 class HorizontalOrbit(_Orbit):
