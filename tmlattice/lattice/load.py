@@ -110,6 +110,7 @@ def _checked(where: Path, read: Callable[[], Ring]) -> tuple[Ring, bool]:
     """A ring that was read and checked, and whether there were warnings."""
     with warnings.catch_warnings(record=True) as caught, reading(where):
         warnings.simplefilter("always")
+        warnings.simplefilter("ignore", ResourceWarning)  # of objects that others left unclosed
         try:
             ring = read()
         except LatticeError as error:
