@@ -94,6 +94,14 @@ def test_the_cache_is_this_user_s_alone(kept):
     assert same(kept)
 
 
+def test_a_lattice_is_kept_by_a_fresh_installation(open_folder):
+    """Modules that are compiled while it is read may warn."""
+    words = [sys.executable, "-X", f"pycache_prefix={open_folder}/compiled", "-m", "tmlattice"]
+    own = os.environ | {"TMLATTICE_CACHE": str(open_folder)}
+    subprocess.run([*words, "info", SMALL], env=own, check=True, capture_output=True)
+    assert list((open_folder / "tmlattice").iterdir())
+
+
 @pytest.mark.parametrize("mode", [0o770, 0o702])
 def test_a_cache_that_others_can_write_to_is_not_used(kept, mode):
     folder, _, _ = kept

@@ -110,13 +110,13 @@ def _checked(where: Path, read: Callable[[], Ring]) -> tuple[Ring, bool]:
     """A ring that was read and checked, and whether there were warnings."""
     with warnings.catch_warnings(record=True) as caught, reading(where):
         warnings.simplefilter("always")
-        warnings.simplefilter("ignore", ResourceWarning)  # of objects that others left unclosed
         try:
             ring = read()
         except LatticeError as error:
             raise _foreign(where) or error from error
         check_ring(ring)
-    own = [w for w in caught if not w.category.__name__.startswith("Numba")]  # of OCELOT's speed
+    # others are of code that is loaded meanwhile, and of the speed of OCELOT's
+    own = [w for w in caught if issubclass(w.category, UserWarning | RuntimeWarning)]
     for w in own:
         warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
     return ring, bool(own)
