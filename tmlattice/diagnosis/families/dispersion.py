@@ -154,15 +154,24 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
         values: fitted, by variable.
         data: the response.
     """
-    for family, gradient in ((HorizontalKicks(), "gradient"), (VerticalKicks(), "skew gradient")):
+    for family in (HorizontalKicks(), VerticalKicks()):
         own = values.get(family.variable, np.zeros(0))
         if own.any():
-            size = np.sqrt(np.mean((own @ family.patterns(data).rf) ** 2))
+            size = _rms(own, family.patterns(data).rf)
             yield (
                 f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from a "
-                f"{gradient} but from kicks of the closed orbit (errors of bends, quadrupole "
-                "offsets, correctors), which the data do not separate"
+                f"{FIELDS[family.plane]} but from kicks of the closed orbit (errors of bends, "
+                "quadrupole offsets, correctors), which the data do not separate"
             )
+
+
+FIELDS = ("gradient", "skew gradient")
+"""Field by which a closed orbit acts, by plane."""
+
+
+def _rms(values: Array, patterns: Array) -> float:
+    """Rms of a sum of patterns."""
+    return float(np.sqrt(np.mean((values @ patterns) ** 2)))
 
 
 def fitted_orbit_kicks(at: Predicted) -> Array | None:
@@ -327,12 +336,12 @@ def orbits_in_sextupoles(values: Mapping[str, Array], data: ResponseData) -> Ite
         values: fitted, by variable.
         data: the response.
     """
-    for family, field in ((HorizontalOrbit(), "gradients"), (VerticalOrbit(), "skew gradients")):
+    for family in (HorizontalOrbit(), VerticalOrbit()):
         own = values.get(family.variable, np.zeros(0))
         if own.any():
-            size = np.sqrt(np.mean((own @ family.patterns(data).orbits) ** 2))
+            size = _rms(own, family.patterns(data).orbits)
             yield (
                 f"the closed orbit is {1e3 * size:.2g} mm rms off the centres of sextupoles in "
-                f"{'xy'[family.plane]}, as their {field} show; the data do not separate the errors "
-                "of bends and quadrupoles that make it"
+                f"{'xy'[family.plane]}, as their {FIELDS[family.plane]}s show; the data do not "
+                "separate the errors of bends and quadrupoles that make it"
             )
