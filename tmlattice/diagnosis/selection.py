@@ -21,6 +21,7 @@ from tmlattice.inference.distributed import (
     DistributedErrors,
     FittedErrors,
     fit_distributed_errors,
+    full_chi2,
     rescaled,
 )
 from tmlattice.inference.judgement import Judgement
@@ -218,37 +219,56 @@ def _given_distributed(search: Search, small: FittedErrors, learn: bool, noisy: 
     found = explain(first, small.before)
     if learn and not found.count:
         found, small = _hidden(first, found, small, noisy)
+    so_far: Explanation | None = None
     for _ in range(search.most):
         if found.fit.kicks or not found.count:
             break
-        choices, most = found.choices, min(found.count + 1, search.most)
         search.progress("distributed errors with the findings")
         try:
-            small, found = _at_findings(small, found, learn, noisy)
+            there = _at_findings(small, found, so_far, learn, noisy)
         except UnstableRingError:
             break  # no linearisation exists at the findings
+        if there is None:
+            found = so_far or explain(replace(first, most=0), small.before)
+            break
+        (small, so_far), choices = there, found.choices
         # each was significant given errors that had absorbed a part of it: none is removed
-        own = replace(search, problem=small.problem, most=most)
-        found = explain(own, small.before, revised(replace(own, keep=True), found))
+        own = replace(search, problem=small.problem, most=min(found.count + 1, search.most))
+        found = explain(own, small.before, revised(replace(own, keep=True), so_far))
         if found.choices == choices:
             break
     return Selection(found, small)
 
 
 def _at_findings(
-    small: FittedErrors, found: Explanation, learn: bool, noisy: bool
-) -> tuple[FittedErrors, Explanation]:
+    small: FittedErrors,
+    found: Explanation,
+    so_far: Explanation | None,
+    learn: bool,
+    noisy: bool,
+) -> tuple[FittedErrors, Explanation] | None:
     """Linearise the distributed errors at the findings until the amounts settle, and estimate the
     scales given these.
+
+    Where orbits are millimetres off in strong sextupoles, the linear model may predict a gain that
+    the full one has not: then None.
+
+    Args:
+        so_far: without the latest finding; None: there were none.
 
     Raises:
         UnstableRingError: no beam is stored there, or no fit exists.
     """
+    earlier = small.before if so_far is None else so_far.fit
+    without = full_chi2(small, earlier, found.dropped)
     for _ in range(STEPS):
         small, causes = _linearised(small, found.fit, found.fit.causes, learn=False)
         found = _refitted(small, found, causes)
         if not _moved(found.fit, causes):
             break
+    gain = without - full_chi2(small, found.fit, found.dropped)
+    if len(found.fit.causes) > len(earlier.causes) and gain < 2 * small.plain.judgement.log_odds:
+        return None
     if not learn:
         return small, found
     small = rescaled(small, found.fit.causes, found.fit.nuisances, noisy)

@@ -284,9 +284,13 @@ class DistributedProblem(MarginalProblem):
         slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
         return 2 / max(float(slope @ covariance @ slope), 1e-9)
 
+    def coordinates(self, clean: Array) -> Array:
+        """Most probable errors of size 1, given the rows that remain, [error]."""
+        return self.rows @ self._root.back(clean)
+
     def estimate(self, clean: Array) -> Array:
         """Most probable amounts of the errors, given the rows that remain, [error]."""
-        return self.known.amounts_at(self.rows @ self._root.back(clean))
+        return self.known.amounts_at(self.coordinates(clean))
 
     def learnt(self, explained: Fit) -> DistributedErrors:
         """Distribution of the errors given an explanation."""
@@ -404,6 +408,25 @@ def fit_distributed_errors(
     if learn:
         fitted = _scaled(fitted, point, causes, noisy, weigh)
     return _with_nuisances(fitted, point.nuisances)
+
+
+def full_chi2(errors: FittedErrors, found: Fit, dropped: Flags) -> float:
+    """Return chi-square of the full model and of the errors' prior, which the linear one predicts.
+
+    Args:
+        errors: distributed errors.
+        found: causes in the linear model.
+        dropped: rejected readings, of the problem's shape.
+    """
+    problem, known = errors.problem, errors.problem.known
+    independent = problem.coordinates(found.clean)
+    amounts = known.amounts_at(independent)
+    plain = errors.plain.without(dropped)
+    try:
+        _, there, _ = linearise(plain, known, amounts, amounts, found.causes, found.nuisances)
+    except UnstableRingError:
+        return float(np.inf)
+    return there.chi2 + float(independent @ independent)
 
 
 def rescaled(

@@ -48,8 +48,8 @@ FREE = 30.0
 """Prior rms of a corrector's own roll, in units of its column's residual: practically free."""
 ROUNDS = 30
 """Iterations of EM for the prior rms of all sources together."""
-ENOUGH, COLUMNS = 12, 8
-"""Fewest readings of a column, and fewest columns, for a search."""
+ENOUGH = 12
+"""Fewest readings of a column for a search."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
     weights = weight(state, 1)
     read = (data.plane_of(1) == plane) & ((weights > 0).sum(axis=1) >= ENOUGH)
     read[-1] = False
-    if read.sum() < COLUMNS or not state.allows("corrector_roll"):
+    if not read.any() or not state.allows("corrector_roll"):
         return nothing
     weights, left = weights[read], np.where(weights > 0, data.pick(at.left, 1), 0.0)[read]
     rolls = data.pick(at.seen(at.across), 1)[read]

@@ -21,7 +21,9 @@ from tmlattice.diagnosis.findings import located
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.result import Finding
+from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import ResponseData
@@ -250,26 +252,30 @@ def rejected_channels(state: State) -> list[Label]:
         if not len(rows):
             continue
         there = np.isfinite(orbits[rows]) & state.good
-        bad = _unlike(read[rows], orbits[rows], there)
+        noise = np.broadcast_to(data.noise[:, p], there.shape)
+        bad = _unlike(read[rows], orbits[rows], noise, there)
         monitors += [Label("rejected monitor", (data.measured.monitors[m],), plane="xy"[p])
                      for m in np.flatnonzero(bad)]  # fmt: skip
-        odd = _unlike(read[rows].T, orbits[rows].T, (there & ~bad).T)
+        odd = _unlike(read[rows].T, orbits[rows].T, noise.T, (there & ~bad).T)
         correctors += [Label("rejected corrector", (data.measured.correctors[rows[c]],))
                        for c in np.flatnonzero(odd)]  # fmt: skip
     return [*monitors, *correctors]
 
 
-def _unlike(model: Array, read: Array, there: Flags) -> Flags:
+def _unlike(model: Array, read: Array, noise: Array, there: Flags) -> Flags:
     """Of each column of [reading, one]: whether no multiple of the model explains it."""
     u, d = np.where(there, model, 0.0), np.where(there, read, 0.0)
     size = (d**2).sum(axis=0)
     gain = (u * d).sum(axis=0) / np.maximum((u**2).sum(axis=0), 1e-300)
-    share = ((d - gain * u) ** 2).sum(axis=0) / np.maximum(size, 1e-300)
-    # a weak response is described by a calibration or a gain
+    left = (d - gain * u) ** 2
+    share = left.sum(axis=0) / np.maximum(size, 1e-300)
+    # a weak response, or one of noise alone, is described by a calibration or a gain
     seen = (there.sum(axis=0) >= ENOUGH) & (size > SILENT**2 * (u**2).sum(axis=0))
+    chance = chi2.sf((left / noise**2).sum(axis=0), there.sum(axis=0))
     if seen.sum() < ENOUGH:
         return np.zeros(len(share), dtype=bool)
     strange = seen & (share > max(UNEXPLAINED, RATIO * float(np.median(share[seen]))))
+    strange &= chance < DEFAULT.false_alarm
     return strange if strange.sum() <= MOST * seen.sum() else np.zeros_like(strange)
 
 

@@ -39,7 +39,7 @@ from tmlattice.diagnosis.findings import (
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.common_factors import explain_gradients
 from tmlattice.diagnosis.response.detected_faults import detected_faults, given_faults
-from tmlattice.diagnosis.response.first_guess import FAR, strange
+from tmlattice.diagnosis.response.first_guess import FAR, first_guess, strange
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.inconsistencies import inconsistencies
 from tmlattice.diagnosis.response.labels import (
@@ -82,13 +82,13 @@ Array = NDArray[np.float64]
 
 PATTERNS = 8
 """Number of the strongest patterns of the residual."""
+TYPICAL = 6
+"""Fewest columns of a plane for the typical one."""
 LARGE = 60_000
 """Most readings for the search for single faults among distributed errors, which refits all."""
 TOO_LARGE = (
     "single faults among the distributed errors were not sought: there are too many readings"
 )
-TYPICAL = 6
-"""Fewest columns of a plane for the typical one."""
 
 
 def diagnose_response(
@@ -213,11 +213,13 @@ def _families(
 
 def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> list[Label]:
     """New swaps by a state; if there are none, rejected channels. If the design is far from the
-    ring, columns match by chance, and the ring is fitted before swaps are sought."""
+    ring, by the typical column or by a better start, columns match by chance, and the ring is
+    fitted before swaps are sought."""
     gone = rejected_channels(state)
     names = [own.elements[0] for own in gone if own.kind == "rejected monitor"]
     good = state.good & ~np.isin(state.data.measured.monitors, names)
-    far = of_design and strange(replace(state, good=good), TYPICAL) > FAR
+    there = replace(state, good=good)
+    far = of_design and (strange(there, TYPICAL) > FAR or first_guess(there) is not None)
     return new([*([] if far else swaps(state, gone)), *swapped_planes(state)], known) or gone
 
 
