@@ -234,7 +234,7 @@ def physics_of(element: Element) -> Hashable:
 
 
 _NUMBERS = (int, float, type(None))
-_PLAIN = frozenset(_NUMBERS)
+_PLAIN = frozenset((*_NUMBERS, bool))
 _FOR_PEOPLE = frozenset(("id", "color", "params"))
 
 
