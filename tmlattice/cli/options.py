@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import stat
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -402,10 +402,15 @@ def outputs(
         yield made, lambda result: write_json(path, result) if path else None
 
 
-def read_data(path: Path, ring: "Ring") -> "tuple[AnyMeasurement, tuple[str, ...]]":
+def read_data(
+    path: Path, ring: "Ring", assumed: Sequence[str] = ()
+) -> "tuple[AnyMeasurement, tuple[str, ...]]":
     """A measurement folder, or a file of another program, and what was assumed of it.
 
     The assumptions are printed too: nothing is taken for granted silently.
+
+    Raises:
+        click.UsageError: one of `assumed` is undone already, by the machine file.
     """
     from tmlattice.measurement import read_measurement
 
@@ -414,6 +419,12 @@ def read_data(path: Path, ring: "Ring") -> "tuple[AnyMeasurement, tuple[str, ...
     from tmlattice.importers import Options, bring_in, described
 
     machine = machine_file()
+    undone = () if machine is None else machine.stated.assume
+    if both := [name for name in assumed if name in undone]:
+        raise click.UsageError(
+            f"--assume {both[0]} is in the machine file too, which would undo it twice; leave it "
+            "out"
+        )
     brought = bring_in(
         [path], Options(ring=ring, stated=None if machine is None else machine.stated)
     )
