@@ -156,6 +156,11 @@ def diagnose(
         from tmlattice.measurement import Measurement, OrbitResponse
 
         ring = open_ring(lattice)
+        if both := {p.resolve() for p in measurements} & {p.resolve() for p in references}:
+            raise click.UsageError(
+                f"'{min(both)}' is the measurement and its --reference: between them nothing "
+                "changed; give the one before"
+            )
         asked = read_settings(settings_file, ring) if settings_file else []
         (data, said), (before, _) = (_read(p, ring, assumed) for p in (measurements, references))
         (first, *more) = data.values()

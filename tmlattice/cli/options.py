@@ -84,12 +84,27 @@ WORKERS = Word("N|ADDRESS", _workers, "'{0}': give a number of processes, or tcp
 BACKGROUND = Word("NAME[=RMS]", named_number, "'{2}' is no rms; give for example {1}=1e-3")
 
 
+def each_once(context: click.Context, parameter: click.Parameter, values: Any) -> Any:
+    """The values of an option that is repeated, each a name, maybe a place, and an amount.
+
+    Raises:
+        click.UsageError: two of one name and place, of which the first would not count.
+    """
+    places = [tuple(str(word).casefold() for word in own) for *own, _ in values]
+    for place, (*own, _) in zip(places, values, strict=True):
+        if places.count(place) > 1:
+            named = " ".join(str(word) for word in own if word is not None)
+            raise click.UsageError(f"{parameter.opts[0]} '{named}' is given twice; give it once")
+    return values
+
+
 def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """`--background NAME[=RMS]`, repeated."""
     return click.option(
         "--background",
         type=BACKGROUND,
         multiple=True,
+        callback=each_once,
         help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
         "one, or `none`.",
     )
