@@ -342,9 +342,15 @@ def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
     ("- {knob: trim, members: QF::3 QF::3}", "'QF::3' is a member of 'trim' and 'trim'"),
     ("- {knob: q, members: QF::1, kind: pump}", "no kind 'pump'"),
     ("knob: QF", "no list of knobs"),
+    ("- {knob: q, members: [[QF::1]]}", "members are no list of names"),
+    ("- {knob: q, members: QF::1 sf::1}", "cannot sit on 'sf::1', a sextupole"),
+    ("- {knob: q, members: QF::1, kind: hcorrector}", "cannot sit on 'QF::1', a quadrupole"),
+    ("knob,low,low\nQF,1,2", "the column 'low' stands twice"),
+    ("knob,low\nQF,1,2", "line 2: more than the 2 fields of the header"),
+    ('knob,low\n"QF,1', "line 2: not CSV"),
 ])  # fmt: skip
 def test_tables_that_cannot_be_used(small_ring, tmp_path, row, said):
-    path = tmp_path / "knobs.yaml"
+    path = tmp_path / ("knobs.csv" if row.startswith("knob,") else "knobs.yaml")
     path.write_text(row)
     with pytest.raises(MeasurementError, match=said):
         read_knobs(path, small_ring)

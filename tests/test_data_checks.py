@@ -402,6 +402,8 @@ def test_one_monitor_and_unknown_assumptions_are_one_sentence(small_ring, health
         diagnose(small_ring, healthy.select(monitors=healthy.monitors[:1]))
     with pytest.raises(UnknownNameError, match="did you mean 'x-reversed'"):
         diagnose(small_ring, healthy, assume=["x-revers"])
+    with pytest.raises(MeasurementError, match="'x-reversed' is named twice"):
+        check_data(small_ring, healthy, assumed=["x-reversed", "y-reversed", "x-reversed"])
     with pytest.raises(MeasurementError, match="no meaning for first turns"):
         check_data(small_ring, healthy, assumed=["rf-reversed"])
     with pytest.raises(MeasurementError, match="there are readings of turn 0"):

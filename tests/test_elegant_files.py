@@ -309,6 +309,9 @@ def test_use_says_which_line(tmp_path):
         ({"CH": "EMATRIX, R12=1"}, "EMATRIX 'CH' has no inverse"),
         ({"CH": "RFCA, VOLT=1E6, CHANGE_P0=1"}, "CHANGE_P0"),
         ({"CELL": "MARK"}, "'CELL' is defined twice"),
+        ({"CH": "MALIGN, DX=1E-5, ON_PASS=0, FORCE_MODIFY_MATRIX=1"}, "MALIGN 'CH' .* by its DX"),
+        ({"QF": "KQUAD, L=0.4, K1=1, K1=1.1"}, "K1 of 'QF' is stated twice"),
+        ({"QUAD": "KQUAD, L=0.4, K1=-1", "QX": "QUAD, L=0.4"}, "'QUAD' is an element and a class"),
     ],
 )
 def test_what_is_not_modelled_is_named(tmp_path, changes, message):
@@ -324,6 +327,10 @@ def test_what_is_not_modelled_is_named(tmp_path, changes, message):
         ({"BB": 'CSBEND, L=1, ANGLE="pi 8 /", K4=3'}, "K4 of bb"),
         ({"CH": "EMATRIX, R11=1, R22=1, R33=1, R44=1, R55=1, R66=1, T211=0.3"}, "T211 of ch"),
         ({"QF": "KQUAD, L=0.4, K1=1.1, EDGE_MULTIPOLES=x.sdds"}, "EDGE_MULTIPOLES of qf"),
+        ({"CH": "RFCA, VOLT=1E6, END1_FOCUS=1"}, "END1_FOCUS of ch"),
+        ({"CH": "HKICK, B2=10"}, "B2 of ch"),
+        ({"MQ": "MONI, XCALIBRATION=1.1, WEIGHT=2"}, r"XCALIBRATION of mq \(1\)$"),
+        ({"D1": "DRIF, L=0.4, K1=3"}, "K1 of d1"),
     ],
 )  # fmt: skip
 def test_what_acts_beyond_the_linear_optics_is_warned_of(tmp_path, changes, message):

@@ -95,7 +95,30 @@ def many_groups(file, folder):
         file.create_group(f"g{number}")
 
 
+def grouped(file, folder):
+    del file["x"]
+    file.create_group("x")
+
+
+def other_order(file, folder):
+    file["bpms"] = NAMES[::-1]
+
+
+def many_attributes(file, folder):
+    for number in range(1001):
+        file["y"].attrs[f"a{number}"] = 1.0
+
+
+def two_units(file, folder):
+    file["x"].attrs["units"] = "um"
+
+
 HALF = {
+    "one number": (replaced(data=1.0), "'x' is one number"),
+    "an empty group": (grouped, "'x' holds no data"),
+    "names in two orders": (other_order, "two lists have the names of 'x' in different orders"),
+    "two units": (two_units, "'x' has the units um and mm"),
+    "more attributes than any file": (many_attributes, "more than 1,000 attributes"),
     "never written": (replaced(shape=(4, 6), dtype="f8"), "all of 'x' was never written"),
     "half written": (partly(0.0), "2 of 4 parts of 'x' was never written"),
     "an enumeration": (replaced(shape=(4, 6), dtype=h5py.enum_dtype({"OK": 0, "BAD": 1})),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 
 import at
 import numpy as np
@@ -451,7 +452,7 @@ def test_pass_method_and_not_the_class_says_what_at_tracks(changed):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"m": at.Monitor("m", Length=0.2)}, "AT's IdentityPass skips the length"),
+        ({"m": at.Monitor("m", Length=0.2)}, r"AT's IdentityPass skips the length.* of m \(1\)$"),
         ({"q": at.Quadrupole("q", 0.4, 1.1, NumIntSteps=1)}, "integration in a few steps"),
         ({"m": at.Quadrupole("m", 0.2, 0.3, PassMethod="IdentityPass")}, "is IdentityPass"),
         ({"m": at.Multipole("m", 0.2, [0], [0.1], PassMethod="ThinMPolePass")}, "skips the length"),
@@ -467,6 +468,33 @@ def test_pass_method_and_not_the_class_says_what_at_tracks(changed):
 def test_what_at_tracks_otherwise_is_warned_of(changed, message):
     with pytest.warns(UserWarning, match=message):
         ring_from_at(fodo(**changed), "x")
+
+
+def test_elements_that_at_tracks_otherwise_are_named_and_counted(small_ring):
+    """The first three names, and how many elements there are, also of one name."""
+    lattice = at.Lattice(at_lattice(small_ring), energy=3e9, periodicity=1)
+    quadrupoles = [e for e in lattice if isinstance(e, at.Quadrupole)]
+    for k, element in enumerate(quadrupoles):
+        element.FamName, element.NumIntSteps = f"q{k // 2}", 1
+    with pytest.warns(UserWarning, match=r"few steps of q0, q1, q2, \.\.\. \(32\)"):
+        ring_from_at(lattice, "x")
+
+
+@pytest.mark.parametrize(("second", "said"), [(3e9, True), (6e9, True), (None, False)])
+def test_ring_parameters_beyond_the_first_are_reported(tmp_path, small_ring, second, said):
+    from scipy.io import loadmat, savemat
+
+    at.save_lattice(at.Lattice(at_lattice(small_ring), energy=3e9), tmp_path / "ring.mat")
+    elements = loadmat(tmp_path / "ring.mat")["RING"].ravel()
+    if second:
+        more = loadmat(tmp_path / "ring.mat")["RING"].ravel()[0]
+        more["Energy"][0, 0] = np.array([[second]])
+        elements = np.insert(elements, 1, np.array([more, None], dtype=object)[:1])
+    savemat(tmp_path / "ring.mat", {"RING": elements})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert load_ring(tmp_path / "ring.mat").energy == pytest.approx(3.0)
+    assert any("More than 1 RingParam" in str(w.message) for w in caught) == said
 
 
 def test_energy_of_a_lattice_of_at_without_one_is_given(tmp_path):

@@ -419,7 +419,7 @@ def test_a_magnet_that_at_passes_as_a_drift_is_one(fields):
     made = [element_from_dict(dict(own), quiet=True, check=False) for own in every]
     there = at.Lattice(made, energy=ENERGY * 1e9, periodicity=1)
     there.disable_6d()
-    with pytest.warns(UserWarning, match=r"pass method is DriftPass \(2\)"):
+    with pytest.warns(UserWarning, match=r"pass method is DriftPass of off \(2\)"):
         ring = ring_from_at(there, "ring", ENERGY)
     assert [e.kind for e in ring.elements if e.family == "off"] == ["drift", "drift"]
     assert_allclose(np.array(ring_tunes(ring)) % 1, at.get_tune(there), atol=1e-3)

@@ -52,6 +52,15 @@ def test_shots_that_are_lost_at_different_places(small_ring, data):
     the_fault_alone(diagnose(small_ring, replace(data, readings=readings)))  # no BPM is dead
 
 
+def test_a_fault_by_which_no_beam_comes_round_from_the_stated_launch(small_ring):
+    """The launch is known to its stated error: from that of the fit the beam comes round."""
+    fault = Cause("quadrupole_gradient", "QD::5", -0.8)
+    own = {"shots": 4, "turns": 2, "amplitude": 3e-3, "seed": 0}
+    found = diagnose(small_ring, simulate(small_ring, [fault], **own).measurement())
+    assert [f.element for f in found.findings] == ["QD::5"]
+    assert found.findings[0].amount == pytest.approx(-0.8, abs=0.01)
+
+
 def test_one_shot_or_one_plane_that_stands_for_all_is_refused(small_ring, data):
     """Also where no launch is stated: noise is another in each shot."""
     for readings, words in (

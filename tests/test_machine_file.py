@@ -74,6 +74,9 @@ def test_a_control_rooms_file_is_read_by_what_the_machine_file_states(machine, t
     """Names, unit, noise and the sign of x; the folder of `import` is the one that was measured."""
     done = tmlattice("import", "room.csv", "--out", tmp_path / "I", cwd=machine, check=0)
     assert "undone: x-reversed" in done.stdout
+    for name in ("check", "diagnose"):
+        done = tmlattice(name, "room.csv", "--assume", "x-reversed", cwd=machine, check=2)
+        assert "--assume x-reversed is in the machine file too" in done.stderr
     own, data = package.read_measurement(tmp_path / "I"), package.read_measurement(machine / "day")
     np.testing.assert_allclose(
         own.select(monitors=data.monitors).readings, data.readings, rtol=1e-8, atol=1e-12
@@ -163,7 +166,8 @@ def test_paths_are_from_the_folder_of_the_file(machine, tmp_path):
         ('[data]\ncolumns = {bpm = "x"}', 'data.columns has the key "bpm"; known are monitor'),
         ("[lattice]\nenergy = '3'", 'lattice.energy is "3"; it should be a number'),
         ("[lattice]\nenergy = 0", "lattice.energy is 0; it should be above 0"),
-        ("[lattice]\nenergy = nan", "nan and inf"),
+        ("[lattice]\nenergy = nan", "nan, inf and 10"),
+        ("[lattice]\nenergy = " + "9" * 400, "nan, inf and 10"),
         ('[lattice]\nmonitors = "BPM*"', "lattice.monitors is"),
         ("[lattice]\nfile = 2026-01-01", "lattice.file is"),
         ('[data]\nunit = "inch"', 'data.unit is "inch"; it should be one of "m", "mm"'),

@@ -379,12 +379,15 @@ def test_readings_of_matlab(small_ring, data, tmp_path, form):
     same(bring_in([tmp_path / "a.mat"], Options(ring=small_ring)), data)
 
 
-def test_columns_of_sdds_are_refused_in_a_sentence(small_ring, tmp_path):
-    (tmp_path / "a.sdds").write_text(
-        "SDDS1\n&column name=x, type=double, &end\n&data mode=ascii, &end\n1\n0.1\n"
-    )
+@pytest.mark.parametrize("name", ["a.sdds", "ring.clo", "watch.w1", "a.txt"])
+@pytest.mark.parametrize("mode", ["ascii", "binary"])
+def test_columns_of_sdds_are_refused_in_a_sentence(small_ring, tmp_path, name, mode):
+    """By any name: elegant writes closed orbits, centroids and watch points so."""
+    head = f"SDDS1\n&column name=x, type=double, &end\n&data mode={mode}, &end\n"
+    rows = b"1\n0.1\n" if mode == "ascii" else bytes([1, 0, 0, 0]) + np.float64(0.1).tobytes()
+    (tmp_path / name).write_bytes(head.encode() + rows)
     with pytest.raises(MeasurementError, match=r"columns such as 'x' of SDDS .* write them as CSV"):
-        bring_in([tmp_path / "a.sdds"], Options(ring=small_ring))
+        bring_in([tmp_path / name], Options(ring=small_ring))
 
 
 def test_many_turns_are_those_of_a_stored_beam(small_ring, tmp_path, rng):

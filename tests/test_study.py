@@ -46,7 +46,7 @@ def test_study_prints_writes_and_goes_on(tmp_path):
     again = json.loads((tmp_path / "study-tune-fit" / "study.json").read_text())
     assert [r["abs_dq"] for r in again["results"]] == [r["abs_dq"] for r in result["results"]]
     with pytest.raises(TmlatticeError, match="other options"):
-        study_tune_fit(str(SMALL), ["sparse"], 2, shots=2, folder=folder)
+        study_tune_fit(SMALL, ["sparse"], 2, shots=2, folder=str(folder))
 
 
 def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(monkeypatch):

@@ -106,6 +106,11 @@ def test_class_that_is_not_modelled_is_named(tmp_path, name):
         ({"__class__": "Replica", "parent_name": "ch"}, "repeats itself"),
         ({"__class__": "Cavity", "voltage": 1e3, "lag": 90.0}, "frequency 0 changes the energy"),
         ({"length": 1.0}, "'ch' has no __class__"),
+        ({"__class__": "Bend", "length": 1.0, "angle": 0.1, "h": 0.2}, "angle 0.1 rad, and 0.2"),
+        (
+            {"__class__": "RBend", "length": 1.2, "length_straight": 1.0, "angle": 0.1},
+            "length 1.2 m, and 1.00042 m",
+        ),
         ({"__class__": "SpaceChargeBiGaussian", "scale_strength": 1.0}, "acts on the beam"),
         ({"__class__": "BeamBeamBiGaussian2D", "other_beam_num_particles": 1e11}, "acts on"),
     ],
@@ -168,6 +173,9 @@ def test_particle_of_the_file(tmp_path):
     ring = load(line, tmp_path)
     assert ring.mass == pytest.approx(0.938272088)
     assert ring.energy == pytest.approx(np.hypot(2.0, 0.938272088))
+    for wrong, message in (({"q0": 0.0}, "has the charge 0"), ({"p0c": -2e9}, "momentum -2e")):
+        with pytest.raises(LatticeError, match=message):
+            load({**line, "particle_ref": {**line["particle_ref"], **wrong}}, tmp_path)
 
 
 def test_old_words_of_fields(tmp_path):

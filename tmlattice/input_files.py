@@ -7,7 +7,6 @@ Everything that a user or another program hands over is opened here, or by
 import difflib
 import gc
 import json
-import math
 import os
 import re
 import stat
@@ -29,6 +28,7 @@ MOST_BYTES = 1 << 30
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 MOST_DIGITS = 300
 """Of a whole number: as a float it would be beyond all of them."""
+LARGEST = 10**MOST_DIGITS
 MOST_YAML, MOST_NODES, DEEPEST = 4 << 20, 100_000, 20
 """Of a YAML file: bytes, keys and values, and how deep they are nested."""
 
@@ -251,8 +251,8 @@ def toml_of(path: Path, error: type[TmlatticeError]) -> dict[str, Any]:
         raise error(f"{path}: no TOML that is read ({plain(str(problem), 200)})") from problem
     level: list[Any] = [made]
     for _ in range(DEEPEST):
-        if any(isinstance(v, float) and not math.isfinite(v) for v in level):
-            raise error(f"{path}: nan and inf are not numbers here; leave the key out")
+        if any(isinstance(v, int | float) and not abs(v) < LARGEST for v in level):
+            raise error(f"{path}: nan, inf and 10^{MOST_DIGITS} are no numbers; leave the key out")
         inner = [
             v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)
         ]

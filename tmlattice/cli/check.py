@@ -50,7 +50,7 @@ def check(
         from tmlattice.diagnosis.data_checks import check_data
 
         ring = open_ring(lattice)
-        data, _ = read_data(measurement, ring)
+        data, _ = read_data(measurement, ring, assumed)
         with named_data(measurement):
             found = check_data(ring, data, assumed=assumed, radiation=radiation)
         document = found.as_json()

@@ -156,8 +156,13 @@ def diagnose(
         from tmlattice.measurement import Measurement, OrbitResponse
 
         ring = open_ring(lattice)
+        if both := {p.resolve() for p in measurements} & {p.resolve() for p in references}:
+            raise click.UsageError(
+                f"'{min(both)}' is the measurement and its --reference: between them nothing "
+                "changed; give the one before"
+            )
         asked = read_settings(settings_file, ring) if settings_file else []
-        (data, said), (before, _) = (_read(p, ring) for p in (measurements, references))
+        (data, said), (before, _) = (_read(p, ring, assumed) for p in (measurements, references))
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more
         turns = isinstance(first, Measurement) and not more
@@ -234,7 +239,9 @@ def diagnose(
         _print_weights(ring, reading)
 
 
-def _read(paths: tuple[Path, ...], ring: "Ring") -> "tuple[dict[str, Measured], list[str]]":
+def _read(
+    paths: tuple[Path, ...], ring: "Ring", assumed: tuple[str, ...]
+) -> "tuple[dict[str, Measured], list[str]]":
     """Measurements by the names of their folders, by the whole path where two have one name; and
     what was assumed of files that are none.
 
@@ -249,7 +256,7 @@ def _read(paths: tuple[Path, ...], ring: "Ring") -> "tuple[dict[str, Measured], 
     found: dict[str, Measured] = {}
     said: list[str] = []
     for name, path in zip(names, paths, strict=True):
-        found[str(path) if twice else name], own = read_data(path, ring)
+        found[str(path) if twice else name], own = read_data(path, ring, assumed)
         said += own
     return found, said
 

@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import stat
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,12 +84,27 @@ WORKERS = Word("N|ADDRESS", _workers, "'{0}': give a number of processes, or tcp
 BACKGROUND = Word("NAME[=RMS]", named_number, "'{2}' is no rms; give for example {1}=1e-3")
 
 
+def each_once(context: click.Context, parameter: click.Parameter, values: Any) -> Any:
+    """The values of an option that is repeated, each a name, maybe a place, and an amount.
+
+    Raises:
+        click.UsageError: two of one name and place, of which the first would not count.
+    """
+    places = [tuple(str(word).casefold() for word in own) for *own, _ in values]
+    for place, (*own, _) in zip(places, values, strict=True):
+        if places.count(place) > 1:
+            named = " ".join(str(word) for word in own if word is not None)
+            raise click.UsageError(f"{parameter.opts[0]} '{named}' is given twice; give it once")
+    return values
+
+
 def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """`--background NAME[=RMS]`, repeated."""
     return click.option(
         "--background",
         type=BACKGROUND,
         multiple=True,
+        callback=each_once,
         help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
         "one, or `none`.",
     )
@@ -402,10 +417,15 @@ def outputs(
         yield made, lambda result: write_json(path, result) if path else None
 
 
-def read_data(path: Path, ring: "Ring") -> "tuple[AnyMeasurement, tuple[str, ...]]":
+def read_data(
+    path: Path, ring: "Ring", assumed: Sequence[str] = ()
+) -> "tuple[AnyMeasurement, tuple[str, ...]]":
     """A measurement folder, or a file of another program, and what was assumed of it.
 
     The assumptions are printed too: nothing is taken for granted silently.
+
+    Raises:
+        click.UsageError: one of `assumed` is undone already, by the machine file.
     """
     from tmlattice.measurement import read_measurement
 
@@ -414,6 +434,12 @@ def read_data(path: Path, ring: "Ring") -> "tuple[AnyMeasurement, tuple[str, ...
     from tmlattice.importers import Options, bring_in, described
 
     machine = machine_file()
+    undone = () if machine is None else machine.stated.assume
+    if both := [name for name in assumed if name in undone]:
+        raise click.UsageError(
+            f"--assume {both[0]} is in the machine file too, which would undo it twice; leave it "
+            "out"
+        )
     brought = bring_in(
         [path], Options(ring=ring, stated=None if machine is None else machine.stated)
     )

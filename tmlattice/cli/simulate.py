@@ -13,6 +13,7 @@ from tmlattice.cli.options import (
     Word,
     background_option,
     console,
+    each_once,
     is_quiet,
     lattice_argument,
     machine_file,
@@ -54,6 +55,7 @@ CAUSE = Word(
 @click.option(
     "--effect",
     "effects",
+    callback=each_once,
     type=CAUSE,
     multiple=True,
     help="What is wrong with the machine; repeat for more.",

@@ -11,17 +11,19 @@ import csv
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tmlattice.beam.rf import rf_of
-from tmlattice.effects import Cause, find
-from tmlattice.errors import MeasurementError, plain, unknown_choice
+from tmlattice.effects import Cause, check, find
+from tmlattice.errors import EffectError, MeasurementError, plain, unknown_choice
 from tmlattice.input_files import number, text_of, yaml_of
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import magnets, supplied_alike
+from tmlattice.measurement.rows import not_csv
 
 Curve = tuple[tuple[float, float], ...]
 
@@ -305,7 +307,22 @@ def read_knobs(path: Path, ring: Ring) -> list[Knob]:
 
 
 def _table(path: Path) -> list[dict[str, Any]]:
-    return list(csv.DictReader(text_of(path, MeasurementError).splitlines()))
+    reader = csv.DictReader(StringIO(text_of(path, MeasurementError)), restkey="", strict=True)
+    try:
+        columns = list(reader.fieldnames or ())
+        if twice := [name for name in columns if columns.count(name) > 1]:
+            raise MeasurementError(f"{path}: the column '{plain(twice[0], 40)}' stands twice")
+        rows = []
+        for row in reader:
+            if any(row.pop("", ())):
+                raise MeasurementError(
+                    f"{path}, line {reader.line_num}: more than the {len(columns)} fields of the "
+                    "header"
+                )
+            rows.append(row)
+    except csv.Error as error:
+        raise not_csv(path, reader.reader.line_num, error) from error
+    return rows
 
 
 def read_settings(path: Path, ring: Ring) -> list[tuple[Knob, float]]:
@@ -380,7 +397,9 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
         )
         raise MeasurementError(f"{what}; the columns are {', '.join(COLUMNS)}")
     members = given.pop("members", ())
-    names = members.split() if isinstance(members, str) else [str(m) for m in members]
+    names = members.split() if isinstance(members, str) else list(members)
+    if not all(isinstance(member, str) for member in names):
+        raise MeasurementError(f"{where}: its members are no list of names")
     kind = str(given.pop("kind", "")).strip()
     known = shown.get(name.casefold())
     if kind and kind not in KINDS:
@@ -391,6 +410,11 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
         if not kind:
             raise MeasurementError(f"{where}: state its kind: {', '.join(KINDS)}")
         pieces = tuple(piece for member in names for piece in ring.pieces(ring[member].name))
+        if effect := KINDS[kind].effect:
+            try:
+                check(ring, [Cause(effect, piece, 0.0) for piece in pieces])
+            except EffectError as error:
+                raise MeasurementError(f"{where}: {error}") from error
         attribute = {"kick": "angle"}.get(KINDS[kind].strength, KINDS[kind].strength)
         known = _knob(name, kind, pieces, float(getattr(first, attribute, 0.0)))
     if known is None or (kind and kind != known.kind):

@@ -59,6 +59,7 @@ def stages_of(
 ) -> list[Stage]:
     """The models: the design; then with distributed errors and with the causes, or with one cause
     after another."""
+    fitted = found.fit.nuisances
     models: list[tuple[tuple[Cause, ...], tuple[Cause, ...], Array]] = [((), (), problem.first)]
     about: dict[Hypothesis, float] = {}
     if small is not None:
@@ -69,10 +70,10 @@ def stages_of(
             amounts = zip(inner.known.hypotheses, inner.estimate(one.clean).tolist(), strict=True)
             models.append((tuple(Cause(*h, a) for h, a in amounts), (), one.nuisances))
         if causes:
-            models[-1] = (models[-1][0], causes, found.fit.nuisances)
+            models[-1] = (models[-1][0], causes, fitted)
     else:
         models += [((), causes[: i + 1], problem.first) for i in range(len(causes))]
-    return [_settled(problem, *model, about) for model in models]
+    return [_settled(problem, *model, fitted, about) for model in models]
 
 
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
@@ -84,8 +85,11 @@ def _settled(
     static: tuple[Cause, ...],
     own: tuple[Cause, ...],
     nuisances: Array,
+    fitted: Array,
     about: Mapping[Hypothesis, float],
 ) -> Stage:
+    """A model at its best nuisances; from those of the fit where from the others no beam comes to
+    the last BPM that read one."""
     for share in SHARES:
         some = tuple(
             replace(c, amount=start + share * (c.amount - start))
@@ -93,6 +97,8 @@ def _settled(
         )  # fmt: skip
         there = replace(problem, fixed=(*problem.fixed, *some))
         point = fit_nuisances(there, own, nuisances)
+        if point.lost:
+            point = fit_nuisances(there, own, fitted)
         if not point.lost or not static:
             break
     if point.lost:

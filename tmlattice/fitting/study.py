@@ -7,6 +7,7 @@ folder as it ends, so a study that was stopped goes on where it was.
 import dataclasses
 import hashlib
 import json
+import os
 import zlib
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -240,13 +241,13 @@ def _case(job: tuple[str, str], values: dict[str, Any]) -> Case:
 
 
 def study_tune_fit(
-    lattice: str,
+    lattice: str | os.PathLike[str],
     methods: Sequence[str] = ("adam", "map", "sparse"),
     magnets: int | None = 40,
     *,
     scheduler: str | None = None,
     jobs: int | None = None,
-    folder: Path | None = None,
+    folder: str | os.PathLike[str] | None = None,
     progress: bool = True,
     **options: Any,
 ) -> list[Case]:
@@ -273,6 +274,8 @@ def study_tune_fit(
     unknown = [m for m in methods if m not in METHODS]
     if unknown or not methods:
         raise TmlatticeError(f"no method '{', '.join(unknown)}'; there are {', '.join(METHODS)}")
+    lattice = os.fspath(lattice)
+    folder = None if folder is None else Path(folder)
     ring = load_ring(lattice)
     need_monitors(ring)
     tasks = [(n, m) for n in spread_magnets(ring, magnets) for m in dict.fromkeys(methods)]

@@ -24,6 +24,7 @@ from tmlattice.importers.columns import (
     SDDS,
     SHEETS,
     as_frame,
+    is_sdds,
     label,
     of_matlab,
     read_columns,
@@ -316,7 +317,7 @@ def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:
         unit = cast("Unit | None", "um" if stated.unit == "µm" else stated.unit)
         return bring_turns(path, ring, options.turns, unit, stated)
     except MeasurementError as error:
-        if options.turns or ring is None or path.suffix.lower() not in SDDS:
+        if options.turns or ring is None or not is_sdds(path):
             raise
         columns = read_columns(path)
         if not isinstance(error, OtherFormatError):  # turns, with something wrong in them

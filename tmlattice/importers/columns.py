@@ -80,13 +80,18 @@ def read_columns(path: Path | Any) -> list[Column]:
     suffix = path.suffix.lower()
     if suffix in HDF5:
         found = _hdf5(path)
-    elif suffix in SDDS:
+    elif is_sdds(path):
         found = _sdds(path)
     else:
         found = _csv(path)
     if not found or not found[0].values:
         raise MeasurementError(f"{path}: no rows below the header; nothing was read")
     return found
+
+
+def is_sdds(path: Path) -> bool:
+    """Whether a file is one of SDDS by its name, or by what it begins with, as elegant's are."""
+    return path.suffix.lower() in SDDS or content_of(path, MeasurementError).startswith(b"SDDS")
 
 
 def label(source: Path | Any) -> str:
@@ -206,10 +211,14 @@ def _hdf5(path: Path) -> list[Column]:
     """A column for each array [row]; `x`, `y` [row, monitor] with a list of names are taken apart
     into a column a monitor. The unit is an attribute `unit` or `units`, or stands in the name."""
     content, attributes = read_apart("hdf5", path, "HDF5", MeasurementError)
-    units = {name: own.get("units", own.get("unit", "")) for name, own in attributes.items()}
-    for name, unit in units.items():
-        if not isinstance(unit, str):
+    units = {}
+    for name, own in attributes.items():
+        stated = [own[key] for key in ("units", "unit") if key in own]
+        if not all(isinstance(unit, str) for unit in stated):
             raise MeasurementError(f"'{path}': the unit of '{name}' is no text")
+        if len(set(stated)) > 1:
+            raise MeasurementError(f"'{path}': '{name}' has the units {' and '.join(stated)}")
+        units[name] = stated[0] if stated else ""
     return _apart(path, {name: (value, units[name]) for name, value in content.items()})
 
 
@@ -223,7 +232,7 @@ def of_matlab(path: Path, content: Mapping[str, Any]) -> list[Column]:
         if isinstance(value, dict):
             for key, own in value.items():
                 take(f"{name}/{key}" if name else key, own)
-        elif isinstance(value, list | np.ndarray):
+        elif isinstance(value, list | np.ndarray | float | int):
             arrays[name] = np.asarray(value), ""
 
     take("", dict(content))
@@ -253,6 +262,8 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
             continue
         array = np.asarray(value)
         if array.ndim == 0:  # about the file
+            if name.rsplit("/", 1)[-1].lower() in ("x", "y"):
+                raise MeasurementError(f"'{path}': '{name}' is one number; readings are a table")
             continue
         if array.dtype.kind not in "fiu" or array.ndim > 2:
             raise MeasurementError(
@@ -272,6 +283,10 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
             raise MeasurementError(
                 f"'{path}': '{name}' has {array.shape[1]} columns, and no list of names has as "
                 f"many entries ({', '.join(f'{n} {len(t)}' for n, t in texts.items()) or 'none'})"
+            )
+        if any(own != fits[0] and sorted(own) == sorted(fits[0]) for own in fits):
+            raise MeasurementError(
+                f"'{path}': two lists have the names of '{name}' in different orders; keep one"
             )
         plain, own = named(short)
         flat += [

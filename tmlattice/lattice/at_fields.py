@@ -10,7 +10,6 @@ its class or MADType where it has that field, else its strongest field at 2 cm f
 """
 
 import math
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -57,15 +56,11 @@ def _normal(strength: complex, order: int) -> tuple[float, float]:
 
 
 def straight(
-    element: Any, family: str, length: float, mad: str, roll: float, left_out: Counter[str]
+    element: Any, family: str, length: float, mad: str, roll: float, left_out: Callable[[str], None]
 ) -> tuple[Kind, Any]:
     """A thick multipole of AT; see `straight_magnet`."""
-
-    def count(reason: str) -> None:
-        left_out[reason] += 1
-
     strengths, own = strengths_of(element), _own_order(element, mad)
-    return straight_magnet(strengths, own, length, roll, family, count)
+    return straight_magnet(strengths, own, length, roll, family, left_out)
 
 
 def straight_magnet(
@@ -122,12 +117,12 @@ def straight_magnet(
 
 
 def thin(
-    element: Any, family: str, length: float, roll: float, left_out: Counter[str]
+    element: Any, family: str, length: float, roll: float, left_out: Callable[[str], None]
 ) -> tuple[Kind, Any]:
     """A multipole of integrated fields."""
     strengths = strengths_of(element) / (length or 1.0)
     if np.any(strengths[3:]):
-        left_out["thin multipoles above the sextupole"] += 1
+        left_out("thin multipoles above the sextupole")
     return "multipole", _combined(strengths, length, roll, family)
 
 
@@ -163,14 +158,14 @@ def _kind(strengths: Any, own: int | None) -> Kind:
 
 
 def bend(
-    element: Any, family: str, length: float, roll: float, left_out: Counter[str]
+    element: Any, family: str, length: float, roll: float, left_out: Callable[[str], None]
 ) -> tuple[Kind, Any]:
     """A bend with its edges, gradient and sextupole field; see `with_coils` for its others."""
     from tmlattice.lattice.ocelot import elements as ocelot
 
     strengths = strengths_of(element)
     if any(strengths[3:]):
-        left_out["orders of bends above the sextupole"] += 1
+        left_out("orders of bends above the sextupole")
     source = ocelot.SBend(
         l=length,
         angle=float(element.BendingAngle),

@@ -21,8 +21,7 @@ import logging
 import math
 import re
 import warnings
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,7 +37,7 @@ from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with
 from tmlattice.lattice.expressions import nothing_run
 from tmlattice.lattice.madx_language import split
 from tmlattice.lattice.mat_file import lattice_in, read_mat
-from tmlattice.lattice.parts import assembled
+from tmlattice.lattice.parts import Report, assembled
 from tmlattice.lattice.places import Place, corrector, corrector_pair, rotation
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 
@@ -109,7 +108,14 @@ def read_at(
         raise LatticeError(
             f"'{path}' cannot be read as an AT lattice ({message}); {advice}"
         ) from error
+    for message in dict.fromkeys(str(warning.message) for warning in caught):
+        if message.startswith(_ASSUMED):
+            warnings.warn(f"'{path}': by AT's reader: {message}", stacklevel=4)
     return ring_from_at(lattice, name, energy)
+
+
+_ASSUMED = ("More than 1 RingParam", "Inconsistent energy", "Non-integer number of cells")
+"""What warnings of AT's reader begin with that are of the ring."""
 
 
 def _list_of_m(path: Path) -> str:
@@ -169,7 +175,7 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     rest = float(lattice.particle.rest_energy) / 1e9
     light = rest < 2 * ELECTRON_GEV  # an electron, or AT's particle that is as fast as light
     design = Ring(name, (), energy_gev, mass=ELECTRON_GEV if light else rest)
-    left_out: Counter[str] = Counter()
+    report = Report()
     converted: list[Place] = []
     known: dict[int, list[Place]] = {}
     errors: dict[int, dict[str, float]] = {}
@@ -181,6 +187,10 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
             family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
             entrance, exit_ = _frame(element, family, design.map_energy)
             bare = _without_frame(element) if entrance else element
+
+            def left_out(reason: str, family: str = family, own: int = id(element)) -> None:
+                report.left_out(reason, family, own)
+
             own = _places(bare, family, design.map_energy, left_out)
             if shift := _shift(bare):
                 errors |= {id(source): shift for _, _, source in own}
@@ -188,9 +198,7 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         converted += known[id(element)]
     if not converted:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
-    if left_out:
-        what = ", ".join(f"{reason} ({count})" for reason, count in left_out.items())
-        warnings.warn(f"'{name}': left out of the model: {what}", stacklevel=3)
+    report.warn(name)
     return assembled(design, converted, errors, max(1, int(lattice.periodicity)))
 
 
@@ -232,7 +240,9 @@ def _shift(element: Any) -> dict[str, float]:
     return {k: v for k, v in (("dx", -T1[0]), ("dy", -T1[2])) if v}
 
 
-def _places(element: Any, family: str, energy: float, left_out: Counter[str]) -> list[Place]:
+def _places(
+    element: Any, family: str, energy: float, left_out: Callable[[str], None]
+) -> list[Place]:
     """What one AT element is in the ring: one element, but for correctors of both planes and bends
     with coils."""
     import at
@@ -257,7 +267,7 @@ def _as_tracked(
     family: str,
     own: list[Place],
     energy: float,
-    left_out: Counter[str],
+    left_out: Callable[[str], None],
 ) -> list[Place]:
     """An element, and behind it a matrix of what AT tracks otherwise: linear fringes, fields that
     a pass method lacks or has about another axis. AT integrates in steps that are fine enough."""
@@ -276,12 +286,12 @@ def _as_tracked(
     if np.abs((rest - np.eye(6))[:4, :5]).max() < SAME and np.abs(across).max() < SAME_KICK:
         return own
     name = f"{family}_rest"
-    left_out[f"what {element.PassMethod} has beyond the model and a first-order matrix"] += 1
+    left_out(f"what {element.PassMethod} has beyond the model and a first-order matrix")
     return [*own, (name, *_matrix(rest, name, 0.0, energy, across if across.any() else None))]
 
 
 def _convert(
-    element: Any, family: str, mad: str, energy: float, left_out: Counter[str]
+    element: Any, family: str, mad: str, energy: float, left_out: Callable[[str], None]
 ) -> tuple[Kind, Any]:
     """Kind and OCELOT element of one AT element."""
     import at
@@ -298,20 +308,20 @@ def _convert(
         return "marker", ocelot.Marker(eid=family)
     acts, method = _acts(element), element.PassMethod
     if length and method in SHORT:
-        left_out[f"that AT's {method} skips the length of an element"] += 1
+        left_out(f"that AT's {method} skips the length of an element")
     steps = float(np.ravel(getattr(element, "NumIntSteps", 10.0))[0])
     gradient = abs(strengths_of(element)[1]) if acts else 0.0
     if "Symplectic4" in method and gradient * length**2 > COARSE * max(steps, 1.0) ** 4:
-        left_out["the error of AT's integration in a few steps"] += 1
+        left_out("the error of AT's integration in a few steps")
     if passes_freely(element):
         if isinstance(element, at.Monitor) or mad in ("MONITOR", "HMONITOR", "VMONITOR"):
             return "monitor", ocelot.Monitor(l=length, eid=family)
         if not mad and isinstance(element, at.Marker) and str(element.FamName).casefold() == "bpm":
             return "monitor", ocelot.Monitor(l=length, eid=family)  # from before the class
         if _fields(element):
-            left_out[f"fields of magnets whose pass method is {method}"] += 1
+            left_out(f"fields of magnets whose pass method is {method}")
         for name in ACTS & {mad, type(element).__name__.upper()}:
-            left_out[f"what {name.lower()} does"] += 1
+            left_out(f"what {name.lower()} does")
         if length:
             return "drift", ocelot.Drift(l=length, eid=family)
         return "marker", ocelot.Marker(eid=family)
@@ -326,7 +336,7 @@ def _convert(
     if angle or (isinstance(element, at.Dipole) and not ahead):
         if method.startswith(_FIELDS):
             if ahead:
-                left_out["that AT tracks bends straight ahead by a pass method Str..."] += 1
+                left_out("that AT tracks bends straight ahead by a pass method Str...")
             return bend(element, family, length, roll, left_out)
     elif (acts or isinstance(element, at.Multipole)) and method.startswith(_FIELDS):
         return straight(element, family, length, mad, roll, left_out)
@@ -338,7 +348,7 @@ def _convert(
     name = type(element).__name__
     if name in ("Element", "Drift", "Marker", "Monitor"):
         name = method.removesuffix("Pass")
-    left_out[f"what {name} has beyond its first-order matrix"] += 1
+    left_out(f"what {name} has beyond its first-order matrix")
     if element.PassMethod.startswith(("GWig", "Wigg", "IdTable")):
         kind = "wiggler"
     return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source

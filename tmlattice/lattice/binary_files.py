@@ -33,8 +33,8 @@ MOST_REFERENCES = 300_000
 """Followed in a file of MATLAB 7.3: a ring of 10,000 elements of 30 fields."""
 MOST_OBJECTS = 10_000
 """Groups and data sets of a file that is no lattice: each is looked at."""
-MOST_ATTRIBUTE = 1 << 16
-"""Bytes of an attribute."""
+MOST_ATTRIBUTE, MOST_ATTRIBUTES = 1 << 16, 1000
+"""Bytes of an attribute, and attributes of one object."""
 
 
 class RefusedError(Exception):
@@ -220,6 +220,9 @@ class _Budget:
             path, item = waiting.pop()
             if isinstance(item, h5py.Dataset):
                 yield path, item
+            empty = not isinstance(item, h5py.Dataset) and not len(getattr(item, "keys", tuple)())
+            if empty and path.rsplit("/", 1)[-1].lower() in ("x", "y"):
+                raise RefusedError(f"'{path}' holds no data")
             if not isinstance(item, h5py.Group):
                 continue
             if (key := _identity(item)) in entered or path.count("/") > DEEPEST:
@@ -282,6 +285,8 @@ class _Budget:
 
     def attributes(self, item: Any) -> dict[str, Any]:
         """All attributes that are numbers or texts."""
+        if len(item.attrs) > MOST_ATTRIBUTES:
+            raise RefusedError(f"'{item.name}' has more than {MOST_ATTRIBUTES:,} attributes")
         found = {name: self._attribute(item, name) for name in item.attrs}
         return {name: value for name, value in found.items() if value is not None}
 
@@ -351,9 +356,15 @@ def sdds(path: str) -> dict[str, tuple[Any, str]]:
     """Columns, arrays and parameters of an SDDS file with their units; by the package `sdds`."""
     import sdds as package
 
+    head = Path(path).read_bytes().partition(b"&data")[0].decode("latin-1")
+    if column := re.search(r'&column\b[^&]*?\bname\s*=\s*"?([^,\s"]+)', head):
+        raise RefusedError(
+            f"columns such as '{column[1]}' of SDDS are not read; write them as CSV "
+            "(sddsprintout FILE OUT.csv -columns -spreadsheet=csv)"
+        )
     content = package.read(path)
     if unread := [name for name in content.definitions if content.values.get(name) is None]:
-        raise RefusedError(f"columns such as '{unread[0]}' of SDDS are not read; write them as CSV")
+        raise RefusedError(f"'{unread[0]}' has no values")
     return {
         name: (content.values[name], str(getattr(definition, "units", None) or ""))
         for name, definition in content.definitions.items()

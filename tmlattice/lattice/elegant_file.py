@@ -68,6 +68,7 @@ _INERT: dict[str, dict[str, float]] = {
 
 _MOVED = ("DX", "DY", "DZ", "TILT")
 _STEERED = ("HKICK", "VKICK", "HCALIBRATION", "VCALIBRATION")
+_MONITORS, _CAVITIES = ("MONI", "HMON", "VMON"), ("RFCA", "RFCW", "MODRF", "RAMPRF")
 _BENDS = ("SBEN", "RBEN", "CSBEND", "CSRCSBEND", "KSBEND", "NIBEND", "CCBEND")
 _OWN: dict[tuple[str, ...], tuple[str, tuple[str, ...]]] = {
     ("QUAD", "KQUAD"): ("quadrupole", ("L", "K1", "FSE", "BORE", "B", *_MOVED, *_STEERED)),
@@ -86,8 +87,8 @@ _OWN: dict[tuple[str, ...], tuple[str, tuple[str, ...]]] = {
     )),
     ("HKICK", "VKICK", "EHKICK", "EVKICK"): ("corrector", ("L", "KICK", "TILT", "CALIBRATION")),
     ("KICKER", "EKICKER"): ("corrector", ("L", "TILT", *_STEERED)),
-    ("MONI", "HMON", "VMON"): ("monitor", ("L",)),
-    ("RFCA", "RFCW", "MODRF", "RAMPRF"): ("cavity", ("L", "VOLT", "FREQ", "CHANGE_P0")),
+    _MONITORS: ("monitor", ("L",)),
+    _CAVITIES: ("cavity", ("L", "VOLT", "FREQ", "CHANGE_P0")),
     ("SOLE",): ("solenoid", ("L", "KS", "B", "DX", "DY", "DZ")),
     ("EMATRIX",): ("matrix", (
         "L", "TILT", "DX", "DY", "DZ", "DELTAP", *(f"C{i}" for i in range(1, 7)),
@@ -130,7 +131,8 @@ NONLINEAR = frozenset({
 _DEFAULTS = {"CALIBRATION": 1.0, "HCALIBRATION": 1.0, "VCALIBRATION": 1.0, "FINT": 0.5,
              "FINT1": -1.0, "FINT2": -1.0, "FACTOR": 1.0, "EDGE1_EFFECTS": 1.0,
              "EDGE2_EFFECTS": 1.0, "ETILT_SIGN": 1.0, "FREQ": 500e6,
-             "LEFFECTIVE": -1.0, "DIRECTION": 1.0}  # fmt: skip
+             "LEFFECTIVE": -1.0, "DIRECTION": 1.0, "XCALIBRATION": 1.0,
+             "YCALIBRATION": 1.0}  # fmt: skip
 
 
 def read_elegant(
@@ -390,6 +392,11 @@ class _Reader:
             return
         head, *given = _split(rest) or [""]
         parent = self.elements.get(_bare(head))
+        if parent and _bare(head) in ALL_CLASSES and (parent.values or parent.cls != _bare(head)):
+            raise LatticeError(
+                f"'{plain(_bare(head), 60)}' is an element and a class; rename the element"
+            )
+        seen = set[str]()
         cls = parent.cls if parent else _class_of(head)
         values: dict[str, float | str] = dict(parent.values) if parent else {}
         for item in given:
@@ -397,6 +404,9 @@ class _Reader:
             key = _attribute(cls, key.strip().upper())
             if not sign or not value.strip():
                 raise LatticeError(f"'{plain(item, 60)}' gives no value")
+            if key in seen:
+                raise LatticeError(f"{plain(key, 40)} of '{plain(name, 60)}' is stated twice")
+            seen.add(key)
             values[key] = self._value(cls, key, value.strip())
         self.elements[name] = _Element(name, cls, values, where)
 
@@ -477,7 +487,8 @@ class _Reader:
             raise LatticeError(
                 f"{named} acts on the beam and is not modelled; take it out, or replace it"
             )
-        if cls in _INERT and element.values.get("ON_PASS", -1.0) == -1.0:
+        once = element.values.get("ON_PASS", -1.0) != -1.0
+        if cls in _INERT and not (once and not element.values.get("FORCE_MODIFY_MATRIX")):
             for key, still in _INERT[cls].items():
                 if element.values.get(key, still) != still:
                     raise LatticeError(
@@ -485,6 +496,9 @@ class _Reader:
                     )
         if cls in _COLLECTIVE:
             self.report.left_out(f"what {cls} does", name)
+        if cls in ("DRIF", "EDRIFT"):
+            for key in element.values.keys() - NO_EFFECT - {"L"}:
+                self.report.left_out(key, name)
         if cls in (*_DRIFTS, *_SILENT, *_COLLECTIVE, *_INERT):
             length = element.number("L")
             return [Part(name, "drift" if length else "marker", {"l": length}, where)]
@@ -493,19 +507,18 @@ class _Reader:
                 continue
             higher = cls == "EMATRIX" and key[0] in "TQU" and key[1:].isdigit()
             bend = key == "K3" and cls in ("CSBEND", "CCBEND", "CSRCSBEND", "KSBEND")
-            if higher or bend or key in NONLINEAR:
+            kick = key == "B2" and _FAMILY[cls] == "corrector"
+            if key in NO_EFFECT or cls in _FAMILY_WITHOUT.get(key, ()):
+                continue
+            if higher or bend or kick or key in NONLINEAR or cls in (*_MONITORS, *_CAVITIES):
                 self.report.left_out(key, name)
-            elif key not in NO_EFFECT and not self._harmless(cls, key, value):
+            else:
                 raise LatticeError(
                     f"the attribute {plain(key, 40)} of {named} is not modelled; set it to 0 or "
                     "take it out"
                 )
         made = getattr(self, f"_as_{_FAMILY[cls]}")(element, name, turned, inner)
         return made if isinstance(made, list) else [made]
-
-    def _harmless(self, cls: str, key: str, value: float | str) -> bool:
-        """Whether an attribute of this class has no effect on the optics."""
-        return cls in _FAMILY_WITHOUT.get(key, ()) or _FAMILY[cls] in ("monitor", "cavity")
 
     def _moved(self, element: _Element) -> dict[str, float]:
         keys = {"dx": "DX", "dy": "DY", "ds": "DZ", "tilt": "TILT"}
@@ -698,7 +711,7 @@ class _Reader:
 
 _FAMILY_WITHOUT: dict[str, tuple[str, ...]] = {
     "EDGE1_EFFECTS": ("QUAD", "KQUAD"), "EDGE2_EFFECTS": ("QUAD", "KQUAD"),
-    "B2": ("HKICK", "VKICK", "KICKER"), "PITCH": ("QUAD", "KQUAD", "KSEXT", "KOCT"),
+    "PITCH": ("QUAD", "KQUAD", "KSEXT", "KOCT"),
     "YAW": ("QUAD", "KQUAD", "KSEXT", "KOCT"), "ANGLE": ("EMATRIX",),
     **dict.fromkeys(("CSR", "BINS", "BIN_SIZE", "BIN_ONCE", "BIN_RANGE_FACTOR", "SG_HALFWIDTH",
                      "SG_ORDER", "SGDERIV_HALFWIDTH", "SGDERIV_ORDER", "TRAPAZOID_INTEGRATION",
@@ -709,6 +722,10 @@ _FAMILY_WITHOUT: dict[str, tuple[str, ...]] = {
                      "HIGH_FREQUENCY_CUTOFF1", "WAKE_FILTER_FILE", "WFF_FREQ_COLUMN",
                      "WFF_REAL_COLUMN", "WFF_IMAG_COLUMN"), ("CSRCSBEND",)),
     **dict.fromkeys(("PERIODS", "ON_PASS", "EXCLUDE_FLOOR"), ("WIGGLER", "ROTATE")),
+    **dict.fromkeys(("WEIGHT", "SETPOINT", "XSETPOINT", "YSETPOINT", "CO_FITPOINT", "READOUT",
+                     "XREADOUT", "YREADOUT", "STORE_TURN_BY_TURN"), _MONITORS),
+    **dict.fromkeys(("PHASE", "Q", "PHASE_REFERENCE", "CHANGE_T", "FIDUCIAL", "T_REFERENCE",
+                     "LOCK_PHASE"), _CAVITIES),
 }  # fmt: skip
 """Attributes without effect on the optics of some classes: PITCH and YAW are ignored by elegant's
 default alignment, and fringes of quadrupoles act by their integrals."""

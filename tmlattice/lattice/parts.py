@@ -116,18 +116,19 @@ class Report:
     """What a reader and the model leave out: names by reason, in one warning."""
 
     def __init__(self) -> None:
-        self.names: dict[str, dict[str, None]] = {}
+        self.names: dict[str, dict[tuple[str, int], None]] = {}
 
-    def left_out(self, reason: str, name: str) -> None:
-        """Note that something of this element is left out."""
-        self.names.setdefault(reason, {})[name] = None
+    def left_out(self, reason: str, name: str, own: int = 0) -> None:
+        """Note that something of this element is left out; several elements of one name are
+        counted by their `own`."""
+        self.names.setdefault(reason, {})[name, own] = None
 
     def warn(self, ring: str) -> None:
         """Warn of all that was noted, if anything was."""
         if not self.names:
             return
         what = "; ".join(
-            f"{reason} of {first_of(list(names), 3)} ({len(names)})"
+            f"{reason} of {first_of(list(dict.fromkeys(n for n, _ in names)), 3)} ({len(names)})"
             for reason, names in self.names.items()
         )
         warnings.warn(f"'{ring}': left out of the model: {what}", stacklevel=4)
@@ -159,6 +160,8 @@ def ring_of_parts(
     """
     if not parts:
         raise LatticeError(f"'{name}' has no elements; name another sequence with sequence=")
+    if not charge:
+        raise LatticeError("the beam's particle has the charge 0; state another")
     mass = ELECTRON_GEV if mass < 2 * ELECTRON_GEV else mass
     design = Ring(name, (), energy, mass=mass)
     report = report or Report()

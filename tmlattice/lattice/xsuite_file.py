@@ -178,6 +178,8 @@ def _particle(*places: Mapping[str, Any]) -> tuple[float, float, float | None]:
     mass = ELECTRON_GEV if mass is None else 1e-9 * mass
     gamma, beta = number("gamma0"), number("beta0")
     energy: float | None = None
+    if momentum and momentum < 0:
+        raise LatticeError(f"the reference particle has the momentum {momentum:g} eV/c")
     if momentum:
         energy = math.hypot(1e-9 * momentum, mass)
     elif gamma:
@@ -800,10 +802,17 @@ class _Bend:
         self.fields, self.reader = fields, reader
         self.length = _way_of(fields)
         self.angle = fields.number("angle")
-        if "angle" not in fields.values and "h" in fields.values:
-            self.angle = fields.number("h") * self.length
+        if "h" in fields.values:
+            bent = fields.number("h") * self.length
+            if "angle" not in fields.values:
+                self.angle = bent
+            elif fields.cls != "RBend" and not math.isclose(bent, self.angle, abs_tol=1e-6):
+                raise LatticeError(
+                    f"{fields.named} has the angle {self.angle:.6g} rad, and {bent:.6g} rad by its "
+                    "h and length; leave one out"
+                )
         self.curvature = self.angle / self.length if self.length else 0.0
-        fields.used |= {"length_straight", "rbend_angle_diff"}
+        fields.used |= {"length_straight", "rbend_angle_diff", "length"}
         stated, from_h = fields.values.get("k0"), fields.values.get("k0_from_h")
         fields.used.add("k0")
         if stated == "from_h" or from_h or (stated is None and from_h is None):
@@ -933,7 +942,13 @@ def _way_of(fields: _Fields) -> float:
         half, difference = angle / 2, fields.number("rbend_angle_diff") / 2
         if abs(angle) < 1e-10 or not straight:
             return straight
-        return angle * straight / (math.sin(half - difference) + math.sin(half + difference))
+        arc = angle * straight / (math.sin(half - difference) + math.sin(half + difference))
+        if "length" in fields.values and abs(fields.number("length") - arc) > 1e-6:
+            raise LatticeError(
+                f"{fields.named} has the length {fields.number('length'):.6g} m, and {arc:.6g} m "
+                "by its length_straight and angle; leave one out"
+            )
+        return arc
     length = fields.number("length")
     for key in ("active_length", "inactive_front", "inactive_back"):
         length += fields.number(key) if key in fields.values else 0.0

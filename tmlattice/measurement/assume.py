@@ -63,9 +63,11 @@ def assume(data: Data, names: Iterable[str], ring_monitors: Sequence[str]) -> Da
 
     Raises:
         UnknownNameError: no such assumption, or a monitor that the ring does not have.
-        MeasurementError: one without meaning for these data.
+        MeasurementError: one without meaning for these data, or one that is named twice.
     """
     names = list(names)
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise MeasurementError(f"the assumption '{twice[0]}' is named twice; name it once")
     if names:
         data = in_beam_order(data, ring_monitors)
     for name in names:
