@@ -220,7 +220,7 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
         (lambda d: {"LocoMeasData_M": d["M"] / 1e-4}, "not the response per rad"),
         (lambda d: {"LocoMeasData_Eta": -d["Eta"], "LocoMeasData_M": np.concatenate(
             [-d["M"][:16], d["M"][16:]])}, "--assume x-reversed"),
-        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-exchanged"),
+        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-swapped"),
         (lambda d: {"LocoMeasData_M": d["M"][np.random.default_rng(1).permutation(len(d["M"]))]},
          "the data are not those of"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 3, -1, 1)[:, None]},

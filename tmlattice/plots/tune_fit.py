@@ -168,7 +168,8 @@ SMALLEST = 1e-9
 
 
 def plot_study(ring: "Ring", cases: "Sequence[Case]", figure: Figure | None = None) -> Figure:
-    """|dQx| and |dQy| of every case against the place of its magnet, one colour a method.
+    """|dQx| and |dQy| of every case against the place of its magnet, a colour and a marker a
+    method.
 
     Cases with an unstable ring, or without a prediction, are crosses at the foot.
     """
@@ -177,14 +178,15 @@ def plot_study(ring: "Ring", cases: "Sequence[Case]", figure: Figure | None = No
     without = sorted({c.s for c in cases if c.absolute_error is None and np.isfinite(c.s)})
     for plane, name in enumerate("xy"):
         ax = grid[plane]
-        for colour, method in enumerate(methods):
+        for k, (method, marker) in enumerate(zip(methods, "os^Dv<>", strict=False)):
+            colour = METHOD_COLOURS.get(method, f"C{4 + k}")
             good = [c for c in cases if c.method == method and c.absolute_error is not None]
             errors = [max(c.absolute_error[plane], SMALLEST) for c in good if c.absolute_error]
             label = method
             if errors:
                 label += f", median {np.median(errors):.1e}"
-                ax.axhline(float(np.median(errors)), color=f"C{colour}", linewidth=0.8, alpha=0.6)
-            ax.plot([c.s for c in good], errors, ".", color=f"C{colour}", ms=4, label=label)
+                ax.axhline(float(np.median(errors)), color=colour, linewidth=0.8, alpha=0.6)
+            ax.plot([c.s for c in good], errors, marker, color=colour, ms=3, label=label)
         if without:
             ax.plot(without, np.full(len(without), 0.03), "x", color="0.5", ms=4,
                     transform=ax.get_xaxis_transform(), label="no tune")  # fmt: skip
