@@ -391,7 +391,7 @@ def test_launches_and_noise_that_nobody_states_are_fitted_beside(folders, tmp_pa
         ("response", [], "is an orbit response"),
         ("corrector", [], "shot 1 has settings"),
         ("axis", [], "every launch is on the axis"),
-        ("strange", [], "no monitor 'last_c'; did you mean"),
+        ("strange", [], "no BPM 'last_c'; did you mean"),
     ],
 )
 def test_tune_fit_refuses_a_measurement(folders, tmp_path, name, more, words):

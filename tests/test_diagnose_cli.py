@@ -173,7 +173,7 @@ def test_reference_and_single_shot(folders, tmp_path):
         ([SMALL, "response"], "the noise of the readings is not stated"),
         ([SMALL, "weak", "--reference", "response"], "give a reference of the same kind"),
         ([SMALL, "weak", "--reference", "nowhere"], "no measurement folder"),
-        ([SMALL, "strange"], "no monitor 'v1'; "),
+        ([SMALL, "strange"], "no BPM 'v1'; "),
         ([SMALL, "weak", "--effects", "quadrupole_gradiant"], "did you mean 'quadrupole_gradient'"),
         ([SMALL, "weak", "--effects", ","], "--effects"),
         ([SMALL, "weak", "--background", "quadrupole_roll=a"], "is no rms"),

@@ -280,7 +280,7 @@ def test_a_frame_that_lacks_a_column_names_it(small_ring, measured):
         Measurement.from_dataframe(frame.drop(columns="shot"))
     with pytest.raises(MeasurementError, match="holds first turns, and not an orbit response"):
         OrbitResponse.from_dataframe(frame, ring=small_ring)
-    with pytest.raises((MeasurementError, UnknownNameError), match="no monitor 'nowhere'"):
+    with pytest.raises((MeasurementError, UnknownNameError), match="no BPM 'nowhere'"):
         tmlattice.diagnose(small_ring, frame.assign(monitor="nowhere").iloc[:1])
     frame.attrs["units"] = "mm"
     with pytest.raises(MeasurementError, match="give the unit of each column"):

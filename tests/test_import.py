@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import struct
 
 import at
@@ -552,6 +553,16 @@ def test_parts_that_are_missing_are_named(esrf, parts, told):
 def test_damaged_hdf5_is_a_sentence(esrf, tmp_path):
     (tmp_path / "orm.h5").write_bytes((esrf / "orm.h5").read_bytes()[:900])
     with pytest.raises(TmlatticeError, match="cannot be read as HDF5"):
+        bring_in([tmp_path / "orm.h5", esrf / "names.json", esrf / "ring.mat"])
+
+
+def test_orbits_up_and_down_of_two_sizes_are_rejected(esrf, tmp_path):
+    shutil.copy(esrf / "orm.h5", tmp_path)
+    with h5py.File(tmp_path / "orm.h5", "r+") as file:
+        down = file["raw_down"][:-1]
+        del file["raw_down"]
+        file["raw_down"] = down
+    with pytest.raises(MeasurementError, match="raw_down has the shape"):
         bring_in([tmp_path / "orm.h5", esrf / "names.json", esrf / "ring.mat"])
 
 

@@ -111,7 +111,7 @@ def test_channels_of_an_orbit_response_are_bpms_and_correctors(tmp_path, small_r
     (tmp_path / "a.csv").write_text("shot,D1 x [mm]\n0,1\n")  # correctors' names are in no way
     assert machine.read(tmp_path / "a.csv", small_ring).monitors == (monitors[1],)
     (tmp_path / "m.toml").write_text("\n".join(lines).replace('"d3"', '"bmp*"'))
-    with pytest.raises(package.errors.UnknownNameError, match="no monitor 'bmp"):
+    with pytest.raises(package.errors.UnknownNameError, match="no BPM 'bmp"):
         load_machine_file(tmp_path / "m.toml").read(tmp_path / "r.csv", small_ring)
 
 

@@ -15,7 +15,7 @@ from tmlattice.effects import CATALOGUE, RingEffect, apply, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine
-from tmlattice.machine.at_stored import _orbit
+from tmlattice.machine.at_stored import stored_orbit
 from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.observe.stored import cavities_of
 
@@ -124,7 +124,8 @@ def test_tunes_and_modes_with_rf_vs_at(request, which):
     beam, deaf = StoredBeam(model, felt), StoredBeam(model)
     engine = AtEngine(ring, causes)
     line, with_rf, late = engine.stored_line({})
-    state = at_orbit.closed(partial(engine.one_pass, with_rf), _orbit(engine, line, late), range(6))
+    before = stored_orbit(engine, line, late)
+    state = at_orbit.closed(partial(engine.one_pass, with_rf), before, range(6))
     steps = np.diag(at_orbit.STEPS)
     moving = np.asfortranarray(np.vstack([state + steps, state - steps]).T)
     seen = engine.run(with_rf, moving.T, 1, moving)[:, 0]

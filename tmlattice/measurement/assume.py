@@ -89,7 +89,7 @@ def in_beam_order(data: Data, ring_monitors: Sequence[str]) -> Data:
     own: Any = data
     if isinstance(data, TuneReading) or own.monitors == tuple(ring_monitors):
         return data
-    names = Names("monitor", ring_monitors)
+    names = Names("BPM", ring_monitors)
     at = [names[name] for name in own.monitors]
     if at == sorted(at):
         return data

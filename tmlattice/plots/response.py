@@ -1,6 +1,7 @@
 """Figures of an orbit response's diagnosis."""
 
 from collections.abc import Iterator
+from textwrap import wrap
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,6 +20,12 @@ RESIDUALS = (
     ("dispersion_rms", "RF response", "C2", "^"),
 )
 """Held-out residuals of a step: attribute, label, colour, marker."""
+
+
+def step_labels(result: Diagnosis) -> list[list[str]]:
+    """What each step adds, in lines that fit under its place."""
+    names = (s.effect.replace("monitor_", "BPM_").replace("_", " ") for s in result.steps)
+    return [wrap(name, 16) for name in names]
 
 
 def gradient_errors(result: Diagnosis) -> list[tuple[Element, float, float]]:
@@ -127,8 +134,7 @@ def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
     ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
     plain_log(ax)
     ax.set_ylabel("held-out rms [µm]")
-    names = [s.effect.replace(", ", ",\n").replace("_", " ") for s in steps]
-    ax.set_xticks(at, names, fontsize=7)
+    ax.set_xticks(at, ["\n".join(lines) for lines in step_labels(result)], fontsize=7)
     ax.grid(alpha=0.25)
     ax.legend(frameon=False, fontsize=8)
     return ax
@@ -141,7 +147,7 @@ def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
     ax.errorbar(
         s, amount, sigma, fmt="s", color="tab:red", ecolor="0.6", markersize=3, elinewidth=0.8
     )
-    named = {e for f in result.findings for e in f.elements} | {s.element for s in result.suspects}
+    named = {one.element for one in (*result.findings, *result.suspects)}
     for element, value, _ in gradient_errors(result):
         if element.name in named:
             ax.annotate(element.name, (element.s, value), xytext=(5, 0), va="center",

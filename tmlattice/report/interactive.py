@@ -33,7 +33,7 @@ from tmlattice.plots.diagnosis import (
     thresholds,
 )
 from tmlattice.plots.readings import AFTER, BEFORE, design_readings, worst_shot
-from tmlattice.plots.response import RESIDUALS, gradient_errors
+from tmlattice.plots.response import RESIDUALS, gradient_errors, step_labels
 from tmlattice.report.amounts import amount_text, words
 from tmlattice.speaks import micrometres
 
@@ -405,9 +405,9 @@ def steps(diagnosis: Diagnosis) -> Figure:
     traces.append(
         _trace([0, len(kept) - 1], [noise, noise], f"noise {noise:.2g} µm", "@faint", dash="dot")
     )
-    names = [as_plain("\n".join(wrap(step.effect.replace("_", " "), 16))) for step in kept]
+    names = [as_plain("\n".join(lines)) for lines in step_labels(diagnosis)]
     layout = _layout(
-        400, xaxis={"tickvals": at, "ticktext": names, "automargin": True},
+        400, xaxis={"tickvals": at, "ticktext": names, "automargin": True, "zeroline": False},
         yaxis=_axis("held-out rms [µm]", type="log", tickvals=_ONE_TWO_FIVE),
     )  # fmt: skip
     return {"data": traces, "layout": layout}

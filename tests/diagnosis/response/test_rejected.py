@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -43,7 +44,9 @@ def day(ring_kicking_x, tmp_path_factory):
     words = ["diagnose", folder / "ring.json", folder / "day", "--lattice-out",
              folder / "found.json", "--json", folder / "found.diagnosis.json", "--effects",
              "quadrupole_gradient,monitor_gain_x,monitor_gain_y,monitor_swap"]  # fmt: skip
-    tmlattice(*words, cwd=folder, check=0)
+    (folder / "ring.json.known.json").write_text("{}")
+    done = tmlattice(*words, cwd=folder, check=0)
+    assert re.search(r"known\.json'\s+is\s+not\s+used.*--reference", done.stdout, re.DOTALL)
     return ring, measured, folder
 
 
