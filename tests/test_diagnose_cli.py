@@ -8,6 +8,7 @@ import sys
 from html.parser import HTMLParser
 
 import jsonschema
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from command import tmlattice
@@ -19,6 +20,8 @@ from tmlattice.effects import Cause
 from tmlattice.files import write_json
 from tmlattice.machine import simulate
 from tmlattice.measurement import OrbitResponse, write_measurement
+from tmlattice.plots.diagnosis import figures, gap_axes, plot_gap, plot_scan
+from tmlattice.report import interactive
 from tmlattice.report.plain import report_text
 from tmlattice.report.text import amount_text, least_text, probability_text
 
@@ -291,10 +294,6 @@ def test_what_cannot_be_seen_is_not_given_a_number():
 # --- the figures ----------------------------------------------------------------------------------
 @pytest.mark.parametrize("verdict", list(CASES))
 def test_every_verdict_has_its_figures(diagnoses, verdict):
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import figures
-
     names = []
     for name, caption, figure in figures(diagnoses[verdict]):
         names.append(name)
@@ -308,10 +307,6 @@ def test_every_verdict_has_its_figures(diagnoses, verdict):
 
 
 def test_scan_figure_shows_the_scan_that_saw_the_fault(diagnoses):
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import plot_scan
-
     diagnosis = diagnoses["identified"]
     figure = plot_scan(diagnosis)
     ax = figure.axes[0]
@@ -328,10 +323,6 @@ def test_scan_figure_shows_the_scan_that_saw_the_fault(diagnoses):
 
 
 def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import plot_gap
-
     diagnosis = diagnoses["identified"]
     ax = plot_gap(diagnosis)
     lengths = [bar.get_width() for bar in ax.patches]
@@ -342,11 +333,6 @@ def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
 
 def test_a_gap_of_a_model_that_loses_the_beam_is_drawn(diagnoses):
     """In the page, too, whose numbers are JSON."""
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import plot_gap
-    from tmlattice.report import interactive
-
     diagnosis = diagnoses["identified"]
     first, *others = diagnosis.heldout.misfits
     lost = dataclasses.replace(first, rms=np.nan, chi2_per_dof=np.nan)
@@ -363,10 +349,6 @@ def test_a_gap_of_a_model_that_loses_the_beam_is_drawn(diagnoses):
 @pytest.mark.parametrize("count", [1, 3, 8])
 def test_names_under_the_bars_of_the_gap_do_not_overlap(diagnoses, count):
     """Long names of many findings, each beside its own bar."""
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import gap_axes, plot_gap
-
     diagnosis = diagnoses["identified"]
     (cause,), (error,) = diagnosis.causes, diagnosis.errors
     long = Cause("corrector_kick_x", "steerer_of_the_long_straight_section_north_supply_17", 1e-5)

@@ -436,8 +436,6 @@ def test_damaged_mat_files_are_a_sentence(simulated, tmp_path):
 
 def save_as_hdf5(path, variables):
     """A MATLAB 7.3 file, as MATLAB writes it: transposed arrays, cells of references."""
-    import h5py
-
     with h5py.File(path, "w", userblock_size=512) as file:
         references = file.create_group("#refs#")
 
@@ -482,8 +480,6 @@ def test_matlabs_file_of_version_7_3_is_the_same(simulated, brought, tmp_path):
 @pytest.fixture(scope="module")
 def esrf(simulated, tmp_path_factory):
     """The same response as the ESRF's files: inputs by name, kicks inside sextupoles."""
-    import h5py
-
     place = tmp_path_factory.mktemp("esrf")
     data, correctors = simulated["LocoMeasData"], simulated["CMData"]
     places = [*correctors["HCMIndex"].astype(int) - 1, *correctors["VCMIndex"].astype(int) - 1]

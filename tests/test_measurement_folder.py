@@ -13,7 +13,7 @@ from shared import measured_data, valid
 
 from tmlattice import Measurement, OrbitResponse, read_measurement, write_measurement
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement import RfStep, measurement_writer, read_truth, write_truth
+from tmlattice.measurement import RfStep, measurement_writer, read_truth, rows, write_truth
 
 
 def same(a, b):
@@ -275,8 +275,6 @@ def test_damaged_table_names_its_line(folder, table, line, words):
 
 
 def test_damage_behind_the_first_chunk_names_its_line(folder, monkeypatch):
-    from tmlattice.measurement import rows
-
     monkeypatch.setattr(rows, "_CHUNK", 3)
     table = [HEADER, *(f"0,{t},bpm_swl_61,1e-3,1e-3" for t in range(10))]
     assert read_measurement(folder(table=table)).readings.shape[1] == 10

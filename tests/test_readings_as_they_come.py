@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command import tmlattice
 from conftest import SMALL
+from scipy.io import savemat
 
 from tmlattice import Cause, read_measurement, simulate
 from tmlattice.errors import MeasurementError, UnknownNameError
@@ -363,8 +364,6 @@ def test_columns_that_are_not_read_are_named(small_ring, data, tmp_path):
 
 @pytest.mark.parametrize("form", ["arrays", "structure", "array of structures", "a row a monitor"])
 def test_readings_of_matlab(small_ring, data, tmp_path, form):
-    from scipy.io import savemat
-
     x, y = (1e3 * data.readings[:, 0, :, i] for i in range(2))
     names = np.array(data.monitors, object)
     content = {

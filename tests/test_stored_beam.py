@@ -16,7 +16,7 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.at_stored import stored_orbit
-from tmlattice.machine.stored_beam import simulate_turns
+from tmlattice.machine.stored_beam import simulate_orbits, simulate_turns
 from tmlattice.observe.stored import cavities_of
 
 WRONG = [
@@ -177,8 +177,6 @@ def test_an_unstable_ring_has_no_modes(small_ring):
 
 def test_a_bends_field_is_spread_over_its_arc(small_ring):
     """As one kick by the whole angle in the middle it made an orbit that was 1.6e-3 too large."""
-    from tmlattice.machine.stored_beam import simulate_orbits
-
     for place in ("bend::3", "bend::16"):
         causes = [Cause("dipole_field", place, 2.5e-4)]
         at = simulate_orbits(small_ring, causes, noise=0.0).measured.orbit[0]

@@ -10,6 +10,7 @@ from tmlattice import diagnose
 from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
+from tmlattice.machine.stored_beam import simulate_orbits
 from tmlattice.measurement import TuneReading
 
 KINDS = ("turn_by_turn", "closed_orbit", "dispersion", "tunes")
@@ -99,8 +100,6 @@ def test_another_ring(small_ring, sound):
 
 
 def test_orbits_whose_correctors_were_set_tell_their_sign(small_ring):
-    from tmlattice.machine.stored_beam import simulate_orbits
-
     settings = [{"v6": {"kick": 1e-4}}, {"v6": {"kick": -1e-4}}, {}]
     data = simulate_orbits(small_ring, [], shots=3, settings=settings, seed=1).measured
     assert check_data(small_ring, data).status != "wrong"

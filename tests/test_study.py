@@ -76,7 +76,7 @@ def test_summary_counts_coverage_and_right_magnets():
     entry = summarise([*cases, broken])["methods"]["sparse"]
     assert (entry["predicted"], entry["failed"]) == (3, 1)
     assert entry["coverage"]["x"] == pytest.approx(2 / 3)
-    assert entry["right"] == pytest.approx(2 / 3)
+    assert entry["right"] == 2 / 4
     assert entry["abs_dq"]["x"]["worst"] == 3.0
 
 

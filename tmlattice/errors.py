@@ -125,6 +125,6 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     near = near or [k for k in original if name and name.casefold() in k][:3]
     shown = [original[k] for k in near] or known[:3]
     offer = [f"'{k}'" for k in shown]
-    known_are = f"known are {', '.join(offer)}, ..."
+    known_are = f"known: {', '.join(offer)}{', ...' * (len(known) > len(offer))}"
     question = f"did you mean {' or '.join(offer)}?" if near else known_are
     return UnknownNameError(f"no {kind} '{name}'; {question}" if shown else f"no {kind} '{name}'")

@@ -67,14 +67,16 @@ def plot_orbit_fit(outcome: "TuneFit") -> Figure:
             if magnet is not None:
                 ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
             ax.grid(alpha=0.25)
-    grid[0].legend(loc="upper right", ncols=5, fontsize="small", framealpha=0.9)
-    if magnet is None or outcome.change is None:
-        grid[0].set_title(f"First turn of {outcome.source or 'a measurement'}")
-    else:
-        grid[0].set_title(
+    grid[0].legend(
+        loc="lower right", bbox_to_anchor=(1, 1), ncols=5, fontsize="small", frameon=False
+    )
+    title = f"First turn of {outcome.source or 'a measurement'}"
+    if magnet is not None and outcome.change is not None:
+        title = (
             f"First turn with {outcome.magnet} changed by {100 * outcome.change:+g} % "
             f"(dotted, s = {magnet.s:.1f} m)"
         )
+    grid[0].set_title(title, loc="left", fontsize="medium")
     return figure
 
 
@@ -97,7 +99,7 @@ def plot_loss(
     penalty = rate * np.asarray(fit.penalty)
     if (penalty > 0).any():
         label = f"{rate:g} x {fit.options['regularization']} penalty"
-        ax.semilogy(np.where(penalty > 0, penalty, np.nan), color="C2", label=label)
+        ax.semilogy(np.where(penalty > 0, penalty, np.nan), color="C0", label=label)
     if floor:
         ax.axhline(floor, color="k", linestyle="--", linewidth=0.9, label="noise alone")
     for name, loss in (others or {}).items():
@@ -106,7 +108,7 @@ def plot_loss(
     ax.set_xlabel("epoch")
     ax.set_ylabel("loss [m²]")
     ax.grid(alpha=0.25)
-    ax.legend(fontsize="small")
+    ax.legend(fontsize="small", loc="center right")
     return ax
 
 

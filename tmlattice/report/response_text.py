@@ -278,7 +278,7 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
         lines += columns(step_rows(result.rejected_steps), width, right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.common_factors is not None:
-        lines += ["", "Common factors of the gradients, and single magnets:"]
+        lines += ["", "Common factors of the gradients:"]
         for name, amount, count, square, makes in common_factor_rows(result):
             of = "" if count == "1" else f"{count} magnets, "
             factor = f"{name}: {amount}, {of}chi² {square}; {makes}"
