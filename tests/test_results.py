@@ -219,6 +219,9 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
     names(str(other))
     with pytest.raises(MeasurementError, match="does not hold 'readings_noise'; diagnose again"):
         Diagnosis.load(tmp_path, SMALL_RING())
+    path.unlink()
+    with pytest.raises(MeasurementError, match="name a folder that `tmlattice diagnose --out`"):
+        Diagnosis.load(tmp_path)
 
 
 def SMALL_RING():

@@ -147,7 +147,7 @@ def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
     ax.errorbar(
         s, amount, sigma, fmt="s", color="tab:red", ecolor="0.6", markersize=3, elinewidth=0.8
     )
-    named = {one.element for one in (*result.findings, *result.suspects)}
+    named = {found.element for found in result.findings} | {s.element for s in result.suspects}
     for element, value, _ in gradient_errors(result):
         if element.name in named:
             ax.annotate(element.name, (element.s, value), xytext=(5, 0), va="center",
