@@ -69,7 +69,7 @@ def wrong(data, ring):
     yield "y of wrong sign", scaled(data, [1, -1]), {"y-reversed"}
     yield "x and y of wrong sign", scaled(data, -1), {"readings-reversed"}
     swapped = replace(data, readings=data.readings[..., ::-1], noise=data.noise[:, ::-1])
-    yield "planes exchanged", swapped, {"planes-exchanged"}
+    yield "planes swapped", swapped, {"planes-swapped"}
     yield "readings in mm", scaled(data, 1e3), {"readings-in-mm"}
     yield "readings and noise in mm", scaled(data, 1e3, noise=1e3), {"readings-in-mm"}
     yield "readings in µm", scaled(data, 1e6), {"readings-in-um"}
@@ -82,7 +82,7 @@ def wrong(data, ring):
     yield "launches of wrong sign", scaled(data, launches=[-1] * 4 + [1]), {"launches-reversed"}
     yield "slopes of wrong sign", scaled(data, launches=[1, -1, 1, -1, 1]), {"slopes-reversed"}
     other = replace(data, launches=data.launches[:, [2, 3, 0, 1, 4]])
-    yield "planes of launches exchanged", other, {"launches-exchanged"}
+    yield "planes of launches swapped", other, {"launches-swapped"}
     for by in (1, -2, 3):
         moved = reordered(data, np.roll(places, -by))
         yield f"monitors shifted by {by}", moved, {f"monitors-shifted={-by}"}
@@ -123,7 +123,7 @@ def wrong_response(data, ring):
     for name, made, asked in (
         ("x of wrong sign", "x-reversed", "x-reversed"),
         ("y of wrong sign", "y-reversed", "y-reversed"),
-        ("planes exchanged", "planes-exchanged", "planes-exchanged"),
+        ("planes swapped", "planes-swapped", "planes-swapped"),
         ("readings in mm", "readings-in-km", "readings-in-mm"),
         ("readings halved", "readings-doubled", "readings-halved"),
         ("kicks in mrad", "", "kicks-in-mrad"),

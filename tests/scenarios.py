@@ -472,14 +472,12 @@ RESPONSES = (
     one("dipole_roll", "bend::10", 1e-3),
     one("quadrupole_offset_x", "QD::9", 1e-4),
     one("corrector_kick_x", "v4", 2e-5),
-    one("corrector_calibration", "v3", -2.0),
     one("corrector_calibration", "v5", 0.5),
     one("corrector_calibration", "v2", -1.0),
     one("corrector_roll", "v5", 0.05),
     one("monitor_gain_x", "end_1", -2.0),
     one("monitor_swap", "bpm::4", 1.0),
     one("monitor_roll", "bpm::4", 0.01),
-    one("energy_offset", None, 2e-3),
     one("energy_spread", None, 1e-3),
     one("family_gradient", "QD", -0.01),
     row(
@@ -608,15 +606,7 @@ DEFECTS = (
             lasts=True,
             fewer=fewer,
         )
-        for a, b, fewer in (("v5", "v6", None), ("v5", "v9", None), ("generated_a", "v5", FITTED))
-    ),
-    row(
-        "response, data: exchanged monitors alone",
-        damage=swapped_monitors("end_1", "end_14"),
-        verdicts=LOCATED,
-        found=(Cause("exchanged", "end_1,end_14", np.nan),),
-        lasts=True,
-        fewer=None,
+        for a, b, fewer in (("v5", "v9", None), ("generated_a", "v5", FITTED))
     ),
     defect("the noise is stated five times too small", noise_times([0.2, 1.0]), "the noise in x"),
     defect("the noise is stated ten times too large", noise_times(10.0), "noise is too large"),

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import at
 import numpy as np
 import pytest
 from ocelot.cpbd.elements import Solenoid, Undulator
@@ -20,6 +21,7 @@ from tmlattice.effects.build import Build
 from tmlattice.errors import LatticeError, UnknownNameError
 from tmlattice.machine.at_elements import Builder
 from tmlattice.machine.at_engine import AtEngine, from_at, to_at
+from tmlattice.optics import closed_orbit
 
 LAUNCH = np.array([1.1e-3, 2e-4, -0.7e-3, 1e-4, 0.0, 0.0])
 TOUCHED = set()
@@ -360,8 +362,6 @@ def test_loss_in_a_bend_moves_the_orbit_as_if_spread_evenly(tmp_path):
 
 
 def test_energy_spread_by_radiation_vs_at_and_the_published(small_ring, petra3):
-    import at
-
     _, i2, i3, i4, _ = at.get_radiation_integrals(AtEngine(small_ring).lattice())
     by_at = np.sqrt(3.832e-13 * small_ring.gamma**2 * i3 / (2 * i2 + i4))
     assert expected_spread(small_ring) == pytest.approx(by_at, rel=0.02)  # a partition of 2
@@ -372,8 +372,6 @@ def test_energy_spread_by_radiation_vs_at_and_the_published(small_ring, petra3):
 
 
 def last_delta(engine):
-    import at
-
     beam = np.zeros((6, 1), order="F")
     lattice = engine.lattice()
     at.internal_lpass(lattice, beam, energy=lattice.energy)
@@ -481,8 +479,6 @@ def test_without_rf_the_energy_stays_and_with_it_the_loss_is_made_good(petra3, n
     maps = network6.maps
     optics = off_momentum(network6, petra3.length)
     delta = 1e-4
-    from tmlattice.optics import closed_orbit
-
     orbit = closed_orbit(network6, delta)
     dispersion = network6(orbit[None])[0].detach().numpy()[:, 0] / delta
     assert len(dispersion) == len(maps.monitors)

@@ -1,19 +1,33 @@
 """The command as a user runs it: what it prints and writes, and how it ends on wrong input."""
 
 import contextlib
+import fcntl
 import json
 import os
+import shlex
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command import tmlattice
 from conftest import SMALL
 from shared import valid
+
+import tmlattice as package
+from tmlattice import Measurement, OrbitResponse, TaylorNetwork, simulate, write_measurement
+from tmlattice.cli.command import SECTIONS
+from tmlattice.cli.command import tmlattice as group
+from tmlattice.fitting.experiment import perturbed_ring
+from tmlattice.maps import ring_matrix
+from tmlattice.network import load_network
+from tmlattice.optics import matrix_tunes, one_turn_optics
 
 QUICK = ["--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--epochs", "20"]
 
@@ -92,11 +106,6 @@ def test_a_method_alone_does_not_pay_for_the_others_and_quiet_prints_nothing(tmp
 
 
 def test_the_weights_that_are_kept_are_those_of_the_best_method(outcome, petra3):
-    import numpy as np
-
-    from tmlattice.network import load_network
-    from tmlattice.optics import one_turn_optics
-
     folder, _ = outcome
     result = json.loads((folder / "result.json").read_text())
     network = load_network(petra3, folder / "figures" / "network.pt")
@@ -148,9 +157,6 @@ def test_help_imports_nothing_heavy(tmp_path):
 
 
 def test_help_groups_the_commands_by_what_they_are_for(tmp_path):
-    from tmlattice.cli.command import SECTIONS
-    from tmlattice.cli.command import tmlattice as group
-
     done = tmlattice("--help", cwd=tmp_path, check=0)
     titles = ("Describe", "Measure", "Diagnose", "Fit", "Develop")
     at = [done.stdout.index(f"\n{title}:") for title in titles]
@@ -163,10 +169,6 @@ def test_help_groups_the_commands_by_what_they_are_for(tmp_path):
 
 def test_commands_of_make_run_are_understood():
     """Their options; an example of the README runs what they do."""
-    import shlex
-
-    from tmlattice.cli.command import tmlattice as group
-
     text = (Path(__file__).parent.parent / "Makefile").read_text().split("\nrun:")[1]
     lines = text.split("\n\n")[0].splitlines()[1:]
     commands = [shlex.split(line.removeprefix("\t$(BIN)/tmlattice ")) for line in lines]
@@ -177,8 +179,6 @@ def test_commands_of_make_run_are_understood():
 
 def test_version_has_one_source(tmp_path):
     from importlib.metadata import version
-
-    import tmlattice as package
 
     done = tmlattice("--version", cwd=tmp_path, check=0)
     assert package.__version__ in done.stdout
@@ -237,10 +237,6 @@ WAITS_IN_A_SCAN = (
 
 def on_a_terminal(code, *words, cwd, stop):
     """Exit code, stdout, and what a terminal of 100 columns was sent."""
-    import fcntl
-    import struct
-    import termios
-
     own, end = os.openpty()
     fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
     process = subprocess.Popen(
@@ -264,8 +260,6 @@ def on_a_terminal(code, *words, cwd, stop):
 @pytest.mark.skipif(os.name == "nt", reason="POSIX terminals")
 @pytest.mark.parametrize("stop", [False, True])
 def test_a_terminal_shows_the_progress_and_ctrl_c_writes_nothing(tmp_path, small_ring, stop):
-    from tmlattice import simulate, write_measurement
-
     write_measurement(tmp_path / "day", simulate(small_ring, [], shots=3, seed=1).measurement())
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "report.txt").write_text("of yesterday")
@@ -301,11 +295,6 @@ def test_no_progress_is_shown_where_there_is_no_terminal(tmp_path):
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory, small_ring):
     """Measurements of the small ring with one weak magnet, one of each kind that is tried."""
-    import numpy as np
-
-    from tmlattice import Measurement, OrbitResponse, TaylorNetwork, write_measurement
-    from tmlattice.fitting.experiment import perturbed_ring
-
     place = tmp_path_factory.mktemp("folders")
     machine = perturbed_ring(small_ring, "QD::5", -0.02)
     launches = np.array([[1e-4, 0, 1e-4, 0, 0], [-1e-4, 1e-5, 5e-5, 0, 0]])
@@ -361,10 +350,6 @@ def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
 
 def test_launches_and_noise_that_nobody_states_are_fitted_beside(folders, tmp_path, small_ring):
     """Launches of 1e-4 m and rad, stated as unknown about the axis; 0.2 µm of noise."""
-    from tmlattice.fitting.experiment import perturbed_ring
-    from tmlattice.maps import ring_matrix
-    from tmlattice.optics import matrix_tunes
-
     done = tmlattice("tune-fit", SMALL, "--measurement", folders / "blind", "--epochs", 300,
                      "--out", "fit", cwd=tmp_path, check=0)  # fmt: skip
     result = json.loads((tmp_path / "fit" / "tune-fit.json").read_text())
@@ -391,7 +376,7 @@ def test_launches_and_noise_that_nobody_states_are_fitted_beside(folders, tmp_pa
         ("response", [], "is an orbit response"),
         ("corrector", [], "shot 1 has settings"),
         ("axis", [], "every launch is on the axis"),
-        ("strange", [], "no monitor 'last_c'; did you mean"),
+        ("strange", [], "no BPM 'last_c'; did you mean"),
     ],
 )
 def test_tune_fit_refuses_a_measurement(folders, tmp_path, name, more, words):

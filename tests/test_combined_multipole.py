@@ -5,16 +5,20 @@ import warnings
 import at
 import numpy as np
 import pytest
+from at.load.utils import element_from_dict
+from scipy.io import loadmat
 from shared import measured_data
 
 from tmlattice import load_ring
 from tmlattice.beam.chain import Chain
+from tmlattice.effects import find
 from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.ocelot_engine import OcelotEngine
+from tmlattice.maps import ring_matrix
 from tmlattice.maps.magnets import way_map
-from tmlattice.maps.quadratic import parts_of
+from tmlattice.maps.quadratic import composed, of_ocelot, parts_of
 from tmlattice.optics import off_momentum, one_turn_optics
 
 ENERGY = 1.9
@@ -49,8 +53,6 @@ def ring(lattice):
 
 
 def test_a_sextupole_with_coils_is_a_sextupole_that_can_be_found_wrong(ring):
-    from tmlattice.effects import find
-
     assert ring.counts()["sextupole"] == 16
     assert ring.counts()["quadrupole"] == 16
     assert ring["sf::3"].k2 == 22.0
@@ -106,8 +108,6 @@ def test_a_bend_with_other_fields_keeps_them_in_its_middle():
 
 
 def test_half_and_half_is_the_whole(ring):
-    from tmlattice.maps.quadratic import composed, of_ocelot
-
     element = ring["sf::0"]
     whole = composed(of_ocelot(p, 6) for p in parts_of(element, ENERGY, False))
     halves = composed(of_ocelot(p, 6) for p in parts_of(element, ENERGY, True))
@@ -117,7 +117,6 @@ def test_half_and_half_is_the_whole(ring):
 
 def test_every_format_that_is_written_keeps_kinds_and_maps(ring, tmp_path):
     from tmlattice.lattice.write import save_ring
-    from tmlattice.maps import ring_matrix
 
     for name in ("ring.json", "ring.at.json", "ring.py"):
         save_ring(ring, tmp_path / name)
@@ -169,9 +168,6 @@ def test_a_corrector_of_two_planes_kicks_in_both_and_one_that_is_named_in_one():
 
 def of_loco(path, energy):
     """The lattice of a LOCO file as AT's own elements."""
-    from at.load.utils import element_from_dict
-    from scipy.io import loadmat
-
     ring = loadmat(path, squeeze_me=True, struct_as_record=False)["RINGData"]
     elements = []
     for e in getattr(ring, "Lattice", ring):

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from conftest import SMALL
 from shared import SHORT
 
 from tmlattice import TaylorNetwork
@@ -163,10 +164,12 @@ def test_fine_tune_on_the_card_follows_the_cpu(small_ring):
     assert fits[1].loss == pytest.approx(fits[0].loss, rel=1e-6)
 
 
+@card
 def test_the_extra_that_brings_the_kernels_is_named_without_triton():
     done = subprocess.run(
         [sys.executable, "-c", "import sys; sys.modules['triton'] = None\n"
-         "from tmlattice.network.network import _cuda\n_cuda()"],
+         "from tmlattice import TaylorNetwork, load_ring\n"
+         f"TaylorNetwork.from_ring(load_ring({str(SMALL)!r})).to('cuda')([[1e-4, 0, 0, 0]])"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert "pip install 'tmlattice[cuda]'" in done.stderr

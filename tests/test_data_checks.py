@@ -51,7 +51,7 @@ def shifted(values, by):
 WRONG = {
     "x-reversed": lambda m: {"readings": m.readings * [-1, 1]},
     "readings-reversed": lambda m: {"readings": -m.readings},
-    "planes-exchanged": lambda m: {"readings": m.readings[..., ::-1]},
+    "planes-swapped": lambda m: {"readings": m.readings[..., ::-1]},
     "readings-in-mm": lambda m: {"readings": 1e3 * m.readings, "noise": 1e3 * m.noise},
     "readings-in-um": lambda m: {"readings": 1e6 * m.readings},
     "monitors-shifted=1": lambda m: {"readings": shifted(m.readings, 1)},
@@ -59,7 +59,7 @@ WRONG = {
     "monitors-backwards": lambda m: {"readings": m.readings[:, :, ::-1]},
     "launches-reversed": lambda m: {"launches": -m.launches},
     "slopes-reversed": lambda m: {"launches": m.launches * [1, -1, 1, -1, 1]},
-    "launches-exchanged": lambda m: {"launches": m.launches[:, [2, 3, 0, 1, 4]]},
+    "launches-swapped": lambda m: {"launches": m.launches[:, [2, 3, 0, 1, 4]]},
     "launches-in-mm": lambda m: {"launches": 1e3 * m.launches},
     "slopes-in-mrad": lambda m: {"launches": m.launches * [1, 1e3, 1, 1e3, 1]},
     "settings-reversed": lambda m: {"settings": kicked(m, -1)},
@@ -145,7 +145,7 @@ def test_an_orbit_that_is_millimetres_off_is_no_global_error(small_ring, seed):
         return  # a third of the BPMs does not show what is exchanged
     swapped = replace(data, readings=data.readings[..., ::-1])
     (check,) = told(check_data(small_ring, swapped))
-    assert check.assume == ("planes-exchanged",)
+    assert check.assume == ("planes-swapped",)
 
 
 @pytest.mark.parametrize("size", [2e-5, 1e-3])
@@ -265,7 +265,7 @@ def test_a_slip_in_the_turns_is_told_before_anything_is_laid_out(small_ring, hea
 
 RESPONSE = {
     "y-reversed": "y-reversed",
-    "planes-exchanged": "planes-exchanged",
+    "planes-swapped": "planes-swapped",
     "readings-in-mm": "readings-in-km",
     "readings-halved": "readings-doubled",
     "kicks-reversed": "kicks-reversed",

@@ -1,5 +1,7 @@
 """Names of the control system: from the files of a machine to text, page and JSON."""
 
+from dataclasses import replace
+
 import pytest
 from shared import measured_data, valid
 
@@ -16,8 +18,6 @@ GAIN = Cause("monitor_gain_x", "end_3", -0.4)
 @pytest.fixture(scope="module")
 def measured(small_ring, tmp_path_factory):
     """First turns with a wrong gain, through a measurement folder."""
-    from dataclasses import replace
-
     data = simulate(small_ring, [GAIN], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
                     noise=2e-6).measurement()  # fmt: skip
     folder = tmp_path_factory.mktemp("devices") / "day"

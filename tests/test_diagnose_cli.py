@@ -8,6 +8,7 @@ import sys
 from html.parser import HTMLParser
 
 import jsonschema
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from command import tmlattice
@@ -19,6 +20,8 @@ from tmlattice.effects import Cause
 from tmlattice.files import write_json
 from tmlattice.machine import simulate
 from tmlattice.measurement import OrbitResponse, write_measurement
+from tmlattice.plots.diagnosis import figures, gap_axes, plot_gap, plot_scan
+from tmlattice.report import interactive
 from tmlattice.report.plain import report_text
 from tmlattice.report.text import amount_text, least_text, probability_text
 
@@ -174,7 +177,7 @@ def test_reference_and_single_shot(folders, tmp_path):
         ([SMALL, "weak", "--reference", "response"], "give a reference of the same kind"),
         ([SMALL, "weak", "--reference", "nowhere"], "no measurement folder"),
         ([SMALL, "weak", "--reference", "weak"], "is the measurement and its --reference"),
-        ([SMALL, "strange"], "no monitor 'v1'; "),
+        ([SMALL, "strange"], "no BPM 'v1'; "),
         ([SMALL, "weak", "--effects", "quadrupole_gradiant"], "did you mean 'quadrupole_gradient'"),
         ([SMALL, "weak", "--effects", ","], "--effects"),
         ([SMALL, "weak", "--background", "quadrupole_roll=a"], "is no rms"),
@@ -292,10 +295,6 @@ def test_what_cannot_be_seen_is_not_given_a_number():
 # --- the figures ----------------------------------------------------------------------------------
 @pytest.mark.parametrize("verdict", list(CASES))
 def test_every_verdict_has_its_figures(diagnoses, verdict):
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import figures
-
     names = []
     for name, caption, figure in figures(diagnoses[verdict]):
         names.append(name)
@@ -309,10 +308,6 @@ def test_every_verdict_has_its_figures(diagnoses, verdict):
 
 
 def test_scan_figure_shows_the_scan_that_saw_the_fault(diagnoses):
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import plot_scan
-
     diagnosis = diagnoses["identified"]
     figure = plot_scan(diagnosis)
     ax = figure.axes[0]
@@ -329,10 +324,6 @@ def test_scan_figure_shows_the_scan_that_saw_the_fault(diagnoses):
 
 
 def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import plot_gap
-
     diagnosis = diagnoses["identified"]
     ax = plot_gap(diagnosis)
     lengths = [bar.get_width() for bar in ax.patches]
@@ -343,11 +334,6 @@ def test_gap_figure_has_a_bar_for_each_step_and_the_noise(diagnoses):
 
 def test_a_gap_of_a_model_that_loses_the_beam_is_drawn(diagnoses):
     """In the page, too, whose numbers are JSON."""
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import plot_gap
-    from tmlattice.report import interactive
-
     diagnosis = diagnoses["identified"]
     first, *others = diagnosis.heldout.misfits
     lost = dataclasses.replace(first, rms=np.nan, chi2_per_dof=np.nan)
@@ -364,10 +350,6 @@ def test_a_gap_of_a_model_that_loses_the_beam_is_drawn(diagnoses):
 @pytest.mark.parametrize("count", [1, 3, 8])
 def test_names_under_the_bars_of_the_gap_do_not_overlap(diagnoses, count):
     """Long names of many findings, each beside its own bar."""
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots.diagnosis import gap_axes, plot_gap
-
     diagnosis = diagnoses["identified"]
     (cause,), (error,) = diagnosis.causes, diagnosis.errors
     long = Cause("corrector_kick_x", "steerer_of_the_long_straight_section_north_supply_17", 1e-5)

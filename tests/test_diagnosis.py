@@ -5,6 +5,7 @@ import pytest
 
 from tmlattice import Cause, diagnose, simulate
 from tmlattice.beam.model import Model
+from tmlattice.diagnosis import prepare
 from tmlattice.effects import CATALOGUE, background_rms, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.newton import fit
@@ -165,8 +166,6 @@ def test_what_is_in_the_reference_too_is_no_change(small_ring, cause, shots):
 
 def test_more_shots_than_find_room_are_used_in_part(small_ring, monkeypatch):
     """Memory is that of the shots that find room, however many there are; with a word."""
-    from tmlattice.diagnosis import prepare
-
     each = prepare.COPIES * 8 * 36 * (len(small_ring.magnets) + 1)
     monkeypatch.setattr(prepare, "MEMORY", 6.5 * each)
     fault = Cause("quadrupole_gradient", "QD::3", -0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from places import PLACES
 
-from tmlattice import load_ring
+from tmlattice import TaylorNetwork, load_ring
 from tmlattice.beam.model import Model
 from tmlattice.effects import (
     CATALOGUE,
@@ -24,6 +24,7 @@ from tmlattice.effects import (
 )
 from tmlattice.errors import EffectError, LatticeError, UnknownNameError
 from tmlattice.lattice import save_ring
+from tmlattice.machine import draw_shots
 from tmlattice.maps import element_map
 from tmlattice.maps.magnets import ring_maps, ring_matrix
 
@@ -36,8 +37,6 @@ SETTINGS = {
 
 @pytest.fixture(scope="module")
 def launches(petra3):
-    from tmlattice.machine import draw_shots
-
     return draw_shots(petra3, 2, 1e-3, seed=1).launches[:, [0, 1, 2, 3, 5]]
 
 
@@ -185,8 +184,6 @@ def test_two_turns_are_one_chain(petra3, launches):
 
 
 def petra3_turns(ring, launch):
-    from tmlattice import TaylorNetwork
-
     return TaylorNetwork.from_ring(ring, 6).track([[*launch[:4], 0.0, launch[4]]], 2)[0]
 
 

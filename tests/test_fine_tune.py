@@ -137,7 +137,7 @@ def test_measurements_that_do_not_fit_are_refused(small_network, weakened):
     with pytest.raises(MeasurementError, match="launch is not finite"):
         Measurement(LAUNCH * np.nan, readings, weakened.monitors)
     strange = Measurement(LAUNCH, readings, ("bpm_x", *weakened.monitors[1:]))
-    with pytest.raises(UnknownNameError, match="no monitor 'bpm_x'"):
+    with pytest.raises(UnknownNameError, match="no BPM 'bpm_x'"):
         fit(small_network, strange)
     with pytest.raises(ValueError, match="l3"):
         fit(small_network, weakened, regularization="l3")

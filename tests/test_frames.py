@@ -1,6 +1,8 @@
 """Data in and out of a notebook: arrays, data frames, xarray, values that are equal, pickles."""
 
 import math
+from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -9,8 +11,10 @@ from conftest import SMALL
 from shared import ROOT, run_page
 
 import tmlattice
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.importers import Options, bring_in
+from tmlattice.machine.response import simulate_response
 from tmlattice.measurement import (
     ClosedOrbit,
     Dispersion,
@@ -75,9 +79,6 @@ def test_a_dataset_is_read_back_as_an_equal_measurement(measured):
 
 @kinds
 def test_measurements_are_equal_by_value(measured):
-    from copy import deepcopy
-    from dataclasses import replace
-
     assert deepcopy(measured) == measured
     assert measured != replace(measured, energy=1.0)
     assert measured != "something else"
@@ -183,8 +184,6 @@ def test_a_dataarray_holds_the_readings(small_ring, measured):
 
 def test_frames_go_where_a_measurement_does(small_ring, measured, tmp_path):
     """As good as the same table in a file."""
-    from tmlattice.diagnosis.data_checks import check_data
-
     frame = forms(measured)["long"]
     frame.to_csv(tmp_path / "a.csv", index=False)
     of_file = bring_in([tmp_path / "a.csv"], Options(ring=small_ring))
@@ -222,8 +221,6 @@ def test_the_page_runs_as_written(tmp_path, monkeypatch):
 
 
 def test_frames_of_a_response(small_ring):
-    from tmlattice.machine.response import simulate_response
-
     made = simulate_response(small_ring, noise=1e-7, seed=3).measured
     long = made.to_dataframe().query("corrector != 'rf'")  # the ring has no cavity
     long.attrs = {}
@@ -280,7 +277,7 @@ def test_a_frame_that_lacks_a_column_names_it(small_ring, measured):
         Measurement.from_dataframe(frame.drop(columns="shot"))
     with pytest.raises(MeasurementError, match="holds first turns, and not an orbit response"):
         OrbitResponse.from_dataframe(frame, ring=small_ring)
-    with pytest.raises((MeasurementError, UnknownNameError), match="no monitor 'nowhere'"):
+    with pytest.raises((MeasurementError, UnknownNameError), match="no BPM 'nowhere'"):
         tmlattice.diagnose(small_ring, frame.assign(monitor="nowhere").iloc[:1])
     frame.attrs["units"] = "mm"
     with pytest.raises(MeasurementError, match="give the unit of each column"):

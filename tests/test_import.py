@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import struct
 
 import at
@@ -220,7 +221,7 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
         (lambda d: {"LocoMeasData_M": d["M"] / 1e-4}, "not the response per rad"),
         (lambda d: {"LocoMeasData_Eta": -d["Eta"], "LocoMeasData_M": np.concatenate(
             [-d["M"][:16], d["M"][16:]])}, "--assume x-reversed"),
-        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-exchanged"),
+        (lambda d: {"LocoMeasData_M": np.roll(d["M"], 16, axis=0)}, "--assume planes-swapped"),
         (lambda d: {"LocoMeasData_M": d["M"][np.random.default_rng(1).permutation(len(d["M"]))]},
          "the data are not those of"),
         (lambda d: {"LocoMeasData_M": d["M"] * np.where(np.arange(32) == 3, -1, 1)[:, None]},
@@ -435,8 +436,6 @@ def test_damaged_mat_files_are_a_sentence(simulated, tmp_path):
 
 def save_as_hdf5(path, variables):
     """A MATLAB 7.3 file, as MATLAB writes it: transposed arrays, cells of references."""
-    import h5py
-
     with h5py.File(path, "w", userblock_size=512) as file:
         references = file.create_group("#refs#")
 
@@ -481,8 +480,6 @@ def test_matlabs_file_of_version_7_3_is_the_same(simulated, brought, tmp_path):
 @pytest.fixture(scope="module")
 def esrf(simulated, tmp_path_factory):
     """The same response as the ESRF's files: inputs by name, kicks inside sextupoles."""
-    import h5py
-
     place = tmp_path_factory.mktemp("esrf")
     data, correctors = simulated["LocoMeasData"], simulated["CMData"]
     places = [*correctors["HCMIndex"].astype(int) - 1, *correctors["VCMIndex"].astype(int) - 1]
@@ -552,6 +549,16 @@ def test_parts_that_are_missing_are_named(esrf, parts, told):
 def test_damaged_hdf5_is_a_sentence(esrf, tmp_path):
     (tmp_path / "orm.h5").write_bytes((esrf / "orm.h5").read_bytes()[:900])
     with pytest.raises(TmlatticeError, match="cannot be read as HDF5"):
+        bring_in([tmp_path / "orm.h5", esrf / "names.json", esrf / "ring.mat"])
+
+
+def test_orbits_up_and_down_of_two_sizes_are_rejected(esrf, tmp_path):
+    shutil.copy(esrf / "orm.h5", tmp_path)
+    with h5py.File(tmp_path / "orm.h5", "r+") as file:
+        down = file["raw_down"][:-1]
+        del file["raw_down"]
+        file["raw_down"] = down
+    with pytest.raises(MeasurementError, match="raw_down has the shape"):
         bring_in([tmp_path / "orm.h5", esrf / "names.json", esrf / "ring.mat"])
 
 

@@ -362,14 +362,6 @@ def test_only_bpms_and_correctors_are_rejected_channels(tmp_path, small_ring, fa
         read_rejected(path, small_ring)
 
 
-def test_orbits_up_and_down_of_two_sizes_are_refused(tmp_path):
-    from tmlattice.importers.hdf5 import _orbits
-
-    data = {"matrix": np.zeros((4, 2)), "raw_up": np.ones((4, 2)), "raw_down": np.ones((3, 2))}
-    with pytest.raises(MeasurementError, match="raw_down has the shape"):
-        _orbits(data, np.ones(2), 4)
-
-
 # --- what is no regular file ----------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["knobs.yaml", "t.h5", "t.csv", "a.json", "a.mat"])
 def test_pipes_and_devices_are_not_read(tmp_path, name):

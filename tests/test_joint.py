@@ -12,6 +12,7 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import EffectError, MeasurementError
+from tmlattice.lattice import save_ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.machine.stored_beam import simulate_orbits
 from tmlattice.maps import ring_matrix
@@ -173,8 +174,6 @@ def test_a_corrector_that_is_held_out_is_named_too(small_ring):
 
 
 def test_the_command_takes_many_folders(small_ring, tmp_path):
-    from tmlattice.lattice import save_ring
-
     save_ring(small_ring, tmp_path / "ring.json")
     write_measurement(tmp_path / "turns", _turns(small_ring, [WEAK]))
     write_measurement(tmp_path / "tunes", _tunes(small_ring, [WEAK]))
@@ -221,8 +220,6 @@ def test_readings_that_are_given_twice_are_refused(small_ring):
 
 
 def test_what_was_known_of_another_ring_goes_with_it(small_ring, tmp_path):
-    from tmlattice.lattice import save_ring
-
     save_ring(small_ring, tmp_path / "ring.json")
     write_measurement(tmp_path / "sound", _tunes(small_ring, []))
     for name in ("twin.json.known.json", "twin.json.calibration.json"):
@@ -234,8 +231,6 @@ def test_what_was_known_of_another_ring_goes_with_it(small_ring, tmp_path):
 
 def test_what_is_known_is_written_beside_the_lattice(small_ring, tmp_path):
     small = _small_errors(small_ring, 21)
-    from tmlattice.lattice import save_ring
-
     save_ring(small_ring, tmp_path / "ring.json")
     write_measurement(tmp_path / "monday", _orbit(small_ring, small))
     write_measurement(tmp_path / "tuesday", _orbit(small_ring, small, seed=99))

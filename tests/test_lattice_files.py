@@ -8,6 +8,7 @@ import at
 import numpy as np
 import pytest
 from at_ring import at_lattice
+from scipy.io import savemat
 from shared import measured_data, valid
 
 from tmlattice import load_ring, ring_maps
@@ -16,6 +17,7 @@ from tmlattice.errors import LatticeError
 from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.maps import ring_matrix
+from tmlattice.maps.magnets import way_map
 from tmlattice.optics import ring_tunes
 
 ENERGY = 3.0
@@ -181,8 +183,6 @@ ELEMENTS["sheared sextupole"].T2 = offset
 @pytest.mark.parametrize("what", ELEMENTS)
 def test_element_moves_a_particle_as_in_at(what):
     """0.1 mm and 0.1 mrad to second order; strong bends, whose terms AT lacks, to first."""
-    from tmlattice.maps.magnets import way_map
-
     lattice = at.Lattice([ELEMENTS[what].deepcopy()], energy=ENERGY * 1e9, periodicity=1)
     ring = ring_from_at(lattice, what)
     map_ = way_map(ring.elements, ENERGY)
@@ -338,8 +338,6 @@ def test_damaged_own_json_ends_in_one_sentence(tmp_path, small_ring, edit, messa
 
 
 def test_files_with_no_ring_end_in_one_sentence(tmp_path):
-    from scipy.io import savemat
-
     with pytest.raises(LatticeError, match="not JSON"):
         load_ring(write(tmp_path, "a.json", "{"))
     with pytest.raises(LatticeError, match="holds no lattice"):
@@ -498,8 +496,6 @@ def test_ring_parameters_beyond_the_first_are_reported(tmp_path, small_ring, sec
 
 
 def test_energy_of_a_lattice_of_at_without_one_is_given(tmp_path):
-    from scipy.io import savemat
-
     ring = np.empty((2, 1), object)
     ring[0, 0] = {"FamName": "q", "PassMethod": "QuadLinearPass", "Length": 0.4, "K": 1.1}
     ring[1, 0] = {"FamName": "d", "PassMethod": "DriftPass", "Length": 0.5}
@@ -514,8 +510,6 @@ def test_energy_of_a_lattice_of_at_without_one_is_given(tmp_path):
 
 def test_a_family_of_matlab_may_have_a_word_of_ats(tmp_path):
     """AT would make a cavity of the quadrupole and a wiggler of the drift."""
-    from scipy.io import savemat
-
     tunes = []
     for names in (("qf", "d"), ("RF", "Wig")):
         lattice = fodo()

@@ -12,7 +12,6 @@ from tmlattice.challenge import make, read_case, read_truth
 from tmlattice.challenge.case import read_set
 from tmlattice.challenge.make import evenly
 from tmlattice.challenge.run import diagnose_case
-from tmlattice.cli.diagnose import _not_used
 from tmlattice.diagnosis.twin import known_document, known_of, read_known
 from tmlattice.effects import background_rms
 from tmlattice.errors import MeasurementError, TmlatticeError, UnstableRingError
@@ -79,14 +78,6 @@ def test_it_is_read_back(monday, known, tmp_path):
     write_json(beside, known_document(halved, tmp_path / "twin.json"))
     with pytest.raises(MeasurementError, match="its directions are damaged"):
         read_known(beside, monday.as_found)
-
-
-def test_a_response_says_that_it_does_not_start_from_what_is_known(tmp_path):
-    assert not _not_used(str(tmp_path / "twin.json"))
-    (tmp_path / "twin.json.known.json").write_text("{}")
-    (said,) = _not_used(str(tmp_path / "twin.json"))
-    assert "is not used" in said
-    assert "--reference" in said
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from tmlattice.effects import find
 from tmlattice.errors import LatticeError, UnknownNameError
 from tmlattice.lattice import middle_of_first_arc
 from tmlattice.lattice.ocelot import elements
+from tmlattice.optics import twiss
 
 
 def write(folder, text, name="machine.py"):
@@ -170,8 +171,6 @@ def test_file_is_run_as_a_module_with_its_neighbours(tmp_path):
 
 
 def test_negative_drift_of_rounding_does_not_add_half_a_turn(small_ring):
-    from tmlattice.optics import twiss
-
     total = twiss(TaylorNetwork.from_ring(small_ring)).total_tunes
     without = small_ring.elements[: small_ring.index("back")]
     assert small_ring["back"].length < 0

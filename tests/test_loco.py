@@ -136,7 +136,7 @@ FORMS = {
                            "HCMGoodDataIndex is empty"),
     "M turned": (together(put("LocoMeasData", M=lambda m: m[:, :30].T), put(
         "CMData", VCMIndex=lambda i: i[:14], VCMKicks=lambda k: k[:14], VCMGoodDataIndex=None)),
-        "M stands as [correctors, monitors]"),
+        "M is [correctors, BPMs]"),
     "several elements a corrector": (several_elements, "the middle is taken"),
     "an RF of no number": (together(put("LocoMeasData", RF=lambda f: np.nan), put(
         "RINGData", CavityHarmNumber=lambda h: np.zeros((0, 0)))), ""),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tmlattice.beam import Model
 from tmlattice.effects import CATALOGUE, Cause, background_rms, find
 from tmlattice.errors import BeamLostError, EffectError, TmlatticeError
 from tmlattice.machine import Machine, Simulation, draw_background, draw_shots, simulate
@@ -309,8 +310,6 @@ def test_processes_do_not_change_a_digit(small_ring):
 
 def test_calibration_errors_that_are_known_act_on_what_is_set(small_ring):
     """The kick of a shot replaces the design's: what is known of the corrector stays."""
-    from tmlattice.beam import Model
-
     setting = {"v5": {"kick": 1e-4}}
     calibration = [Cause("corrector_calibration", "v5", 0.5)]
     launch = np.zeros((1, 5))

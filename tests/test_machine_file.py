@@ -17,6 +17,7 @@ from tmlattice.errors import MachineFileError, MeasurementError
 from tmlattice.lattice import load_ring, save_ring
 from tmlattice.machine_file import load_machine_file
 from tmlattice.measurement import write_measurement
+from tmlattice.observe.calibration import calibrated_response
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +93,6 @@ def test_a_control_rooms_file_is_read_by_what_the_machine_file_states(machine, t
 
 def test_channels_of_an_orbit_response_are_bpms_and_correctors(tmp_path, small_ring):
     """Of the design's response with other names: the same response, without the bad BPM."""
-    from tmlattice.observe.calibration import calibrated_response
-
     _, response = calibrated_response(small_ring, [], ["v1", "v2"])
     monitors = [monitor.name for monitor in small_ring.monitors]
     rows = ["corrector,monitor,x,y,kick"]
@@ -114,7 +113,7 @@ def test_channels_of_an_orbit_response_are_bpms_and_correctors(tmp_path, small_r
     (tmp_path / "a.csv").write_text("shot,D1 x [mm]\n0,1\n")  # correctors' names are in no way
     assert machine.read(tmp_path / "a.csv", small_ring).monitors == (monitors[1],)
     (tmp_path / "m.toml").write_text("\n".join(lines).replace('"d3"', '"bmp*"'))
-    with pytest.raises(package.errors.UnknownNameError, match="no monitor 'bmp"):
+    with pytest.raises(package.errors.UnknownNameError, match="no BPM 'bmp"):
         load_machine_file(tmp_path / "m.toml").read(tmp_path / "r.csv", small_ring)
 
 

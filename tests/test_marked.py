@@ -88,8 +88,8 @@ def test_marked_ring_is_measured_and_kept(file, tmp_path):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"monitors": "BPM*"}, UnknownNameError, r"no monitor like 'BPM\*'"),
-        ({"monitors": "QF"}, LatticeError, "quadrupole 'qf::0', which cannot be a monitor"),
+        ({"monitors": "BPM*"}, UnknownNameError, r"no BPM like 'BPM\*'"),
+        ({"monitors": "QF"}, LatticeError, "quadrupole 'qf::0', which cannot be a BPM"),
         ({"correctors": "RF"}, LatticeError, "cavity 'rf::0', which cannot be a corrector"),
     ],
 )

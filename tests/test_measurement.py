@@ -62,7 +62,7 @@ def test_ring_order_puts_missing_monitors_back(measurement):
     assert np.isnan(full.readings[:, :, 0]).all()
     np.testing.assert_array_equal(full.readings[:, :, 1:], measurement.readings[:, :, [2, 0, 1]])
     np.testing.assert_array_equal(full.noise[1:], measurement.noise[[2, 0, 1]])
-    with pytest.raises(UnknownNameError, match="no monitor 'bpm_c'; did you mean"):
+    with pytest.raises(UnknownNameError, match="no BPM 'bpm_c'; did you mean"):
         measurement.in_order_of(("bpm_a", "bpm_b"))
 
 
@@ -156,7 +156,7 @@ def test_chi2_of_pure_noise_is_one(rng):
         ({"noise": (1e-5, -1e-5)}, "above zero"),
         ({"noise": (1e-5, np.inf)}, "no BPM has"),
         ({"noise": (1e-5, 1e-5, 1e-5)}, "neither a pair"),
-        ({"noise": {"bpm_x": (1e-5, 1e-5)}}, "no monitor 'bpm_x'"),
+        ({"noise": {"bpm_x": (1e-5, 1e-5)}}, "no BPM 'bpm_x'"),
         ({"monitors": ("bpm_a", "bpm_b", "BPM_A")}, "stands twice"),
         ({"monitors": ("bpm_a", "bpm_b", "bpm_a::0")}, "stands twice"),
         ({"monitors": ("bpm_a", "bpm_b", "bpm\n")}, "no name"),

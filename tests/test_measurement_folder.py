@@ -13,7 +13,7 @@ from shared import measured_data, valid
 
 from tmlattice import Measurement, OrbitResponse, read_measurement, write_measurement
 from tmlattice.errors import MeasurementError
-from tmlattice.measurement import RfStep, measurement_writer, read_truth, write_truth
+from tmlattice.measurement import RfStep, measurement_writer, read_truth, rows, write_truth
 
 
 def same(a, b):
@@ -261,7 +261,7 @@ GOOD = "0,0,bpm_swl_61,1e-3,1e-3"
         ([HEADER, GOOD, "0,0,bpm_swl_46,1e-3,-1.5"], 3, "y = -1.5 m is above 0.2 m.*divide milli"),
         ([HEADER, GOOD, "0,0,bpm_swl_46,,", "0,0,BPM_SWL_61::0,,"], 4, "stands in the table"),
         ([HEADER, GOOD, "7,0,bpm_swl_46,,", "7,0,bpm_sw_46,1e-3,1e-3"], 4,
-         "no monitor 'bpm_sw_46'; did you mean 'bpm_swl_46'"),
+         "no BPM 'bpm_sw_46'; did you mean 'bpm_swl_46'"),
         ([HEADER, GOOD, '0,0,"bpm', "2,0,a,,"], 3, "name|fields"),
         ("\n".join([HEADER, GOOD, "7,0,bpm_µ,,"]).encode("latin-1"), 3, "not UTF-8"),
     ],
@@ -275,8 +275,6 @@ def test_damaged_table_names_its_line(folder, table, line, words):
 
 
 def test_damage_behind_the_first_chunk_names_its_line(folder, monkeypatch):
-    from tmlattice.measurement import rows
-
     monkeypatch.setattr(rows, "_CHUNK", 3)
     table = [HEADER, *(f"0,{t},bpm_swl_61,1e-3,1e-3" for t in range(10))]
     assert read_measurement(folder(table=table)).readings.shape[1] == 10
@@ -318,7 +316,7 @@ def test_table_without_rows_or_readings(folder):
         ({"noise": {"x": "small", "y": 1e-5}}, "noise.x is .small.; it should be a number or null"),
         ({"noise": {"a": {"x": -1e-5}}}, "noise.a.x is -1e-05; it should be above 0"),
         ({"noise": 2e-5}, "noise is 2e-05; it should be an object"),
-        ({"noise": {"bpm_dead": {"x": 1e-5, "y": 1e-5}}}, "no monitor 'bpm_dead'"),
+        ({"noise": {"bpm_dead": {"x": 1e-5, "y": 1e-5}}}, "no BPM 'bpm_dead'"),
         ({"energy_gev": 0}, "energy_gev is 0; it should be above 0"),
         ({"lattice": 3}, "lattice is 3; it should be a text or null"),
     ],
@@ -400,7 +398,7 @@ def test_orbit_response_of_the_page(folder):
     [
         ({}, [*ORBITS, "pch_swr_9,a,,"], "line 5: corrector pch_swr_9, monitor a stands in the"),
         ({}, [*ORBITS, "pch_swr_8,a,,"], "line 5: no corrector 'pch_swr_8'; did you mean"),
-        ({}, [*ORBITS, "pcv,b,,"], "line 5: no monitor 'b'"),
+        ({}, [*ORBITS, "pcv,b,,"], "line 5: no BPM 'b'"),
         ({}, [*ORBITS[:3], "rf,a,0.5,"], "line 4: x = 0.5 m is above"),
         ({}, ORBITS[:3], 'no row of "rf"'),
         ({"dispersion": False}, ORBITS, "line 4: a row of the RF step"),

@@ -45,7 +45,7 @@ def test_columns_in_any_order_with_others_between(table):
         (("monitor,x,y", "a,1e-3,1e-3", "a,1e-3,1e-3"), "line 3: monitor a stands"),
         (("monitor,x,y", "a,3,1"), "line 2: x = 3 m is above 0.2 m"),
         (("monitor,x,y", "a,3,1mm"), "line 2: y is '1mm'"),
-        (("monitor,x,y", "c,1e-3,1e-3"), "line 2: no monitor 'c'"),
+        (("monitor,x,y", "c,1e-3,1e-3"), "line 2: no BPM 'c'"),
         (("monitor,x,y", "a,,"), "every reading is missing"),
         ((), "line 1: the file is empty"),
     ],
@@ -134,7 +134,7 @@ def test_turn_by_turn_files_that_cannot_be_read(tmp_path, ring_data):
     with pytest.raises(MeasurementError, match="no kind 'lhd'"):
         read_turn_by_turn(path, "lhd")
     written(path, 1e-3 * ring_data, "lhc")
-    with pytest.raises(MeasurementError, match=r"a.sdds: no monitor 'BPM.C'"):
+    with pytest.raises(MeasurementError, match=r"a.sdds: no BPM 'BPM.C'"):
         read_turn_by_turn(path, monitors=["bpm.a", "bpm.b"])
     with pytest.raises(MeasurementError, match="no unit 'cm'"):
         read_turn_by_turn(path, unit="cm")

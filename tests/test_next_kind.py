@@ -65,7 +65,7 @@ def test_the_dearer_of_two_that_part_alike_is_not_proposed(small_ring, tunes, mo
     _, diagnosis = tunes
     seen = {**how().__dict__, "ring": small_ring}
     ask = (small_ring, diagnosis.explanation)
-    monkeypatch.setattr(module, "_separation", lambda problem, pair: 10.0)
+    monkeypatch.setattr(module, "separation", lambda problem, pair: 10.0)
     assert next_kind(*ask, ["tunes"], PartOptions(**seen), ()).kind == "closed_orbit"
     assert (
         next_kind(*ask, ["tunes", "closed_orbit"], PartOptions(**seen), ()).kind == "turn_by_turn"
@@ -76,7 +76,7 @@ def test_nothing_is_proposed_that_gains_little(small_ring, tunes, monkeypatch):
     _, diagnosis = tunes
     asked = replace(how(), ring=small_ring)
     assert next_kind(small_ring, diagnosis.explanation, list(KINDS), asked, ()) is None
-    monkeypatch.setattr(module, "_separation", lambda problem, pair: 1.9)
+    monkeypatch.setattr(module, "separation", lambda problem, pair: 1.9)
     assert next_kind(small_ring, diagnosis.explanation, ["tunes"], asked, ()) is None
     sound = diagnose(small_ring, measure("tunes", small_ring, [], 1.0, 1, seed=3, machine_seed=1))
     assert sound.next is None
@@ -98,7 +98,7 @@ def test_what_a_kind_cannot_see_it_does_not_part(small_ring, tunes):
                     (cause.effect, cause.element), replace(fit, point=point, covariance=known)
                 )
             )
-        separation = module._separation(KINDS[kind].proposal(small_ring, asked), tuple(pair))
-        assert (separation > 10) is parts
+        apart = module.separation(KINDS[kind].proposal(small_ring, asked), tuple(pair))
+        assert (apart > 10) is parts
         if parts:  # 200 um in one reading of 2 um
-            assert separation == pytest.approx(100, rel=0.01)
+            assert apart == pytest.approx(100, rel=0.01)

@@ -3,6 +3,7 @@
 import functools
 import inspect
 import io
+import sys
 import warnings
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import at
 import machine_data
 import numpy as np
 import pytest
+from ocelot.cpbd.elements import Drift, Marker, Quadrupole, SBend
+from ocelot.cpbd.magnetic_lattice import MagneticLattice
 from shared import measured_data
 
 import tmlattice
@@ -94,9 +97,6 @@ def test_at_misalignments_periods_and_particle_come_over():
 
 
 def test_ocelot_elements_in_lists_and_lattices():
-    from ocelot.cpbd.elements import Drift, Marker, Quadrupole, SBend
-    from ocelot.cpbd.magnetic_lattice import MagneticLattice
-
     moved = Quadrupole(l=0.3, k1=-1.0, eid="qd", dx=1e-4)
     cell = [Quadrupole(l=0.3, k1=1.0, eid="qf"), Drift(l=1), SBend(l=1, angle=0.1, eid="b"), moved]
     for given in (cell, [cell], MagneticLattice(cell)):
@@ -539,8 +539,6 @@ def test_methods_are_seen_by_editors(small_ring):
 
 
 def test_xtrack_that_is_not_installed_is_one_sentence(small_ring, tmp_path, monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "xtrack", None)
     with pytest.raises(TmlatticeError, match=r"xtrack.*not installed: `pip install xsuite`"):
         small_ring.to_xtrack()

@@ -124,13 +124,13 @@ def test_names_of_findings_that_stand_together_step_aside(small_ring):
     ]
     nowhere = SimpleNamespace(s=None, where=None, element=None, elements=())
     plan_of = survey(small_ring)
-    diagnosis = SimpleNamespace(ring=small_ring, findings=(*found, nowhere))
+    diagnosis = SimpleNamespace(ring=small_ring, findings=(*found, nowhere), suspects=())
     placed = plan.placed(diagnosis, plan_of)
     assert [number for number, *_ in placed] == [1, 2, 3, 4, 5, 6]
     assert placed[0][-1] == placed[-1][-1] == 0
-    boxes = [
-        plan._box(at, plan.label(number, own), lines, plan_of) for number, own, at, lines in placed
-    ]
-    for i, one in enumerate(boxes):
-        for other in boxes[:i]:
-            assert (one[1] <= other[0]).any() or (other[1] <= one[0]).any()
+    ax = plan.plot_plan(diagnosis)
+    ax.figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in ax.texts]
+    assert len(boxes) == 6
+    assert not any(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])
+    plt.close(ax.figure)

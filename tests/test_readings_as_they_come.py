@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command import tmlattice
 from conftest import SMALL
+from scipy.io import savemat
 
 from tmlattice import Cause, read_measurement, simulate
 from tmlattice.errors import MeasurementError, UnknownNameError
@@ -191,7 +192,7 @@ def test_sdds_arrays(small_ring, data, tmp_path):
 def test_a_machine_file_states_names_unit_noise_and_bad_bpms(small_ring, data, tmp_path):
     alias = {m: f"P{i:02d}" for i, m in enumerate(data.monitors)}
     path = wide(tmp_path / "a.csv", data, lambda m, p: f"{alias[m]}:{p}")
-    with pytest.raises(MeasurementError, match=r"no monitor 'P00'.*\[channels\].*--example"):
+    with pytest.raises(MeasurementError, match=r"no BPM 'P00'.*\[channels\].*--example"):
         bring_in([path], Options(ring=small_ring))
     names = "\n".join(f'"{alias[m]}" = "{m}"' for m in data.monitors)
     (tmp_path / "tmlattice.toml").write_text(
@@ -250,7 +251,7 @@ def test_turns_that_are_counted_from_another_number(small_ring, data, tmp_path):
 
 def test_a_channel_of_a_bpm_that_is_not_there(small_ring, data, tmp_path):
     path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m} {p}")
-    with pytest.raises(UnknownNameError, match="no monitor 'end_99'; did you mean"):
+    with pytest.raises(UnknownNameError, match="no BPM 'end_99'; did you mean"):
         bring_in([path], Options(ring=small_ring, stated=Stated(names={"a": "end_99"})))
 
 
@@ -363,8 +364,6 @@ def test_columns_that_are_not_read_are_named(small_ring, data, tmp_path):
 
 @pytest.mark.parametrize("form", ["arrays", "structure", "array of structures", "a row a monitor"])
 def test_readings_of_matlab(small_ring, data, tmp_path, form):
-    from scipy.io import savemat
-
     x, y = (1e3 * data.readings[:, 0, :, i] for i in range(2))
     names = np.array(data.monitors, object)
     content = {
@@ -419,7 +418,7 @@ def test_spellings_are_matched_and_a_part_of_a_name_is_not(small_ring, data, tmp
     same(bring_in([path], Options(ring=small_ring)), data)
     part = data.select(monitors=["end_1", "end_2"])
     path = wide(tmp_path / "b.csv", part, lambda m, p: f"{m}7 {p} [mm]")
-    with pytest.raises(MeasurementError, match="no monitor 'end_17'"):
+    with pytest.raises(MeasurementError, match="no BPM 'end_17'"):
         bring_in([path], Options(ring=small_ring))
 
 

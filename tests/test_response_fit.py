@@ -170,7 +170,7 @@ def test_numbers_that_have_a_lowest_value_vs_bounded_least_squares(rng):
     normal = Normal(jacobian.T @ jacobian, jacobian.T @ data)
     group = Group("all", np.eye(size), 1.0, fixed=True)
     there = Linear(normal, start, np.full(size, 1e9), none, none, none, {}, (group,), {}, lowest)
-    found = rounds._within(there, 1.0).values
+    found = rounds.bounded_step(there, 1.0).values
     referee = lsq_linear(
         np.vstack([jacobian, np.eye(size)]), np.append(data, np.zeros(size)), (lowest, np.inf),
         method="bvls",

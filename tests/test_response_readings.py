@@ -122,6 +122,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     what, *pair = EXCHANGED[case]
     measured = small_steps(small_ring, seed=3)
     wrong = swapped(measured, what, pair)
+    what = "BPMs" if what == "monitors" else what
     found = diagnose(small_ring, wrong, effects=["quadrupole_gradient"])
     assert found.verdict == "localised"
     (one,) = found.findings
@@ -139,7 +140,7 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     else:
         assert any(one.where[0] <= s <= one.where[1] for s in places)
         assert one.where[1] - one.where[0] < 0.4 * small_ring.length
-    assert f"LOCALISED: {what.capitalize()} {one.elements[0]} and" in found.report()
+    assert f"LOCALISED: {what[0].upper()}{what[1:]} {one.elements[0]} and" in found.report()
     assert one.to_check in " ".join(found.report().split())
     assert repr(one).startswith(f"<Finding {one.words}")
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from shared import measured_data
 
-from tmlattice import Cause, read_measurement
+from tmlattice import Cause, TaylorNetwork, load_ring, off_momentum, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.response_derivatives import derivatives
 from tmlattice.effects import CATALOGUE, RingEffect, apply
@@ -78,8 +78,6 @@ def test_finite_steps_settle_to_the_derivative(model):
 
 def test_without_energy_a_horizontal_kick_moves_less(petra3, model):
     """Without energy shift lacks -eta_m eta_c / (alpha C): what the longer path takes."""
-    from tmlattice import TaylorNetwork, off_momentum
-
     flat = ResponseModel(petra3, dimension=4)
     name = max(model.correctors, key=lambda c: abs(model.columns([c]).start[0, 5]))
     (shift,) = model.columns([name]).start[:, 5]
@@ -210,8 +208,6 @@ def test_refusals(small_ring):
 
 def test_design_vs_measured_petra3():
     """The README of the data: 160.8 micrometres, all blocks and monitors, by another code."""
-    from tmlattice import load_ring
-
     folder = measured_data("petra3_orbit_response")
     ring, measured = load_ring(folder / "p3_low_beta.mat"), read_measurement(folder)
     *_, design = OfResponse(ring, measured).pairs(measured)[:2]

@@ -15,8 +15,12 @@ from shared import valid
 
 import tmlattice
 from tmlattice import Cause, Diagnosis
+from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError, TmlatticeError, UnknownNameError
 from tmlattice.files import write_json
+from tmlattice.fitting.adam import fit_adam
+from tmlattice.fitting.map_fit import fit_map
+from tmlattice.fitting.sparse import fit_sparse
 from tmlattice.machine.response import simulate_response
 from tmlattice.machine.stored_beam import simulate_orbits, simulate_tunes
 from tmlattice.measurement import write_measurement
@@ -215,6 +219,9 @@ def test_what_the_file_lacks_is_said(diagnoses, tmp_path):
     names(str(other))
     with pytest.raises(MeasurementError, match="does not hold 'readings_noise'; diagnose again"):
         Diagnosis.load(tmp_path, SMALL_RING())
+    path.unlink()
+    with pytest.raises(MeasurementError, match="name a folder that `tmlattice diagnose --out`"):
+        Diagnosis.load(tmp_path)
 
 
 def SMALL_RING():
@@ -224,8 +231,6 @@ def SMALL_RING():
 # --- pickles --------------------------------------------------------------------------------------
 def test_every_public_result_is_pickled_and_copied(diagnoses, small_ring, small_network, tmp_path):
     """What it says of itself, and its JSON, are the same; a class without a case fails."""
-    from tmlattice.diagnosis.data_checks import check_data
-
     measured = shots(small_ring, [FAULT])
     found = diagnoses["first turns"]
     orbits = simulate_orbits(small_ring, seed=1).measured
@@ -360,10 +365,6 @@ def test_public_functions_state_all_their_arguments():
 
 
 def test_defaults_of_fine_tune_are_those_of_its_methods():
-    from tmlattice.fitting.adam import fit_adam
-    from tmlattice.fitting.map_fit import fit_map
-    from tmlattice.fitting.sparse import fit_sparse
-
     stated = inspect.signature(tmlattice.fine_tune).parameters
     recipe = inspect.signature(tmlattice.tune_fit).parameters
     for method in (fit_adam, fit_sparse, fit_map):

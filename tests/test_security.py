@@ -78,7 +78,7 @@ def spoilt(folder):
     for path in folder.iterdir():
         content = bytearray(path.read_bytes()[32:])
         content[len(content) // 2] ^= 1
-        path.write_bytes(cache._checksum(path.name, bytes(content)) + content)
+        path.write_bytes(cache.checksum(path.name, bytes(content)) + content)
 
 
 def same(kept):

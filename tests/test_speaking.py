@@ -105,8 +105,6 @@ def test_a_fit_shows_its_tunes_and_what_it_trusts(small_ring, measured):
 
 
 def test_names_of_a_file_do_not_become_tags(small_ring):
-    from dataclasses import replace
-
     assert "<script>" not in replace(small_ring, name="<script>")._repr_html_()
 
 

@@ -15,8 +15,8 @@ from tmlattice.effects import CATALOGUE, RingEffect, apply, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine
-from tmlattice.machine.at_stored import _orbit
-from tmlattice.machine.stored_beam import simulate_turns
+from tmlattice.machine.at_stored import stored_orbit
+from tmlattice.machine.stored_beam import simulate_orbits, simulate_turns
 from tmlattice.observe.stored import cavities_of
 
 WRONG = [
@@ -124,7 +124,8 @@ def test_tunes_and_modes_with_rf_vs_at(request, which):
     beam, deaf = StoredBeam(model, felt), StoredBeam(model)
     engine = AtEngine(ring, causes)
     line, with_rf, late = engine.stored_line({})
-    state = at_orbit.closed(partial(engine.one_pass, with_rf), _orbit(engine, line, late), range(6))
+    before = stored_orbit(engine, line, late)
+    state = at_orbit.closed(partial(engine.one_pass, with_rf), before, range(6))
     steps = np.diag(at_orbit.STEPS)
     moving = np.asfortranarray(np.vstack([state + steps, state - steps]).T)
     seen = engine.run(with_rf, moving.T, 1, moving)[:, 0]
@@ -176,8 +177,6 @@ def test_an_unstable_ring_has_no_modes(small_ring):
 
 def test_a_bends_field_is_spread_over_its_arc(small_ring):
     """As one kick by the whole angle in the middle it made an orbit that was 1.6e-3 too large."""
-    from tmlattice.machine.stored_beam import simulate_orbits
-
     for place in ("bend::3", "bend::16"):
         causes = [Cause("dipole_field", place, 2.5e-4)]
         at = simulate_orbits(small_ring, causes, noise=0.0).measured.orbit[0]

@@ -10,6 +10,7 @@ from tmlattice import diagnose
 from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError
+from tmlattice.machine.stored_beam import simulate_orbits
 from tmlattice.measurement import TuneReading
 
 KINDS = ("turn_by_turn", "closed_orbit", "dispersion", "tunes")
@@ -45,7 +46,7 @@ def test_small_errors_are_nothing_global(small_ring, sound, kind):
 
 
 CHANGES = {
-    "x and y are exchanged": lambda values: values[..., ::-1],
+    "x and y are swapped": lambda values: values[..., ::-1],
     "1 place downstream": lambda values: np.roll(values, 1, axis=-2),
     "2 places upstream": lambda values: np.roll(values, -2, axis=-2),
     "reverse order": lambda values: values[..., ::-1, :],
@@ -74,14 +75,14 @@ def test_turns_that_are_numbered_backwards(small_ring, sound):
 
 def test_a_sign_a_unit_and_the_planes_of_a_dispersion(small_ring, sound):
     data = sound["dispersion"]
-    assert "exchanged" in wrong_in(small_ring, step(data, lambda values: values[..., ::-1]))
+    assert "swapped" in wrong_in(small_ring, step(data, lambda values: values[..., ::-1]))
     assert "wrong sign" in wrong_in(small_ring, step(data, lambda values: -values))
     assert "a thousand times too small" in wrong_in(small_ring, step(data, lambda v: 1e-3 * v))
 
 
 def test_a_diagnosis_refuses_what_is_wrong_everywhere(small_ring, sound):
-    exchanged = turns(sound["turn_by_turn"], CHANGES["x and y are exchanged"])
-    with pytest.raises(MeasurementError, match="x and y are exchanged"):
+    exchanged = turns(sound["turn_by_turn"], CHANGES["x and y are swapped"])
+    with pytest.raises(MeasurementError, match="x and y are swapped"):
         diagnose(small_ring, exchanged)
     flipped = step(sound["dispersion"], lambda values: -values)
     with pytest.raises(MeasurementError, match="dispersion: x has the wrong sign"):
@@ -99,8 +100,6 @@ def test_another_ring(small_ring, sound):
 
 
 def test_orbits_whose_correctors_were_set_tell_their_sign(small_ring):
-    from tmlattice.machine.stored_beam import simulate_orbits
-
     settings = [{"v6": {"kick": 1e-4}}, {"v6": {"kick": -1e-4}}, {}]
     data = simulate_orbits(small_ring, [], shots=3, settings=settings, seed=1).measured
     assert check_data(small_ring, data).status != "wrong"
@@ -111,7 +110,7 @@ def test_orbits_whose_correctors_were_set_tell_their_sign(small_ring):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda q: q[:, ::-1], "x and y are exchanged"),
+        (lambda q: q[:, ::-1], "x and y are swapped"),
         (lambda q: 1 - q, "both tunes are 1 - Q"),
         (lambda q: np.array([[1 - q[0, 0], q[0, 1]]]), "Qx is 1 - Qx"),
         (lambda q: np.full((1, 2), 0.44), "not those of"),
@@ -123,7 +122,7 @@ def test_tunes(small_ring, sound, change, said):
 
 def test_what_is_assumed_of_them_is_undone(small_ring, sound):
     exchanged = turns(sound["turn_by_turn"], lambda values: values[..., ::-1])
-    assert check_data(small_ring, exchanged, assumed=["planes-exchanged"]).status != "wrong"
+    assert check_data(small_ring, exchanged, assumed=["planes-swapped"]).status != "wrong"
     flipped = step(sound["dispersion"], lambda values: -values)
     assert check_data(small_ring, flipped, assumed=["rf-reversed"]).status != "wrong"
     folded = TuneReading(tune=1 - sound["tunes"].tune)

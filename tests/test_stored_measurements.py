@@ -75,7 +75,7 @@ def test_ring_gives_names_and_order(tmp_path):
     assert read.monitors == ("C", "A", "b")
     np.testing.assert_array_equal(read.readings, turns_of().readings[:, :, [2, 0, 1]])
     np.testing.assert_array_equal(read.noise[1], [1e-6, 2e-6])
-    with pytest.raises(MeasurementError, match=r"line 2: no monitor 'a'"):
+    with pytest.raises(MeasurementError, match=r"line 2: no BPM 'a'"):
         read_measurement(tmp_path / "m", ["b", "c", "d"])
 
 
@@ -105,9 +105,9 @@ def test_monitors_in_another_order_keep_their_own_readings(measured, values):
     part = spread.select(monitors=["b", "c"])
     np.testing.assert_array_equal(values(part), values(measured)[1:][[0, 1]])
     np.testing.assert_array_equal(part.noise, [[1e-6, 2e-6]] * 2)
-    with pytest.raises(UnknownNameError, match="no monitor 'a'"):
+    with pytest.raises(UnknownNameError, match="no BPM 'a'"):
         part.select(monitors=["a"])
-    with pytest.raises(UnknownNameError, match="no monitor 'c'"):
+    with pytest.raises(UnknownNameError, match="no BPM 'c'"):
         part.in_order_of(["b"])
 
 

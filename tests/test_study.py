@@ -16,8 +16,6 @@ from tmlattice.fitting.study import (
     summarise,
 )
 
-QUICK = {"launch": (1e-4, 0.0, 1e-4, 0.0), "change": -0.02, "noise": 1e-6}
-
 
 def test_study_prints_writes_and_goes_on(tmp_path):
     command = [
@@ -49,35 +47,7 @@ def test_study_prints_writes_and_goes_on(tmp_path):
         study_tune_fit(SMALL, ["sparse"], 2, shots=2, folder=str(folder))
 
 
-def test_a_cluster_is_used_by_its_address_and_a_broken_case_does_not_stop_it(monkeypatch):
-    from distributed import LocalCluster
-
-    from tmlattice.fitting import study
-
-    def broken(task):
-        if task[1][0] == "QF::1":
-            raise RuntimeError("the worker broke")
-        return work(task)
-
-    work = study._work
-    monkeypatch.setattr(study, "_work", broken)
-    monkeypatch.setattr(study, "spread_magnets", lambda *_: ["QF::0", "QF::1", "QF::2"])
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        cases = study_tune_fit(
-            SMALL, ["sparse"], scheduler=cluster.scheduler_address, progress=False, **QUICK
-        )
-    assert len(cases) == 3
-    failed = [c for c in cases if c.problem]
-    assert [c.magnet for c in failed] == ["QF::1"]
-    assert "the worker broke" in failed[0].problem
-    summary = summarise(cases)
-    assert summary["methods"]["sparse"]["failed"] == 1
-    assert summary["methods"]["sparse"]["predicted"] == 2
-
-
-def test_no_scheduler_and_no_method_are_reported(tmp_path):
+def test_no_method_of_that_name_is_reported():
     with pytest.raises(TmlatticeError, match="no method 'magic'"):
         study_tune_fit(SMALL, ["magic"])
 
@@ -102,9 +72,11 @@ def test_summary_counts_coverage_and_right_magnets():
                     (1.0, 0.5), 1e-6, found)  # fmt: skip
 
     cases = [case(1.0, 1.0, ("a",)), case(3.0, 1.0, ("a",)), case(0.1, 1.0, ("a", "b"))]
-    entry = summarise(cases)["methods"]["sparse"]
+    broken = Case("b", 1.0, "sparse", 0, problem="the worker broke")
+    entry = summarise([*cases, broken])["methods"]["sparse"]
+    assert (entry["predicted"], entry["failed"]) == (3, 1)
     assert entry["coverage"]["x"] == pytest.approx(2 / 3)
-    assert entry["right"] == pytest.approx(2 / 3)
+    assert entry["right"] == 2 / 4
     assert entry["abs_dq"]["x"]["worst"] == 3.0
 
 

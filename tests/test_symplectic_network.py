@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from at_ring import at_lattice
 
 from tmlattice import TaylorNetwork, one_turn_optics
 from tmlattice.errors import BeamLostError
@@ -54,8 +55,6 @@ def test_agrees_with_the_second_order_layers_to_second_order(petra3_network):
 
 def test_first_turn_vs_at(petra3, petra3_network):
     """Thick AT elements; 3 mm, where OCELOT's own second order is good to 0.3 micrometres."""
-    from at_ring import at_lattice
-
     launch = np.array([3e-3, 0, 3e-3, 0])
     mine = petra3_network.symplectic().track(launch[None], 1)[0, 1]
     six = np.zeros((6, 1), order="F")

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,7 @@ from tmlattice.inference.scan import scan
 from tmlattice.machine import simulate
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
+from tmlattice.plots import plot_weights
 
 FAULT = Cause("quadrupole_gradient", "QD::7", 0.03)
 
@@ -170,10 +172,6 @@ def test_unknown_noise_is_estimated(small_ring, small_network, measurement, unch
 
 
 def test_figure_marks_the_first_layer_of_each_ranking(small_ring, unchanged):
-    import matplotlib.pyplot as plt
-
-    from tmlattice.plots import plot_weights
-
     reading = unchanged  # a figure of nothing is one too
     figure = plot_weights(reading, mark=FAULT.element)
     figure.canvas.draw()

@@ -23,7 +23,7 @@ WORDS = (
     (r"torn|odd (steps?|readings?)", "inconsistent steps, outliers"),
     (r"(gross|wild) readings?|spikes?|left-out readings?", "outliers"),
     (r"other kicks", "spurious kicks"),
-    (r"exchanged (columns|correctors|monitors|planes|labels)", "swapped labels"),
+    (r"exchanged (columns|correctors|monitors|BPMs|planes|labels)|are exchanged", "swapped"),
     (r"few causes|few reasons", "sparse fit, common factors"),
     (r"dense fit|families' fit", "hierarchical fit"),
     (r"singled out|stands? out", "detected fault"),

@@ -4,6 +4,7 @@ import json
 import warnings
 from dataclasses import replace
 
+import at
 import numpy as np
 import pytest
 from command import tmlattice
@@ -63,8 +64,6 @@ def test_protons_are_as_fast_in_the_file(small_ring, file, tmp_path):
 
 def test_at_itself_finds_the_tunes_in_the_file(uneven, tmp_path):
     """AT tracks the file with its own elements: ten steps a magnet leave 2e-5."""
-    import at
-
     save_ring(uneven, tmp_path / "ring.at.json")
     lattice = at.load_lattice(str(tmp_path / "ring.at.json"))
     assert at.get_tune(lattice) == pytest.approx(ring_tunes(uneven), abs=5e-5)

@@ -132,7 +132,7 @@ def load(name: str, read: Callable[[bytes], Value]) -> Value | None:
     if not content:
         return None
     try:
-        if content[:_DIGEST] != _checksum(name, content[_DIGEST:]):
+        if content[:_DIGEST] != checksum(name, content[_DIGEST:]):
             raise ValueError("its checksum is wrong")
         return read(content[_DIGEST:])
     except Exception as error:  # whatever else it holds, it is no entry of this key
@@ -158,7 +158,8 @@ def _content(name: str, place: int) -> bytes:
         return file.read() if usable else b""
 
 
-def _checksum(name: str, content: bytes) -> bytes:
+def checksum(name: str, content: bytes) -> bytes:
+    """What stands before the content of an entry."""
     return hashlib.sha256(name.encode() + content).digest()
 
 
@@ -180,7 +181,7 @@ def _write(name: str, content: bytes, place: int) -> None:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     try:
         with os.fdopen(os.open(temporary, flags, 0o600, dir_fd=place), "wb") as file:
-            file.write(_checksum(name, content) + content)
+            file.write(checksum(name, content) + content)
         os.replace(temporary, name, src_dir_fd=place, dst_dir_fd=place)
     finally:
         with contextlib.suppress(FileNotFoundError):

@@ -124,6 +124,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     original = {k.casefold(): k for k in known}
     near = near or [k for k in original if name and name.casefold() in k][:3]
     shown = [original[k] for k in near] or known[:3]
-    offer = " or ".join(f"'{k}'" for k in shown)
-    question = f"did you mean {offer}?" if near else f"known are {offer}, ..."
+    offer = [f"'{k}'" for k in shown]
+    known_are = f"known: {', '.join(offer)}{', ...' * (len(known) > len(offer))}"
+    question = f"did you mean {' or '.join(offer)}?" if near else known_are
     return UnknownNameError(f"no {kind} '{name}'; {question}" if shown else f"no {kind} '{name}'")

@@ -49,7 +49,7 @@ def test_what_the_lattice_lacks_is_left_out_and_told(small_ring, response):
     assert own["findings"] == other["findings"]
     assert own["findings"][0]["effect"] == "quadrupole_gradient"
     assert found.warnings[:2] == (
-        f"not in the lattice, and left out: 1 of {len(response.monitors) + 1} monitors "
+        f"not in the lattice, and left out: 1 of {len(response.monitors) + 1} BPMs "
         "(screen_of_the_line)",
         f"not in the lattice, and left out: 1 of {len(response.correctors) + 1} correctors "
         "(steerer_of_the_line)",
@@ -78,7 +78,7 @@ def test_of_every_kind_that_has_monitors(small_ring, kind):
     strange = replace(measured, monitors=("elsewhere", *names[1:]))
     kept, said = in_the_lattice(small_ring, strange)
     assert kept.monitors == tuple(names[1:])
-    assert said == [f"not in the lattice, and left out: 1 of {len(names)} monitors (elsewhere)"]
+    assert said == [f"not in the lattice, and left out: 1 of {len(names)} BPMs (elsewhere)"]
     assert diagnose(small_ring, strange).warnings[0] == said[0]
     assert check_data(small_ring, strange).reported[0].sentence == said[0]
 
@@ -87,7 +87,7 @@ def test_another_ring_s_names_are_an_error(small_ring, response):
     names = tuple(f"other_{name}" for name in response.monitors)
     count = len(names)
     for run in (diagnose, check_data):
-        with pytest.raises(UnknownNameError, match=f"^{count} of {count} monitors are not in"):
+        with pytest.raises(UnknownNameError, match=f"^{count} of {count} BPMs are not in"):
             run(small_ring, replace(response, monitors=names))
 
 
@@ -127,5 +127,5 @@ def test_half_of_the_names_may_be_unknown_and_no_more(small_ring, response):
         if unknown <= count / 2:
             assert len(in_the_lattice(small_ring, measured)[0].monitors) == count - unknown
         else:
-            with pytest.raises(UnknownNameError, match=f"{unknown} of {count} monitors"):
+            with pytest.raises(UnknownNameError, match=f"{unknown} of {count} BPMs"):
                 in_the_lattice(small_ring, measured)

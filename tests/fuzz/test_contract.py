@@ -14,6 +14,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from contract import made, report, tried, tried_whole
 from kills import filled, killed, prepared, references
 
+from tmlattice import diagnose, load_ring, read_measurement
+
 pytestmark = pytest.mark.usefixtures("forked_readers")
 SOME = 80
 """Inputs, one or more of each format; `make fuzz` takes 10,000."""
@@ -43,8 +45,6 @@ def test_damaged_files_end_in_one_sentence(inputs):
 
 def test_one_wrong_reading_does_not_spoil_the_others(inputs):
     """2 cm for one monitor of the RF's orbit: a fit that follows it leaves 100 µm everywhere."""
-    from tmlattice import diagnose, load_ring, read_measurement
-
     ring = load_ring(inputs.folder / "ring.json")
     measured = read_measurement(inputs.folder / "response")
     orbit = measured.rf.orbit.copy()

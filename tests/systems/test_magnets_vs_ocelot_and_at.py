@@ -4,6 +4,7 @@ import at
 import numpy as np
 import pytest
 from at_ring import at_lattice
+from ocelot.cpbd.high_order import t_nnn
 from scipy.integrate import solve_ivp
 
 from tmlattice.maps import TaylorMap, taylor_map_of_ode
@@ -28,8 +29,6 @@ def test_bodies_agree_with_ocelot_to_second_order(lattice, request):
 
 
 def test_a_bend_with_gradient_and_sextupole_agrees_with_ocelot():
-    from ocelot.cpbd.high_order import t_nnn
-
     h, k1, k2, length = 0.11, 0.35, -2.3, 1.4
     ours = taylor_map_of_ode(hamilton_equations(hamiltonian(h, k1, k2)), 2, length).coefficients[2]
     T = t_nnn(length, h, k1, k2, 6.0)[:4, :4, :4]

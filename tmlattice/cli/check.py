@@ -43,7 +43,7 @@ def check(
     """Check a measurement as a whole for errors of the data, in a second.
 
     The check finds wrong signs, units, names and orders; launches and noise that contradict the
-    stated ones; silent, frozen and copied monitors; and outliers. MEASUREMENT is a folder of any
+    stated ones; silent, frozen and copied BPMs; and outliers. MEASUREMENT is a folder of any
     kind. The exit code is 0 if the data can be diagnosed, and 1 if they must be corrected first.
     """
     with outputs(None, json_file) as (_, write):

@@ -204,7 +204,7 @@ SPELT = "tmlattice.spelt"
 """How a stream writes what its encoding does not have."""
 _LETTERS = {
     "µ": "u", "±": "+-", "²": "^2", "³": "^3", "·": "*", "×": "x", "β": "beta", "σ": "sigma",
-    "χ": "chi", "–": "-", "−": "-", "…": "...",
+    "χ": "chi", "π": " pi", "–": "-", "−": "-", "…": "...",
 }  # fmt: skip
 
 

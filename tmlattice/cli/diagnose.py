@@ -445,7 +445,11 @@ def _print(
         text = "\n".join(wrapped(f"Correction: {correction.words}", "", screen.width))
         screen.print(f"\n{text}", soft_wrap=True)
     if result.parts:
-        what = ", ".join(f"{part.label} ({part.readings} readings)" for part in result.parts)
+        parts = result.parts
+        names = (p.label.replace("_", " ") if len(parts) == 1 else p.label for p in parts)
+        what = ", ".join(
+            f"{name} ({part.readings} readings)" for name, part in zip(names, parts, strict=True)
+        )
     elif result.kind == "trajectory":
         view = result.trajectories
         what = (

@@ -41,7 +41,7 @@ def predict(
     """Predict how the stored beam's orbit answers a kick of each corrector, at fixed RF frequency.
 
     The table has the columns of a measurement's response.csv: corrector, monitor, and the orbit
-    change x, y in m. It is linear in the kick. Silent monitors and channels that the fit rejected
+    change x, y in m. It is linear in the kick. Silent BPMs and channels that the fit rejected
     are left empty.
     """
     from tmlattice.files import output_file

@@ -153,7 +153,7 @@ def simulate(
 
     The virtual machine is LATTICE with effects of the catalogue in it, tracked by
     accelerator-toolbox (or by OCELOT's maps). Each shot has a launch of its own, with random
-    betatron phases; monitors read with noise. With `--kind orbit-response` the stored beam's
+    betatron phases; BPMs read with noise. With `--kind orbit-response` the stored beam's
     closed orbit is read for a step of every corrector and of the RF; `turn-by-turn` kicks the
     stored beam, `closed-orbit`, `dispersion` and `tunes` read it as it is. The folder holds no
     truth.

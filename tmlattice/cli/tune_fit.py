@@ -106,7 +106,7 @@ def tune_fit(
 ) -> None:
     """Predict the tunes of a perturbed ring from one first-turn orbit.
 
-    One magnet of LATTICE is weakened, the monitors read one noisy first turn, the network of the
+    One magnet of LATTICE is weakened, the BPMs read one noisy first turn, the network of the
     unperturbed design is fine-tuned on it, and its tunes are held against OCELOT's true ones. There
     is a column for each method: adam, the paper's recipe, which frees every weight; sparse, as few
     changed magnets as the readings ask for; map, the most probable changes of all magnets. Under

@@ -149,7 +149,7 @@ class Correction(Speaks):
     def _change(self, name: str, plane: int) -> str:
         target, now = TARGETS[name], self.before[name][plane][0]
         then, low, high = self.after[name][plane]
-        factor, unit = (100.0, "%") if target.unit == "relative" else (1.0, target.unit)
+        factor, unit = {"relative": (100.0, "%"), "m": (1e3, "mm"), "": (1.0, "")}[target.unit]
         scale = (
             f"{factor * now:.3g} to {factor * then:.3g} ± {factor * (high - low) / 2:.2g} {unit}"
         )

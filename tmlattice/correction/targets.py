@@ -47,7 +47,7 @@ class Target:
 
 TARGETS: dict[str, Target] = {
     "beta_beating": Target("beta beating", "relative", 0.01, ("x", "y")),
-    "phase_advance": Target("phase advance", "2 pi", 1e-3, ("x", "y")),
+    "phase_advance": Target("phase advance / 2π", "", 1e-3, ("x", "y")),
     "dispersion": Target("dispersion error", "m", 0.01, ("x", "y")),
     "tunes": Target("tune error", "", 1e-3, ("x", "y")),
     "chromaticity": Target("chromaticity error", "", 0.1, ("x", "y")),

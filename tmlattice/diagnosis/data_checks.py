@@ -529,9 +529,11 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
     messages: list[str] = []
     if not ring.monitors:
         return measured, messages  # nothing can be read there; reported elsewhere
-    monitors = Names("monitor", (monitor.name for monitor in ring.monitors))
-    for what, find in (("monitors", monitors.__getitem__), ("correctors", ring.index)):
-        names = getattr(own, what, ())
+    monitors = Names("BPM", (monitor.name for monitor in ring.monitors))
+    for what, kept, find in (
+        ("BPMs", "monitors", monitors.__getitem__), ("correctors", "correctors", ring.index),
+    ):  # fmt: skip
+        names = getattr(own, kept, ())
         unknown = [name for name in names if not _has(ring, monitors, name)]
         if not unknown:
             continue
@@ -540,7 +542,7 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
             raise UnknownNameError(
                 f"{len(unknown)} of {len(names)} {what} are not in the lattice: {fix}"
             )
-        own = own.select(**{what: [name for name in names if name not in unknown]})
+        own = own.select(**{kept: [name for name in names if name not in unknown]})
         typed = MEANT in fix and len(unknown) == 1
         messages.append(
             f"not in the lattice, and left out: {len(unknown)} of {len(names)} {what} "

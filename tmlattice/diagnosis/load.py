@@ -54,6 +54,8 @@ def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diag
     """
     place = Path(path)
     file = place / DOCUMENT if place.is_dir() else place
+    if not file.exists():
+        raise MeasurementError(f"no '{file}'; name a folder that `tmlattice diagnose --out` wrote")
     document = read_document(file, "diagnosis", FORMAT, VERSION)
     ring = _ring(file, document) if ring is None else ring
     places = {name for e in ring.elements for name in (e.name, e.family)}

@@ -70,15 +70,15 @@ def next_kind(
             continue
         try:
             problem = replace(kind.proposal(ring, options), fixed=fixed)
-            separation = _separation(_among(problem, explanation, pair[0]), pair)
+            apart = separation(_among(problem, explanation, pair[0]), pair)
         except TmlatticeError:  # no cavity, no corrector, no beam
             log.info("no %s can be proposed", name, exc_info=True)
             continue
         minutes = kind.minutes(ring)
-        if separation >= LEAST and separation**2 / minutes > best:
-            best = separation**2 / minutes
+        if apart >= LEAST and apart**2 / minutes > best:
+            best = apart**2 / minutes
             first, second = (" ".join(w for w in one.hypothesis if w) for one in pair)
-            found = NextMeasurement(None, {}, (first, second), separation, name, minutes)
+            found = NextMeasurement(None, {}, (first, second), apart, name, minutes)
     return found
 
 
@@ -95,7 +95,7 @@ def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Pr
     return fit_distributed_errors(problem, known, problem.first, causes, learn=False).problem
 
 
-def _separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> float:
+def separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> float:
     """The separation in standard deviations; 0 where one of the explanations has no stored beam."""
     each = [
         [c for c in one.fit.causes if problem.sees((c.effect, c.element))] for one in pair

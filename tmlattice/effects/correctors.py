@@ -105,7 +105,7 @@ class CorrectorPosition(_OnCorrector, ErrorEffect):
 
     name = "corrector_position"
     responds = True
-    words = "field of a corrector elsewhere along the beam"
+    words = "misplaced corrector (its field is at another s)"
     acts_on_settings = True
     error = "ds"
     unit = "m"

@@ -160,13 +160,13 @@ class MonitorSwap(ReadingEffect):
 
     name = "monitor_swap"
     responds = True
-    words = "BPM with its planes exchanged"
-    quantity = "planes exchanged"
+    words = "BPM with swapped planes"
+    quantity = "planes swapped"
     recommended_action = "swap the cables of {} back"
     to_check = "Follow its cables from the pick-ups to the electronics: x and y are swapped."
     calibrates = True
     unit = "discrete"
-    sign = "1: x and y are exchanged"
+    sign = "1: x and y are swapped"
     largest = 1.0
     discrete = True
 
@@ -184,7 +184,7 @@ class MonitorTurnOffset(ReadingEffect):
     """A monitor with a wrong turn count."""
 
     name = "monitor_turn_offset"
-    words = "BPM that counts its turns off"
+    words = "BPM with a wrong turn count"
     quantity = "count of turns"
     recommended_action = "set the turn count of {}"
     to_check = "Check its trigger and the delay of its turn clock."

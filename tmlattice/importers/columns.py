@@ -268,7 +268,7 @@ def _apart(path: Path, arrays: dict[str, tuple[Any, str]]) -> list[Column]:
         if array.dtype.kind not in "fiu" or array.ndim > 2:
             raise MeasurementError(
                 f"'{path}': '{name}' is an array of {array.ndim} dimensions of {array.dtype}; "
-                "readings are numbers [row] or [shot, monitor]"
+                "readings are numbers [row] or [shot, BPM]"
             )
         short = name.rsplit("/", 1)[-1]
         if array.ndim == 1:

@@ -18,7 +18,7 @@ KICK = 1e-4
 FILES = {
     "readings_wide.csv": "a row a shot, a column a BPM and plane",
     "readings_long.csv": "a row a shot and BPM",
-    "readings.h5": "x and y [shot, monitor], with the BPMs' names",
+    "readings.h5": "x and y [shot, BPM], with the BPMs' names",
     "response.csv": "an orbit response: a row a corrector and BPM (here the design's)",
     "tmlattice.toml": "what the files do not state: lattice, unit, names, bad BPMs (--machine)",
 }

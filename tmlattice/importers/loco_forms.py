@@ -255,7 +255,7 @@ def _shapes(data: dict[str, Any], monitors: Fields, correctors: Fields, said: li
     if M is not None and M.ndim == 2 and M.shape != shape:
         if M.shape == shape[::-1]:
             data["M"] = M.T
-            said.append("M stands as [correctors, monitors] and is turned")
+            said.append("M is [correctors, BPMs] and is transposed")
         elif M.shape == (len(rows), len(columns)):
             data["M"] = np.full(shape, np.nan)
             data["M"][np.ix_(rows, columns)] = M

@@ -457,7 +457,7 @@ class _Finder:
             if plain.casefold() not in self._exact and name.casefold() in others:
                 continue  # a corrector's
             if plain.casefold() not in self._exact:
-                raise unknown_name("monitor", name, self._names)
+                raise unknown_name("BPM", name, self._names)
             self._told[_norm(device)] = self._exact[plain.casefold()]
 
     def all(self, path: str, devices: Sequence[str]) -> dict[str, int | None]:
@@ -477,7 +477,7 @@ class _Finder:
         else:
             found = {device: self.find(device) for device in devices}
         if all(at is None for at in found.values()):
-            error = unknown_name("monitor", devices[0], self._names)
+            error = unknown_name("BPM", devices[0], self._names)
             raise MeasurementError(
                 f"{path}: {error}; assign the names in [channels] of "
                 "tmlattice.toml (`tmlattice import --example` writes one)"

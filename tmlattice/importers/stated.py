@@ -56,7 +56,7 @@ class Stated:
             ]  # fmt: skip
             if not like:
                 known = [*others, *monitors, *monitors.values()]
-                raise unknown_name("monitor", pattern, dict.fromkeys(known))
+                raise unknown_name("BPM", pattern, dict.fromkeys(known))
             found += like
         return [own for own in monitors if own in found]
 

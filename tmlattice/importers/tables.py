@@ -147,7 +147,7 @@ def bring_turns(
 
 def _of_ring(data: Measurement, ring: Ring, stated: Stated) -> tuple[Measurement, tuple[str, ...]]:
     """The monitors that the ring has, under its names and in its order, and what it has not."""
-    ours = Names("monitor", [element.name for element in ring.monitors])
+    ours = Names("BPM", [element.name for element in ring.monitors])
     place = {name: ours.find(stated.name_of(name)) for name in data.monitors}
     there = sorted((at, name) for name, at in place.items() if at is not None)
     missing = [name for name, at in place.items() if at is None]

@@ -194,6 +194,8 @@ def _find(name: str) -> Path:
             f".repr, .json), MAD-X (.seq, .madx; a TWISS table: .tfs), elegant (.lte), Xsuite "
             f"(.json), the package's own JSON or a built-in name ({', '.join(builtin)})"
         )
+    if path.is_dir():
+        raise LatticeError(f"'{name}' is a folder and no lattice; give the lattice first")
     if path.suffix:
         raise LatticeError(f"no lattice file '{name}'; check the path")
     raise unknown_name("lattice", name, builtin)

@@ -43,7 +43,7 @@ def marked(
     wanted_monitors, wanted_correctors = (_patterns(text) for text in (monitors, correctors))
     if not wanted_monitors and not wanted_correctors:
         return ring
-    read = _matched(ring, wanted_monitors, "monitor", _WAY | {"monitor"})
+    read = _matched(ring, wanted_monitors, "BPM", _WAY | {"monitor"})
     coils = _matched(ring, wanted_correctors, "corrector", _WAY | _CORRECTORS | _SPLIT)
     places: list[Place] = []
     errors: list[Errors] = []

@@ -50,7 +50,7 @@ def turns_of(
         kicked: change of x, px, y, py by the kick at the start of the ring, m and rad, [4].
     """
     line, with_rf, late = engine.stored_line(settings)
-    state = _orbit(engine, line, late)
+    state = stored_orbit(engine, line, late)
     rf = with_rf != line
     if rf:
         state = at_orbit.closed(functools.partial(engine.one_pass, with_rf), state, ALL, late)
@@ -66,7 +66,7 @@ def turns_of(
 def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
     """Return tunes in [0, 1) and chromaticities dQ / d delta of the stored beam, each [mode]."""
     line, _, late = engine.stored_line(settings)
-    state = _orbit(engine, line, late)
+    state = stored_orbit(engine, line, late)
     turn = functools.partial(engine.one_pass, line)
     tune = _tunes(turn, state)
     slopes = []
@@ -76,7 +76,7 @@ def tunes_of(engine: AtEngine, settings: Settings) -> tuple[Array, Array]:
     return tune, (slopes[0] - slopes[1]) / (2 * ENERGY)
 
 
-def _orbit(engine: AtEngine | NetworkEngine, line: Any, late: float) -> Array:
+def stored_orbit(engine: AtEngine | NetworkEngine, line: Any, late: float) -> Array:
     """State of the stored beam at the start of the line, without RF, [6]."""
     turn = functools.partial(engine.one_pass, line)
     start, solve = at_orbit.stored(turn)

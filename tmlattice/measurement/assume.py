@@ -91,7 +91,7 @@ def in_beam_order(data: Data, ring_monitors: Sequence[str]) -> Data:
     own: Any = data
     if isinstance(data, TuneReading) or own.monitors == tuple(ring_monitors):
         return data
-    names = Names("monitor", ring_monitors)
+    names = Names("BPM", ring_monitors)
     at = [names[name] for name in own.monitors]
     if at == sorted(at):
         return data
@@ -310,8 +310,8 @@ _TABLE: tuple[_Row, ...] = (
     ("y-reversed", _ORBITS, "y has the wrong sign at every BPM", SIGN.format("y"), _sign, 1, -1),
     ("readings-reversed", _ORBITS, "x and y have the wrong sign at every BPM",
      SIGN.format("x and y"), _sign, -1, -1),
-    ("planes-exchanged", (*_READ, TuneReading), "x and y are exchanged everywhere",
-     "exchange x and y", _exchanged),
+    ("planes-swapped", (*_READ, TuneReading), "x and y are swapped everywhere",
+     "swap x and y", _exchanged),
     ("readings-in-mm", _ORBITS, "the readings are in mm", UNIT.format("them", "m"), _unit, 1e-3),
     ("readings-in-um", _ORBITS, "the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
     ("readings-in-km", _ORBITS, "the readings are a thousand times too small",
@@ -343,7 +343,7 @@ _TABLE: tuple[_Row, ...] = (
      SIGN.format("px of every launch"), _launches, 1, -1, 1, 1),
     ("slopes-y-reversed", _FIRST, "py of the launches has the wrong sign",
      SIGN.format("py of every launch"), _launches, 1, 1, 1, -1),
-    ("launches-exchanged", _FIRST, "x, px and y, py of the launches are exchanged", "exchange them",
+    ("launches-swapped", _FIRST, "x, px and y, py of the launches are swapped", "swap them",
      _launches_exchanged),
     ("launches-in-mm", _FIRST, "the launches are in mm and mrad", UNIT.format("them", "m and rad"),
      _launches, 1e-3, 1e-3, 1e-3, 1e-3),

@@ -76,7 +76,7 @@ class Dispersion(OfMonitors):
 
     def __post_init__(self) -> None:
         monitors = tuple(self.monitors)
-        Names("monitor", monitors)
+        Names("BPM", monitors)
         steps = []
         for step in self.steps:
             check_rf(step)

@@ -49,12 +49,12 @@ def read_noise(noise: Any, read: Sequence[str], known: Sequence[str] | None) -> 
         return None
     if not any(isinstance(entry, dict) for entry in noise.values()):
         return noise_table(_pair(noise), read)
-    table = Names("monitor", noise)
+    table = Names("BPM", noise)
     if known is not None:
-        every = Names("monitor", known)
+        every = Names("BPM", known)
         for name in table.names:
             every[name]  # an UnknownNameError where the ring has no such monitor
-    names = Names("monitor", read)
+    names = Names("BPM", read)
     there = {name: _pair(entry) for name, entry in noise.items() if names.find(name) is not None}
     unread = [name for name in table.names if names.find(name) is None]
     if unread and known is None:

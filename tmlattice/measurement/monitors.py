@@ -97,7 +97,7 @@ def noise_table(noise: Any, monitors: Sequence[str]) -> Array | None:
     if noise is None:
         return None
     table = np.full((len(monitors), 2), np.nan)
-    names = Names("monitor", monitors)
+    names = Names("BPM", monitors)
     try:
         if isinstance(noise, Mapping):
             for name, pair in noise.items():

@@ -137,7 +137,7 @@ class OrbitResponse(OfMonitors):
             response=response,
         )
         Names("corrector", self.correctors)
-        Names("monitor", self.monitors)
+        Names("BPM", self.monitors)
         columns, monitors = len(self.correctors), len(self.monitors)
         if response.shape != (columns, monitors, 2):
             raise MeasurementError(

@@ -155,7 +155,7 @@ def match_names(
     found, place = rows.names[column]
     if known is None:
         return found, place
-    names = Names(column, known)
+    names = Names("BPM" if column == "monitor" else column, known)
     there = np.empty(len(found), dtype=np.int64)
     for i, name in enumerate(found):
         try:

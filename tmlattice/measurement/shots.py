@@ -66,7 +66,7 @@ class Shots(OfMonitors):
     def __post_init__(self) -> None:
         own: Any = self
         read, monitors = np.asarray(getattr(own, self.READ), dtype=float), tuple(own.monitors)
-        Names("monitor", monitors)
+        Names("BPM", monitors)
         if read.ndim != len(self.AXES) + 2 or read.shape[-2:] != (len(monitors), 2):
             axes = ", ".join(f"{axis}s" for axis in self.AXES)
             raise MeasurementError(

@@ -100,7 +100,7 @@ class OfMonitors(Shown):
         Raises:
             UnknownNameError: this measurement has a monitor that is not among them.
         """
-        places = places_of("monitor", monitors, vars(self)["monitors"])
+        places = places_of("BPM", monitors, vars(self)["monitors"])
         return self._of(monitors, lambda values: spread(values, places, len(monitors)))
 
     def at_monitors(self, monitors: Sequence[str]) -> Self:
@@ -111,7 +111,7 @@ class OfMonitors(Shown):
             MeasurementError: nothing is left.
         """
         known = vars(self)["monitors"]
-        here = places_of("monitor", known, monitors)
+        here = places_of("BPM", known, monitors)
         return self._of([known[i] for i in here], lambda values: values[..., here, :])
 
     def _of(self, monitors: Sequence[str], change: Callable[[Array], Array]) -> Self:

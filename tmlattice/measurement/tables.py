@@ -118,7 +118,7 @@ def read_turn_by_turn(
         )
     with located(path):
         if monitors is not None:
-            names = Names("monitor", monitors)
+            names = Names("BPM", monitors)
             ring = np.array([names[name] for name in found])
             order = np.argsort(ring)
             readings = readings[:, :, order]

@@ -93,7 +93,7 @@ class MeasurementWriter:
         table: TextIO,
         devices: Mapping[str, str] | None = None,
     ) -> None:
-        self.monitors = Names("monitor", monitors).names
+        self.monitors = Names("BPM", monitors).names
         self.noise = noise_table(noise, self.monitors)
         self.lattice, self.energy, self.devices = lattice, energy, devices or {}
         self._shots: set[int] = set()

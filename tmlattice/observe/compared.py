@@ -303,7 +303,7 @@ class OfLines(Compared):
         """See `Compared`; [shot * mode]. The lines are found once, but with planes exchanged, as
         each is sought in its own plane."""
         problem, change = self.problem, self._changed(names)
-        if "planes-exchanged" in names:
+        if "planes-swapped" in names:
             try:
                 problem, change = self._lines(self.assumed(names)), self._changed(())
             except MeasurementError:

@@ -28,16 +28,16 @@ from tmlattice.speaks import micrometres
 
 Array = NDArray[np.float64]
 
-COLOURS: Mapping[str, str] = {
-    "quadrupoles": "tab:red",
-    "bends": "tab:blue",
-    "correctors": "tab:orange",
-    "sextupoles": "tab:green",
-    "insertion devices": "tab:purple",
-    "monitors": "tab:cyan",
-    "beam": "tab:brown",
+STYLES: Mapping[str, tuple[str, str]] = {
+    "quadrupoles": ("tab:red", "s"),
+    "bends": ("tab:blue", "v"),
+    "correctors": ("tab:orange", "^"),
+    "sextupoles": ("tab:green", "D"),
+    "insertion devices": ("tab:purple", "P"),
+    "monitors": ("tab:cyan", "o"),
+    "beam": ("tab:brown", "X"),
 }
-"""By the group of an effect."""
+"""Colour and marker by the group of an effect."""
 
 WIDE = 300.0
 """A finding whose place is wider than this is not drawn near by, m."""
@@ -85,8 +85,8 @@ def _of_readings(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         )
     yield (
         "scan",
-        "How much better each hypothesis alone explains the data (fall of chi-square), along the "
-        "ring, before any finding. Above the dashed line it is no accident of the noise "
+        "How much better each hypothesis alone explains the data: the decrease of chi-square, "
+        "before any finding. Above the dashed line it is no accident of the noise "
         "anywhere in the scan.",
         plot_scan(diagnosis),
     )
@@ -131,7 +131,7 @@ def plot_scan(diagnosis: Diagnosis) -> Figure:
     ax, side, strip = grid[0, 0], grid[0, 1], grid[1, 0]
     grid[1, 1].axis("off")
     found = diagnosis.explanation.first
-    _draw_scan(ax, diagnosis, 3.0)
+    _draw_scan(ax, diagnosis, 1.8)
     threshold = thresholds(diagnosis)[0]
     _whole_ring(side, diagnosis)
     ax.set_yscale("log")
@@ -151,7 +151,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
     assert finding.where is not None
     figure, (ax,) = above_strip(diagnosis.ring, (11, 5), [6], figure)
     low, high = around(diagnosis, finding)
-    _draw_scan(ax, diagnosis, 7.0)
+    _draw_scan(ax, diagnosis, 4.0)
     seen = [line.get_ydata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
     places = [line.get_xdata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
     values = np.concatenate([np.asarray(v, dtype=float) for v in seen])
@@ -200,7 +200,7 @@ def thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
 
 
 def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
-    """Statistics at their places, one colour for each group, and both thresholds."""
+    """Statistics at their places, a colour and a marker for each group, and both thresholds."""
     found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
     s = middles(diagnosis)
     groups = np.array([find(effect).group for effect, _ in found.hypotheses])
@@ -211,21 +211,21 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
             layers[order], np.maximum(free.statistic[order], FLOOR),
             color="0.65", linewidth=0.9, zorder=1, label="a free kick in each shot",
         )  # fmt: skip
-    for name, colour in COLOURS.items():
+    for name, (colour, marker) in STYLES.items():
         own = (groups == name) & np.isfinite(s) & (found.statistic > FLOOR)
         if own.any():
             ax.plot(
-                s[own], found.statistic[own], linestyle="none", marker=".", color=colour,
-                ms=size, label=name.replace("monitors", "BPMs"), zorder=2,
+                s[own], found.statistic[own], linestyle="none", marker=marker, color=colour,
+                ms=size, mew=0, label=name.replace("monitors", "BPMs"), zorder=2,
             )  # fmt: skip
     named, kicks = thresholds(diagnosis)
     ax.axhline(
         named, color="k", linestyle="--", linewidth=1, zorder=3, label=f"threshold {named:.1f}"
     )
     if len(order):
-        label = f"of free kicks {kicks:.1f}"
+        label = f"threshold of free kicks {kicks:.1f}"
         ax.axhline(kicks, color="0.5", linestyle=":", linewidth=1.2, label=label)
-    ax.set_ylabel("fall of chi-square")
+    ax.set_ylabel("Δχ²")
     ax.grid(alpha=0.25)
 
 
@@ -254,7 +254,8 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     side.grid(alpha=0.25)
     side.axhline(thresholds(diagnosis)[0], color="k", linestyle="--", linewidth=1, zorder=3)
     for i, (effect, value) in enumerate(best.items()):
-        side.plot(i, value, "D", color=COLOURS[find(effect).group], ms=5, clip_on=False, zorder=4)
+        colour, marker = STYLES[find(effect).group]
+        side.plot(i, value, marker, color=colour, ms=5, clip_on=False, zorder=4)
     side.set_xticks(range(len(best)), [find(effect).label for effect in best])
     side.tick_params(axis="x", labelrotation=90, labelsize="x-small", labelbottom=True)
     for label in side.get_xticklabels():
@@ -368,7 +369,7 @@ def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
         _, ax = plt.subplots()
     members = finding.credible_set[:MOST]
     rows = np.arange(len(members))
-    colours = [COLOURS[find(member.effect).group] for member in members]
+    colours = [STYLES[find(member.effect).group][0] for member in members]
     ax.barh(rows, [100 * member.probability for member in members], color=colours, height=0.6)
     for row, member in zip(rows, members, strict=True):
         ax.annotate(

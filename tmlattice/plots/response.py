@@ -1,6 +1,7 @@
 """Figures of an orbit response's diagnosis."""
 
 from collections.abc import Iterator
+from textwrap import wrap
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -13,12 +14,18 @@ from tmlattice.optics import twiss
 from tmlattice.plots.strip import above_strip, plain_log
 
 RESIDUALS = (
-    ("heldout_rms_in_plane", "in-plane", "C0"),
-    ("heldout_rms_position", "in-plane, with position jump", "tab:cyan"),
-    ("heldout_rms_coupling", "coupling", "C3"),
-    ("dispersion_rms", "RF response", "C2"),
+    ("heldout_rms_in_plane", "in-plane", "C0", "o"),
+    ("heldout_rms_position", "in-plane, with position jump", "tab:cyan", "D"),
+    ("heldout_rms_coupling", "coupling", "C3", "s"),
+    ("dispersion_rms", "RF response", "C2", "^"),
 )
-"""Held-out residuals of a step: attribute, label, colour."""
+"""Held-out residuals of a step: attribute, label, colour, marker."""
+
+
+def step_labels(result: Diagnosis) -> list[list[str]]:
+    """What each step adds, in lines that fit under its place."""
+    names = (s.effect.replace("monitor_", "BPM_").replace("_", " ") for s in result.steps)
+    return [wrap(name, 16) for name in names]
 
 
 def gradient_errors(result: Diagnosis) -> list[tuple[Element, float, float]]:
@@ -36,7 +43,7 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         yield (
             "maps",
             "Orbit change by corrector and BPM, each corrector in its own plane: measured, and "
-            f"residuals of the {result.starting_model} and of the result. Grey: rejected.",
+            f"residuals of the {result.starting_model} and the result. Grey: rejected or held out.",
             plot_maps(result),
         )
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
@@ -120,26 +127,31 @@ def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
         ax = plt.subplots(figsize=(9, 4))[1]
     steps = result.steps
     at = np.arange(len(steps))
-    for name, label, colour in RESIDUALS:
-        ax.plot(at, [1e6 * getattr(s, name) for s in steps], "o-", color=colour, label=label)
+    for name, label, colour, marker in RESIDUALS:
+        values = [1e6 * getattr(step, name) for step in steps]
+        ax.plot(at, values, f"{marker}-", color=colour, ms=5, label=label)
     sigma = 1e6 * result.gap["noise"]
     ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
     plain_log(ax)
     ax.set_ylabel("held-out rms [µm]")
-    names = [s.effect.replace(", ", ",\n").replace("_", " ") for s in steps]
-    ax.set_xticks(at, names, fontsize=7)
+    ax.set_xticks(at, ["\n".join(lines) for lines in step_labels(result)], fontsize=7)
     ax.grid(alpha=0.25)
     ax.legend(frameon=False, fontsize=8)
     return ax
 
 
 def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
-    """Relative gradient errors with their errors, above the lattice."""
+    """Relative gradient errors with their errors; findings and suspects have their names."""
     figure, (ax,) = above_strip(result.ring, (11, 4), [5], figure)
     s, amount, sigma = np.array([(e.s, a, sigma) for e, a, sigma in gradient_errors(result)]).T
     ax.errorbar(
-        s, amount, sigma, fmt=".", color="tab:red", ecolor="0.6", markersize=3, elinewidth=0.8
+        s, amount, sigma, fmt="s", color="tab:red", ecolor="0.6", markersize=3, elinewidth=0.8
     )
+    named = {found.element for found in result.findings} | {s.element for s in result.suspects}
+    for element, value, _ in gradient_errors(result):
+        if element.name in named:
+            ax.annotate(element.name, (element.s, value), xytext=(5, 0), va="center",
+                        textcoords="offset points", fontsize="small")  # fmt: skip
     ax.axhline(0, color="0.4", linewidth=0.5)
     ax.set_ylabel("gradient error [%]")
     ax.grid(alpha=0.25)

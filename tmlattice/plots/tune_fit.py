@@ -67,14 +67,16 @@ def plot_orbit_fit(outcome: "TuneFit") -> Figure:
             if magnet is not None:
                 ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
             ax.grid(alpha=0.25)
-    grid[0].legend(loc="upper right", ncols=5, fontsize="small", framealpha=0.9)
-    if magnet is None or outcome.change is None:
-        grid[0].set_title(f"First turn of {outcome.source or 'a measurement'}")
-    else:
-        grid[0].set_title(
+    grid[0].legend(
+        loc="lower right", bbox_to_anchor=(1, 1), ncols=5, fontsize="small", frameon=False
+    )
+    title = f"First turn of {outcome.source or 'a measurement'}"
+    if magnet is not None and outcome.change is not None:
+        title = (
             f"First turn with {outcome.magnet} changed by {100 * outcome.change:+g} % "
             f"(dotted, s = {magnet.s:.1f} m)"
         )
+    grid[0].set_title(title, loc="left", fontsize="medium")
     return figure
 
 
@@ -97,7 +99,7 @@ def plot_loss(
     penalty = rate * np.asarray(fit.penalty)
     if (penalty > 0).any():
         label = f"{rate:g} x {fit.options['regularization']} penalty"
-        ax.semilogy(np.where(penalty > 0, penalty, np.nan), color="C2", label=label)
+        ax.semilogy(np.where(penalty > 0, penalty, np.nan), color="C0", label=label)
     if floor:
         ax.axhline(floor, color="k", linestyle="--", linewidth=0.9, label="noise alone")
     for name, loss in (others or {}).items():
@@ -106,7 +108,7 @@ def plot_loss(
     ax.set_xlabel("epoch")
     ax.set_ylabel("loss [m²]")
     ax.grid(alpha=0.25)
-    ax.legend(fontsize="small")
+    ax.legend(fontsize="small", loc="center right")
     return ax
 
 
@@ -168,7 +170,8 @@ SMALLEST = 1e-9
 
 
 def plot_study(ring: "Ring", cases: "Sequence[Case]", figure: Figure | None = None) -> Figure:
-    """|dQx| and |dQy| of every case against the place of its magnet, one colour a method.
+    """|dQx| and |dQy| of every case against the place of its magnet, a colour and a marker a
+    method.
 
     Cases with an unstable ring, or without a prediction, are crosses at the foot.
     """
@@ -177,14 +180,15 @@ def plot_study(ring: "Ring", cases: "Sequence[Case]", figure: Figure | None = No
     without = sorted({c.s for c in cases if c.absolute_error is None and np.isfinite(c.s)})
     for plane, name in enumerate("xy"):
         ax = grid[plane]
-        for colour, method in enumerate(methods):
+        for k, (method, marker) in enumerate(zip(methods, "os^Dv<>", strict=False)):
+            colour = METHOD_COLOURS.get(method, f"C{4 + k}")
             good = [c for c in cases if c.method == method and c.absolute_error is not None]
             errors = [max(c.absolute_error[plane], SMALLEST) for c in good if c.absolute_error]
             label = method
             if errors:
                 label += f", median {np.median(errors):.1e}"
-                ax.axhline(float(np.median(errors)), color=f"C{colour}", linewidth=0.8, alpha=0.6)
-            ax.plot([c.s for c in good], errors, ".", color=f"C{colour}", ms=4, label=label)
+                ax.axhline(float(np.median(errors)), color=colour, linewidth=0.8, alpha=0.6)
+            ax.plot([c.s for c in good], errors, marker, color=colour, ms=3, label=label)
         if without:
             ax.plot(without, np.full(len(without), 0.03), "x", color="0.5", ms=4,
                     transform=ax.get_xaxis_transform(), label="no tune")  # fmt: skip

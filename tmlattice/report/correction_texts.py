@@ -89,6 +89,7 @@ def sentences(correction: Correction) -> list[str]:
     share, error = 100 * correction.gain, 100 * correction.gain_error
     found = [] if correction.refused else [
         f"Expected gain: {share:.3g} ± {error:.1g} % of the squared errors in units of their "
-        f"tolerances. Measurements and corrections that this ring needs: {correction.iterations}."
+        "tolerances. Measurements and corrections that are expected to be needed: "
+        f"{correction.iterations}."
     ]  # fmt: skip
     return found + [f"Note: {text}." for text in correction.warnings]

@@ -22,8 +22,8 @@ from tmlattice.lattice.survey import survey
 from tmlattice.plots import plan as plan_view
 from tmlattice.plots import strip as strip_view
 from tmlattice.plots.diagnosis import (
-    COLOURS,
     FLOOR,
+    STYLES,
     around,
     clearest,
     gap_labels,
@@ -33,11 +33,17 @@ from tmlattice.plots.diagnosis import (
     thresholds,
 )
 from tmlattice.plots.readings import AFTER, BEFORE, design_readings, worst_shot
-from tmlattice.plots.response import RESIDUALS, gradient_errors
+from tmlattice.plots.response import RESIDUALS, gradient_errors, step_labels
 from tmlattice.report.amounts import amount_text, words
 from tmlattice.speaks import micrometres
 
 Figure = dict[str, Any]
+
+SYMBOLS = {
+    "o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down",
+    "P": "cross", "X": "x",
+}  # fmt: skip
+"""Plotly's names of matplotlib's markers."""
 
 MOST = 4000
 """Points of the scan that are drawn, so that the page stays quick. The picture has all."""
@@ -95,12 +101,17 @@ def _colour(name: str) -> str:
 
 def _trace(
     x: ArrayLike, y: ArrayLike, name: str, colour: str, *, mode: str = "lines", size: float = 1.2,
-    text: Sequence[str] | None = None, hover: str = "", dash: str = "solid", **more: Any,
+    text: Sequence[str] | None = None, hover: str = "", dash: str = "solid", marker: str = "o",
+    **more: Any,
 ) -> Figure:  # fmt: skip
     """A line or markers; on hover a point shows its `text`, then the template `hover`."""
-    style: Figure = {"line": {"width": size, "color": _colour(colour), "dash": dash}}
-    if mode == "markers":
-        style = {"marker": {"size": size, "color": _colour(colour)}}
+    style: Figure = {}
+    if "lines" in mode:
+        style["line"] = {"width": size, "color": _colour(colour), "dash": dash}
+    if "markers" in mode:
+        style["marker"] = {
+            "size": 7 if style else size, "color": _colour(colour), "symbol": SYMBOLS[marker],
+        }  # fmt: skip
     texts: Figure = {"hoverinfo": "skip"}
     if text is not None:
         texts = {
@@ -123,7 +134,7 @@ def _layout(height: int, **axes: Any) -> Figure:
         "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom",
                    "itemsizing": "constant"},
         "modebar": {"orientation": "v", "bgcolor": "rgba(0, 0, 0, 0)", "color": "#8c8c8c",
-                    "activecolor": "#5c5c5c"},  # upright: beside the legend
+                    "activecolor": "#5c5c5c"},  # upright: next to the legend
         **axes,
     }  # fmt: skip
 
@@ -192,8 +203,8 @@ def plan(diagnosis: Diagnosis) -> Figure:
         own = [ring.elements[i] for i in places]
         trace = _trace(at[:, 0], at[:, 1], plan_view.plural(kind), colour, mode="markers",
                        size=3 if small else 4, hover=f"<br>{kind}",
+                       marker=plan_view.SMALL[kind].marker if small else "o",
                        text=[f"{e.name}\ns = {e.s:.2f} m" for e in own])  # fmt: skip
-        trace["marker"]["symbol"] = "triangle-up" if kind == "corrector" else "circle"
         traces.append(trace)
     for number, finding, place, lines_off in plan_view.placed(diagnosis, view):
         high, side = plan_view.inwards(place, view)
@@ -219,8 +230,8 @@ def plan(diagnosis: Diagnosis) -> Figure:
         trace["marker"]["symbol"] = "circle-open"
         traces.append(trace)
     layout = _layout(
-        460, xaxis=_axis("m", showgrid=False),
-        yaxis=_axis("", scaleanchor="x", scaleratio=1, showgrid=False),
+        460, xaxis=_axis("x [m]", showgrid=False),
+        yaxis=_axis("y [m]", scaleanchor="x", scaleratio=1, showgrid=False),
     )  # fmt: skip
     return {"data": traces, "layout": layout}
 
@@ -310,7 +321,7 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
     layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
     order = np.argsort(layers)
     order = order[(layers[order] >= low) & (layers[order] <= high)]
-    order_of = {group: k for k, group in enumerate(COLOURS)}
+    order_of = {group: k for k, group in enumerate(STYLES)}
     kicks = np.maximum(free.statistic[order], FLOOR)
     traces = [_trace(layers[order], kicks, "a free kick in each shot", "@faint")]
     by_effect: dict[str, list[int]] = {}
@@ -319,29 +330,30 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
     shown: set[str] = set()
     for effect, own in sorted(by_effect.items(), key=lambda item: order_of[find(item[0]).group]):
         group = find(effect).group
+        colour, marker = STYLES[group]
         hover = [f"{found.hypotheses[i][1]}\n{_amount(effect, found.amount[i])}" for i in own]
         traces.append(
             _trace(s[own], found.statistic[own], group.replace("monitors", "BPMs"),
-                   COLOURS[group], mode="markers", size=4,
-                   hover=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>fall of chi² %{{y}}",
+                   colour, mode="markers", size=4, marker=marker,
+                   hover=f"<br>{words(effect)}<br>s = %{{x:.2f}} m<br>Δχ² %{{y}}",
                    text=hover, legendgroup=group, showlegend=group not in shown)
         )  # fmt: skip
         shown.add(group)
     named, of_kicks = thresholds(diagnosis)
     ends = [low, high]
     traces.append(_trace(ends, [named] * 2, f"threshold {named:.1f}", "@ink", dash="dash"))
-    text = f"of free kicks {of_kicks:.1f}"
+    text = f"threshold of free kicks {of_kicks:.1f}"
     traces.append(_trace(ends, [of_kicks] * 2, text, "@faint", dash="dot"))
     if not len(order):
         del traces[0], traces[-1]
     layout = _layout(
         480, xaxis=_axis("s [m]", anchor="y2"), shapes=_marks(diagnosis),
-        yaxis=_axis("fall of chi²", type="log", dtick=1, domain=[0.13, 1], exponentformat="power"),
+        yaxis=_axis("Δχ²", type="log", dtick=1, domain=[0.13, 1], exponentformat="power"),
         yaxis2={**_STRIP_AXIS, "domain": [0, 0.09]},
     )  # fmt: skip
     if span is not None:
         layout["xaxis"]["range"] = [low, high]
-        layout["yaxis"] = _axis("fall of chi²", domain=[0.13, 1], rangemode="tozero")
+        layout["yaxis"] = _axis("Δχ²", domain=[0.13, 1], rangemode="tozero")
     return {"data": traces, "layout": layout, "strip": "y2"}
 
 
@@ -383,18 +395,19 @@ def steps(diagnosis: Diagnosis) -> Figure:
     kept = diagnosis.steps
     at = list(range(len(kept)))
     traces = []
-    for name, label, colour in RESIDUALS:
+    for name, label, colour, marker in RESIDUALS:
         values = [1e6 * getattr(step, name) for step in kept]
-        trace = _trace(at, values, label, colour, text=[step.effect for step in kept],
-                       hover=f"<br>{label} %{{y:.3g}} µm")  # fmt: skip
-        traces.append({**trace, "mode": "lines+markers"})
+        traces.append(
+            _trace(at, values, label, colour, mode="lines+markers", marker=marker,
+                   text=[step.effect for step in kept], hover=f"<br>{label} %{{y:.3g}} µm")
+        )  # fmt: skip
     noise = 1e6 * diagnosis.gap["noise"]
     traces.append(
         _trace([0, len(kept) - 1], [noise, noise], f"noise {noise:.2g} µm", "@faint", dash="dot")
     )
-    names = [as_plain("\n".join(wrap(step.effect.replace("_", " "), 16))) for step in kept]
+    names = [as_plain("\n".join(lines)) for lines in step_labels(diagnosis)]
     layout = _layout(
-        400, xaxis={"tickvals": at, "ticktext": names, "automargin": True},
+        400, xaxis={"tickvals": at, "ticktext": names, "automargin": True, "zeroline": False},
         yaxis=_axis("held-out rms [µm]", type="log", tickvals=_ONE_TWO_FIVE),
     )  # fmt: skip
     return {"data": traces, "layout": layout}

@@ -22,7 +22,7 @@ PULLS = 4
 def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
     """Head and rows of the table of steps: effect (in the first step the model), parameters,
     held-out rms in µm."""
-    head = ("step", "amounts", "in-plane", "jump", "coupling", "roll", "RF", "chi2")
+    head = ("step", "amounts", "in-plane", "jump", "coupling", "roll", "RF", "chi²")
     rows: list[tuple[str, ...]] = [
         (
             (model if step.effect == "design" else "") or step.effect,
@@ -138,7 +138,7 @@ def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
 
 SURE = 0.95
 """Probability of a common factor from which on its probability is not printed."""
-REASON = ("common factor", "gradients", "magnets", "chi2", "possible cause")
+REASON = ("common factor or magnet", "gradients", "magnets", "chi²", "possible cause")
 
 
 def common_factor_rows(result: Diagnosis) -> list[tuple[str, ...]]:
@@ -177,19 +177,20 @@ def common_factors_sentence(result: Diagnosis) -> str:
         if own.between
         else ""
     )
-    if not own.common_factors:
+    if not any(len(one.members) > 1 for one in own.common_factors):
         return (
-            "No common factor was detected; the gradients scatter by "
+            "No common factor of several magnets was detected; the gradients scatter by "
             f"{100 * own.scatter:.2g} % (rms).{families}"
         )
     return (
-        f"Common factors explain {100 * own.share:.0f} % of the gradients' mean square; single "
-        f"magnets scatter about them by {100 * own.scatter:.2g} % (rms).{families}"
+        f"Common factors of several magnets explain {100 * own.share:.0f} % of the gradients' "
+        f"mean square; single magnets scatter about them by {100 * own.scatter:.2g} % "
+        f"(rms).{families}"
     )
 
 
 INSTEAD = "Alternative common factors of the same gradients:"
-OUTLIERS = "Outliers, for which a fault other than a gradient error is likely:"
+OUTLIERS = "Outlier magnets, of which another fault than a gradient error is probable:"
 MISSING = "Missing effects: held-out rms in µm, each alone, and on top of those that improve:"
 REJECTED = "Rejected, because they increase the held-out residual or their amount is implausible:"
 
@@ -218,7 +219,9 @@ def instead_texts(result: Diagnosis) -> list[str]:
 def outlier_texts(result: Diagnosis) -> list[str]:
     """Outlier magnets, with the neighbours that they are correlated with."""
     said = []
-    for own in () if result.common_factors is None else result.common_factors.outliers[:SHOWN]:
+    found = {finding.element for finding in result.findings}  # the fault is known
+    outliers = () if result.common_factors is None else result.common_factors.outliers
+    for own in [one for one in outliers if one.element not in found][:SHOWN]:
         text = f"{own.element} {100 * own.amount:+.1f} ± {100 * own.amount_sigma:.1f} %"
         pulls = ", ".join(
             f"{name} ({100 * amount:+.1f} %, correlation {correlation:+.2f})"
@@ -268,7 +271,7 @@ def bad_monitors_text(result: Diagnosis) -> str:
 
 def steps_text(result: Diagnosis, width: int) -> list[str]:
     """The section of the plain text, as lines."""
-    lines = wrapped("Held-out correctors, rms in µm (chi2 per reading):", "", width)
+    lines = wrapped("Held-out correctors, rms in µm (chi² per reading):", "", width)
     lines += columns(step_rows(result.steps, result.starting_model), width, right=True)
     if result.rejected_steps:
         lines += ["", *wrapped(REJECTED, "", width)]
@@ -277,7 +280,8 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     if result.common_factors is not None:
         lines += ["", "Common factors of the gradients:"]
         for name, amount, count, square, makes in common_factor_rows(result):
-            factor = f"{name}: {amount}, {count} magnets, chi2 {square}; {makes}"
+            of = "" if count == "1" else f"{count} magnets, "
+            factor = f"{name}: {amount}, {of}chi² {square}; {makes}"
             lines += wrapped(factor, "   ", width)
         lines += wrapped(common_factors_sentence(result), "", width)
         instead = instead_texts(result)

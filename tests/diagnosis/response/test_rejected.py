@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +44,7 @@ def day(ring_kicking_x, tmp_path_factory):
     words = ["diagnose", folder / "ring.json", folder / "day", "--lattice-out",
              folder / "found.json", "--json", folder / "found.diagnosis.json", "--effects",
              "quadrupole_gradient,monitor_gain_x,monitor_gain_y,monitor_swap"]  # fmt: skip
+    (folder / "ring.json.known.json").write_text("{}")
     tmlattice(*words, cwd=folder, check=0)
     return ring, measured, folder
 
@@ -78,6 +80,8 @@ def left(table, measured, columns):
 def test_prediction_of_the_written_files_reproduces_the_held_out_figure(day):
     ring, measured, folder = day
     told = json.loads((folder / "found.diagnosis.json").read_text())
+    (said,) = told["provenance"]["assumed_of_files"]  # a response starts from no earlier knowledge
+    assert re.search(r"known.json' is not used.*--reference", said)
     figure = told["steps"][-1]["heldout_rms_in_plane"]
     gone = {own["element"] for own in told["rejected_channels"] if own["plane"] is None}
     kept = measured.select(correctors=[c for c in measured.correctors if c not in gone])

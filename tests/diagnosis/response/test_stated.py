@@ -126,4 +126,4 @@ def test_gradients_hold_where_the_orbit_is_millimetres_off_in_sextupoles(small_r
         if cause.effect == "quadrupole_gradient"
     ]
     assert max(map(abs, pulls)) < 4
-    assert any("rms off the centres of sextupoles in x" in said for said in found.warnings)
+    assert any("mm in x and" in said for said in found.warnings)

@@ -330,18 +330,20 @@ class VerticalOrbit(_Orbit):
 
 
 def orbits_in_sextupoles(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
-    """Yield a message for each plane in which the closed orbit acts in sextupoles.
+    """Yield a message where the closed orbit acts in sextupoles.
 
     Args:
         values: fitted, by variable.
         data: the response.
     """
-    for family in (HorizontalOrbit(), VerticalOrbit()):
-        own = values.get(family.variable, np.zeros(0))
-        if own.any():
-            size = _rms(own, family.patterns(data).orbits)
-            yield (
-                f"the closed orbit is {1e3 * size:.2g} mm rms off the centres of sextupoles in "
-                f"{'xy'[family.plane]}, as their {FIELDS[family.plane]}s show; the data do not "
-                "separate the errors of bends and quadrupoles that make it"
-            )
+    sizes = [
+        f"{1e3 * _rms(own, family.patterns(data).orbits):.2g} mm in {'xy'[family.plane]}"
+        for family in (HorizontalOrbit(), VerticalOrbit())
+        if (own := values.get(family.variable, np.zeros(0))).any()
+    ]
+    if sizes:
+        yield (
+            f"the sextupoles' gradients and skew gradients show a closed orbit of "
+            f"{' and '.join(sizes)} (rms) about their centres; the data do not separate the errors "
+            "of bends and quadrupoles that make it"
+        )

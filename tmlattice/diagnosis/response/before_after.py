@@ -193,7 +193,7 @@ def _lost(before: OrbitResponse, after: OrbitResponse) -> list[str]:
     messages = []
     for what, a, b in (
         ("correctors", before.correctors, after.correctors),
-        ("monitors", before.monitors, after.monitors),
+        ("BPMs", before.monitors, after.monitors),
     ):
         alone = sorted({n.casefold() for n in a} ^ {n.casefold() for n in b})
         if alone:

@@ -49,9 +49,9 @@ MESSAGES = {
     **{
         f"swapped {what}": f"{what} that respond each as the other one should, taken as swapped: "
         "{}; look at their cables and at the table of names"
-        for what in ("correctors", "monitors")
+        for what in ("correctors", "BPMs")
     },
-    "rejected monitor": "BPM channels that the model cannot describe, rejected: {}",
+    "rejected BPM": "BPM channels that the model cannot describe, rejected: {}",
     "rejected corrector": "correctors that the model cannot describe, rejected: {}",
     "inconsistent": "inconsistent steps, at which neighbouring BPMs contradict one another as if "
     "some had been read before the orbit settled, rejected: {}; measure these correctors again, "
@@ -167,7 +167,7 @@ def swapped_monitors(state: State, among: Collection[str]) -> list[Label]:
     left = sum(_as_others(orbits[rows].T, model[rows].T)
                for rows in (data.plane[:-1] == p for p in (0, 1)))  # fmt: skip
     pairs = combinations([m for m, name in enumerate(names) if name in among], 2)
-    return _pairs("monitors", names, np.asarray(left), pairs, float(np.median(data.noise)))
+    return _pairs("BPMs", names, np.asarray(left), pairs, float(np.median(data.noise)))
 
 
 def swapped_planes(state: State) -> list[Label]:
@@ -254,7 +254,7 @@ def rejected_channels(state: State) -> list[Label]:
         there = np.isfinite(orbits[rows]) & state.good
         noise = np.broadcast_to(data.noise[:, p], there.shape)
         bad = _unlike(read[rows], orbits[rows], noise, there)
-        monitors += [Label("rejected monitor", (data.measured.monitors[m],), plane="xy"[p])
+        monitors += [Label("rejected BPM", (data.measured.monitors[m],), plane="xy"[p])
                      for m in np.flatnonzero(bad)]  # fmt: skip
         odd = _unlike(read[rows].T, orbits[rows].T, noise.T, (there & ~bad).T)
         correctors += [Label("rejected corrector", (data.measured.correctors[rows[c]],))

@@ -216,7 +216,7 @@ def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> lis
     ring, by the typical column or by a better start, columns match by chance, and the ring is
     fitted before swaps are sought."""
     gone = rejected_channels(state)
-    names = [own.elements[0] for own in gone if own.kind == "rejected monitor"]
+    names = [own.elements[0] for own in gone if own.kind == "rejected BPM"]
     good = state.good & ~np.isin(state.data.measured.monitors, names)
     there = replace(state, good=good)
     far = of_design and (strange(there, TYPICAL) > FAR or first_guess(there) is not None)

@@ -59,7 +59,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         there: `linear` of that block at the start.
         bold: factor on the step bounds; small after diverged rounds.
     """
-    found = _within(there, bold)
+    found = bounded_step(there, bold)
     groups = {group.name: group for group in found.groups}
     learnt = replace(state, groups={**state.groups, **groups})
     weights = weight(state, block)
@@ -99,7 +99,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
     return best
 
 
-def _within(there: Linear, bold: float) -> Posterior:
+def bounded_step(there: Linear, bold: float) -> Posterior:
     """The bounded step, with numbers fixed at their lower bounds where it would cross them."""
     groups, trust = there.groups, bold * there.trust
     for _ in range(HELD):
