@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
@@ -328,7 +329,7 @@ def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
     )]  # fmt: skip
 
 
-def _follows_nothing(shares: NDArray[np.float64]) -> NDArray[np.intp]:
+def _follows_nothing(shares: Array) -> NDArray[np.intp]:
     """The last sections that follow no trajectory, by their shares [section]; none, if those before
     do not either."""
     read = np.flatnonzero(np.isfinite(shares))

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.recommended_actions import credible as credible_actions
@@ -21,8 +21,6 @@ from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
 from tmlattice.inference.search import Explanation, Identified
 from tmlattice.lattice import Element, Ring
-
-Array = NDArray[np.float64]
 
 
 def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternative], Array]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.model import Model
 from tmlattice.beam.rf import rf_of
@@ -42,8 +42,6 @@ from tmlattice.observe.split import split_columns
 from tmlattice.observe.stored import ModelCache, Stored
 from tmlattice.observe.tune_readings import tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
-
-Array = NDArray[np.float64]
 
 NOISE, TURN_NOISE = 2e-6, 2e-5
 """rms of an averaged reading of a stored beam, and of one of one turn, m."""

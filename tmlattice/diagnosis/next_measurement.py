@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
 from tmlattice.diagnosis.records import OPTIONAL, named, record_of
@@ -22,8 +22,6 @@ from tmlattice.lattice import Ring
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import one_turn_optics
-
-Array = NDArray[np.float64]
 
 PHASES = 12
 CHANGES = {

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
 from tmlattice.effects import LaunchEffect, expected_radiation, find, modelled, names, rare
@@ -23,8 +23,6 @@ from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.data import Data, joined, of_measurement
 from tmlattice.observe.first_turns import STEPS, FirstTurns
 from tmlattice.observe.noise import estimate
-
-Array = NDArray[np.float64]
 
 FLOOR = 2e-4
 """Lower limit of the noise, as a share of the orbit. Second-order maps leave 2e-5 of an orbit of a
@@ -260,7 +258,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
-def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
+def same_monitors(other: Data, data: Data, dropped: Flags) -> Data:
     """Held-out readings of the BPMs that the fit kept.
 
     Args:
@@ -280,9 +278,7 @@ _COLUMNS = (0, 1, 2, 3, 5)
 """The five coordinates of a launch in a measurement."""
 
 
-def chosen_effects(
-    ring: Ring, effects: Sequence[str] | None, launch_sigma: NDArray[np.float64]
-) -> list[str]:
+def chosen_effects(ring: Ring, effects: Sequence[str] | None, launch_sigma: Array) -> list[str]:
     """The effects to be fitted; none where all that are requested show in the data alone.
 
     Args:

@@ -13,15 +13,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.records import OPTIONAL, record_of
 from tmlattice.diagnosis.support import share_of_fault
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.effects.effect import FamilyEffect, StrengthEffect
 from tmlattice.lattice import Element, Kind, Ring
-
-Array = NDArray[np.float64]
 
 STRENGTHS = {"k1": "1/m2", "k2": "1/m3"}
 """Strengths reported before and after, with their units."""

@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.kinds import KINDS
@@ -259,7 +259,7 @@ class Diagnosis(Speaks):
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
     supports: tuple[Support, ...] = ()
-    covariance: NDArray[np.float64] | None = field(default=None, repr=False)
+    covariance: Array | None = field(default=None, repr=False)
 
     report = Method("tmlattice.report.plain", "report_text", "The report as plain text.")
     save = Method(

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.records import encoded, named
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.judgement import DEFAULT
@@ -16,9 +16,6 @@ from tmlattice.measurement.lost_beam import FEWEST, LostBeam
 from tmlattice.measurement.monitors import LARGEST_READING
 from tmlattice.measurement.shots import FEWEST as TURNS
 from tmlattice.observe.noise import SAME_PLACE
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 NAMED = 3
 """Names of BPMs in a sentence at most."""

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
@@ -28,9 +28,6 @@ from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import DETERMINED, Gap, Misfit, held_out_gap
 from tmlattice.inference.whitening import Blocks
 from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import find
 from tmlattice.inference.problem import Hypothesis
 
@@ -102,9 +102,7 @@ class Correlation:
         return {"first": one, "second": other, "correlation": self.correlation}
 
 
-def correlations_of(
-    amounts: Sequence[Hypothesis], covariance: NDArray[np.float64]
-) -> tuple[Correlation, ...]:
+def correlations_of(amounts: Sequence[Hypothesis], covariance: Array) -> tuple[Correlation, ...]:
     """The pairs with the strongest correlations, from `STRONG` on.
 
     Args:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
@@ -26,8 +26,6 @@ from tmlattice.measurement.documents import read_document
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 

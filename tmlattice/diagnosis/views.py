@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.records import OPTIONAL, named, record_of
 from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
@@ -70,9 +70,9 @@ class TrajectoryView:
 
     explanation: Explanation
     problem: FirstTurns
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
-    dropped: NDArray[np.bool_]
+    before: Array
+    after: Array
+    dropped: Flags
 
     @property
     def data(self) -> Data:
@@ -93,11 +93,11 @@ class ResponseView:
     """
 
     measured: OrbitResponse
-    data: NDArray[np.float64]
-    design: NDArray[np.float64]
-    model: NDArray[np.float64]
-    held: NDArray[np.bool_]
-    good: NDArray[np.bool_]
+    data: Array
+    design: Array
+    model: Array
+    held: Flags
+    good: Flags
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ class PartView:
     before: Misfit
     after: Misfit
     monitors: tuple[str, ...]
-    left: NDArray[np.float64] = field(repr=False)
+    left: Array = field(repr=False)
     numbers: tuple[NumberRead, ...] = field(default=(), metadata=OPTIONAL)
 
     def as_json(self) -> dict[str, Any]:

@@ -4,17 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference import chi2
 from tmlattice.inference.common_factors import MIN_CHI2
 from tmlattice.inference.newton import Fit, Outcome, fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan
-
-Array = NDArray[np.float64]
-
 
 MIN_FALL = 1.0
 """Chi-square that a parameter takes from noise: a smaller fall explains nothing."""

@@ -25,11 +25,10 @@ from heapq import heapify, heappop, heappush
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
 from scipy.special import logsumexp
 
-Array = NDArray[np.float64]
+from tmlattice.arrays import Array
 
 MIN_CHI2 = 25.0
 """Chi-square of a selected factor, at least: five standard deviations."""

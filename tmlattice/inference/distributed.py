@@ -18,9 +18,9 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
@@ -28,9 +28,6 @@ from tmlattice.inference.newton import Fit, fit, fit_nuisances
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.variance_components import VarianceComponents, fit_variance_components
 from tmlattice.inference.whitening import Projection, Root, inverse_root
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 LINEARISATIONS = 8
 """At the design, and at the most probable errors until the model is linear up to these: at most.
@@ -272,7 +269,7 @@ class DistributedProblem(MarginalProblem):
 
     known: DistributedErrors = field(repr=False)
     linearised_at: Array = field(repr=False)
-    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
+    open: tuple[Indices, Array] | None = field(default=None, repr=False)
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
         """Degrees of freedom of the variance along a hypothesis, from the scales' covariance."""
@@ -505,7 +502,7 @@ def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesi
     return out
 
 
-def families_of(known: DistributedErrors) -> tuple[list[str], NDArray[np.int64]]:
+def families_of(known: DistributedErrors) -> tuple[list[str], Indices]:
     """Effects in `known`, and the index of each error's effect, [error]."""
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     return names, np.array([names.index(name) for name, _ in known.hypotheses])
@@ -553,7 +550,7 @@ def chain_factors(known: DistributedErrors, amounts: Array) -> Array:
     return np.array([find(name).chain(amount) for (name, _), amount in own])
 
 
-def sampled_rows(count: int) -> NDArray[np.int64]:
+def sampled_rows(count: int) -> Indices:
     """Return rows for variance components: a fixed random sample, as rows alternate in kind."""
     if count <= ROWS:
         return np.arange(count)
@@ -564,7 +561,7 @@ def components_of_rows(
     residual: Array,
     directions: Array,
     rows: Array,
-    belongs: NDArray[np.int64],
+    belongs: Indices,
     noise: Sequence[Flags] = (),
 ) -> VarianceComponents:
     """Return the variance components from a sample of rows.
@@ -601,7 +598,7 @@ class Posterior:
 
     before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
-    visible: NDArray[np.int64] = field(repr=False)
+    visible: Indices = field(repr=False)
     spread: Array = field(repr=False)
     errors: Mapping[str, float]
 
@@ -704,7 +701,7 @@ def sums_at(
     point: Point,
     known: DistributedErrors,
     amounts: Array,
-    keep: NDArray[np.int64],
+    keep: Indices,
 ) -> Sums:
     """Return the sums at a point.
 

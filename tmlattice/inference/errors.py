@@ -28,14 +28,11 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.inference.normal import ROUNDING, Normal, Slopes, shared_by, times_precision
 from tmlattice.inference.priors import Group
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MAX_LEVERAGE = 0.75
 """Leverage of a cluster above which the other readings know too little to test it. The mean
@@ -258,7 +255,7 @@ class _Mixtures:
             self.square[begin:end, : len(chances)] = scales**2
         self.variance = np.sum(np.exp(self.log_chance) * self.square, axis=1)
 
-    def some(self, members: NDArray[np.bool_]) -> "_Mixtures":
+    def some(self, members: Flags) -> "_Mixtures":
         """Return the priors of some members."""
         made = copy(self)
         made.log_chance, made.square = self.log_chance[members], self.square[members]
@@ -407,7 +404,7 @@ class _Scales:
 
     def __init__(
         self, information: Array, score: Array, group: Indices, groups: Sequence[Group],
-        absent: NDArray[np.bool_],
+        absent: Flags,
     ) -> None:  # fmt: skip
         self.information, self.score, self.group = information, score, group
         self.known: dict[bytes, float] = {}

@@ -8,12 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.inference.whitening import Projection
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Hypothesis = tuple[str, str | None]
 """An effect and its place."""
 
@@ -93,7 +91,7 @@ class Metric:
             rows = np.concatenate(some)
             yield np.arange(rows.shape[1]), rows
 
-    def free_kicks(self, places: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
+    def free_kicks(self, places: Indices, clean: Array) -> tuple[Array, Array]:
         """Information of free kicks at places, and their product with data.
 
         Returns:

@@ -9,14 +9,12 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.scan import free_scan
 from tmlattice.inference.whitening import Projection
-
-Array = NDArray[np.float64]
 
 STEP_SHARES = (1.0, 0.5, 0.25, 0.0625)
 """Shares of a step, tried in turn until the cost falls."""

@@ -17,18 +17,14 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 from scipy.linalg.blas import dsyrk, dtrmm
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 from scipy.sparse import csr_array
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.compiled import jit_sums
 from tmlattice.inference.priors import Group
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
 
 ROUNDING = 1e-11
 

@@ -10,14 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.effects import find
 from tmlattice.inference import chi2
 from tmlattice.inference.metric import Hypothesis, Metric
-
-Array = NDArray[np.float64]
 
 DRAWS = 64
 """Simulations of pure noise for the threshold: the effective number is known to 12 %."""
@@ -141,10 +139,10 @@ class FreeScan:
         amounts: best values, [place, parameter], zero where there is none.
     """
 
-    places: NDArray[np.int64]
+    places: Indices
     gain: Array
     statistic: Array
-    freedom: NDArray[np.int64]
+    freedom: Indices
     amounts: Array
 
 
@@ -171,7 +169,7 @@ def evidence_of_scale(values: Array, information: Array) -> Array:
     return np.asarray(logsumexp(gains, axis=0) - np.log(len(_RATIOS)))
 
 
-def free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan:
+def free_scan(places: Indices, gram: Array, inner: Array) -> FreeScan:
     """Statistics of groups of parameters.
 
     Args:

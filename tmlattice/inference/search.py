@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Flags
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Alternative, Detection, alternatives, linear_evidence
 from tmlattice.inference.newton import Fit, Outcome, fit
@@ -32,8 +32,6 @@ from tmlattice.inference.scan import (
 )
 
 log = logging.getLogger(__name__)
-
-Flags = NDArray[np.bool_]
 
 
 READINGS_PER_OUTLIER = 10

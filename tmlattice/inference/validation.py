@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import Array
 from tmlattice.inference import chi2
-
-Array = NDArray[np.float64]
 
 DETERMINED = 5.0
 """Standard errors of a gap from which on the share that is explained is determined, to a fifth."""

@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 
-Array = NDArray[np.float64]
+from tmlattice.arrays import Array, Flags
 
 COMMON_SPREAD = 1.5
 """rms of the common log scale: machines differ by factors of five."""
@@ -57,7 +56,7 @@ class VarianceComponents:
 
 
 def fit_variance_components(
-    rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[NDArray[np.bool_]] = ()
+    rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[Flags] = ()
 ) -> VarianceComponents:
     """Return the most probable scales of families of distributed errors.
 

@@ -22,12 +22,10 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, eigh
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.inference.normal import inverse_of_lower, lower_factor
-
-Array = NDArray[np.float64]
 
 EXACT = 1e-12
 """m, rad or relative: rms of a launch coordinate that is known exactly."""
@@ -140,7 +138,7 @@ class Readings(Protocol):
     """Data of a whitening, see `observe.data.Data`."""
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Flags:
         """Valid readings, [shot, reading, 2]."""
 
     @property

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import CORRECTORS, Columns, ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.effects import CATALOGUE, Cause, apply, check, find, monitors_with
@@ -13,8 +13,6 @@ from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import located, read_document
-
-Array = NDArray[np.float64]
 
 ENERGY = 1e-3
 """Energy step of the differences for an energy spread."""

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, ComplexArray
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import modelled
 from tmlattice.errors import MeasurementError
@@ -31,8 +32,6 @@ from tmlattice.observe.sections import mean_pass
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
 from tmlattice.optics import ring_tunes
-
-Array = NDArray[np.float64]
 
 USUAL = 0.01
 """Mean square misfit of a column by usual errors, relative to the column: a tenth squared."""
@@ -320,7 +319,7 @@ class OfLines(Compared):
         return np.where(size > 0, 2 * left, np.nan).ravel()
 
     @staticmethod
-    def _size(lines: NDArray[np.complex128]) -> Array:
+    def _size(lines: ComplexArray) -> Array:
         return np.asarray((np.abs(lines) ** 2).sum(axis=(2, 3)))
 
     def _changed(self, names: Names) -> NDArray[np.intp]:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.inference.metric import Hypothesis
@@ -23,9 +23,6 @@ from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 COORDINATES = 2
 """Coordinates of a launch in one plane."""
@@ -213,7 +210,7 @@ class FirstTurns(Problem):
         """[shot, reading, 2]."""
         return self.data.valid
 
-    def owner(self) -> NDArray[np.int64]:
+    def owner(self) -> Indices:
         """Monitor of each reading."""
         one = np.tile(np.arange(len(self.monitors)), self.data.turns)
         return np.broadcast_to(one[None, :, None], self.valid.shape)

@@ -21,6 +21,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.effects import Cause, Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -29,7 +30,6 @@ from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.observe.sections import (
     DIVERGED_SIGMA,
-    Flags,
     Passes,
     SectionFits,
     Sections,
@@ -37,8 +37,6 @@ from tmlattice.observe.sections import (
     log_uncertainty,
     mean_pass,
 )
-
-Array = NDArray[np.float64]
 
 SHOTS, TURNS = 8, 3
 """Shots and turns that are used: a global error is in each."""
@@ -118,7 +116,7 @@ class Split:
     @classmethod
     def of(
         cls, miss: Array, spread: Array, kicked: Array, there: Flags,
-        freedom: Array | NDArray[np.int64], errors: float = ERRORS,
+        freedom: Array | Indices, errors: float = ERRORS,
     ) -> "Split":  # fmt: skip
         """Split mismatches.
 

@@ -12,14 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dct, idct
 
+from tmlattice.arrays import Array, ComplexArray, Flags, Indices
 from tmlattice.harmonics import frequency as strongest
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
 
 WIDEST = 0.05
 """Largest half width of a line, in tune: the envelope of a beam that decoheres in 10 turns."""
@@ -58,7 +54,7 @@ class LineFit:
 
 
 def fit_lines(
-    data: Array, there: Mask, frequencies: Sequence[float], noise: Array, *,
+    data: Array, there: Flags, frequencies: Sequence[float], noise: Array, *,
     broad: int, span: int, rounds: int = ROUNDS,
 ) -> LineFit:  # fmt: skip
     """Fit lines near given frequencies to all signals at once.
@@ -118,7 +114,7 @@ def fit_lines(
 def least_squares(
     basis: Array,
     data: Array,
-    there: Mask,
+    there: Flags,
     weights: Array | None = None,
     prior: float = 0.0,
 ) -> tuple[Array, Array]:
@@ -172,7 +168,7 @@ def _widths(lines: Array, broad: int) -> Array:
     return np.asarray(np.minimum(most, 0.45 * np.minimum(next_one, mirror)))
 
 
-def _cosines(width: Array | float, turns: int) -> NDArray[np.int64]:
+def _cosines(width: Array | float, turns: int) -> Indices:
     """Number of cosines of the turns within a width."""
     return np.maximum(1, np.round(2 * np.asarray(width) * turns)).astype(np.int64)
 
@@ -269,7 +265,7 @@ def floor(fit: LineFit) -> Array:
     return np.asarray(np.sqrt(np.median(power, axis=1) / np.log(2) / mean))
 
 
-def noise_at(fit: LineFit, line: int, quiet: Array, planes: NDArray[np.int64]) -> Array:
+def noise_at(fit: LineFit, line: int, quiet: Array, planes: Indices) -> Array:
     """Noise at a line over that at all frequencies and turns, at least 1; of the typical signal of
     each plane, [signal]. Lines near this one may be in one plane alone.
 
@@ -318,7 +314,7 @@ def without(fit: LineFit, changes: ComplexArray) -> LineFit:
     return replace(fit, residual=residual)
 
 
-def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
+def change(fit: LineFit, line: int, planes: Indices) -> Array:
     """Change of amplitudes between the first and the last half of a line's power, [signal].
 
     Where amplitude and energy shape the optics, the particles that decohere last have other ratios

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.model import Paths
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -17,8 +18,6 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.data import Data
 from tmlattice.observe.sections import Passes, SectionFits
-
-Array = NDArray[np.float64]
 
 SAME_PLACE = 1e-6
 """m; monitors within this distance are at one place."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.beam.response_derivatives import ResponseSlopes
@@ -21,8 +21,6 @@ from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, mon
 from tmlattice.errors import EffectError, UnstableRingError
 from tmlattice.observe.response_data import ResponseData
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Hypothesis = tuple[str, str | None]
 
 DELTA = 1e-3

@@ -15,16 +15,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import UnstableRingError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.noise import completed
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 NO_RF = 1e-6
 """Relative RF step for a measurement without one: its orbit is missing."""

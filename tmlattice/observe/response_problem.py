@@ -19,16 +19,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
 from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
-from tmlattice.inference.metric import Hypothesis, Indices, Metric, Products
+from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.problem import Point
 from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.steady import MAX_NUMBERS, Steady, SteadyMetric
-
-Array = NDArray[np.float64]
 
 
 def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> list[Hypothesis]:
@@ -106,7 +105,7 @@ class Response(Steady):
         """Monitors of the measurement."""
         return self.base.data.measured.monitors
 
-    def owner(self) -> NDArray[np.int64]:
+    def owner(self) -> Indices:
         """Monitor of each reading."""
         return np.broadcast_to(np.arange(self.used.shape[1])[:, None], self.used.shape)
 
@@ -224,7 +223,7 @@ class _Here:
     """
 
     view: Predicted
-    used: NDArray[np.bool_]
+    used: Flags
     sigma: Array
 
     @property

@@ -18,14 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
 from tmlattice.inference import chi2
 from tmlattice.lattice import Ring
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
 
 _KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates, without tau
@@ -142,10 +141,10 @@ class SectionFits:
     """
 
     left: Array
-    owner: NDArray[np.int64]
+    owner: Indices
     there: Flags
     free: Array
-    freedom: NDArray[np.int64]
+    freedom: Indices
     misfit: Array
     delta: Array
     start: Array
@@ -399,7 +398,7 @@ EnergyTerms = tuple[Array, Array, Array]
 """Terms [pass, term] of the energy's equation: their misfit, right side and left side."""
 
 
-def _energy_terms(left: Array, slope: Array, freedom: NDArray[np.int64]) -> EnergyTerms:
+def _energy_terms(left: Array, slope: Array, freedom: Indices) -> EnergyTerms:
     """Terms of readings, projected off the trajectories of their sections."""
     misfit = np.where(freedom > 0, (left**2).sum(axis=2) / np.maximum(freedom, 1), np.inf)
     return misfit, (left * slope).sum(axis=2), (slope**2).sum(axis=2)
@@ -453,9 +452,7 @@ def _common_energy(
     return np.full(count, asked.sum() / known.sum()), np.full(count, known.sum())
 
 
-def _prior_precision(
-    passes: Passes, slopes: Array, members: Flags, count: NDArray[np.int64]
-) -> Array:
+def _prior_precision(passes: Passes, slopes: Array, members: Flags, count: Indices) -> Array:
     """Prior precision of each coordinate, [pass, section, 4]; 0 in a plane with readings.
 
     With fewer than two readings in a plane the prior is as large as the turn's readings. Without it

@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import betaincinv
 
+from tmlattice.arrays import Array, ComplexArray, Flags, Indices
 from tmlattice.errors import TooFewTurnsError, first_of
 from tmlattice.harmonics import MIN_TURNS
 from tmlattice.inference import chi2
@@ -38,10 +38,6 @@ from tmlattice.observe.line_fit import (
     without,
 )
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
-Planes = NDArray[np.int64]
 Near = Sequence[float] | Array | None
 Modes = tuple[int | None, int | None]
 """Lines of the modes nearer to x and to y; None without a line."""
@@ -62,7 +58,7 @@ OUTLIER = 8.0
 class Lines:
     """Betatron lines of the turns of a stored beam.
 
-    Modes are (1, 2): the one nearer to x, and to y. Planes are (x, y). Missing values are NaN.
+    Modes are (1, 2): the one nearer to x, and to y. Indices are (x, y). Missing values are NaN.
 
     Attributes:
         monitors: names.
@@ -87,7 +83,7 @@ class Lines:
     amplitude: ComplexArray
     error: Array
     noise: Array
-    turns: NDArray[np.int64]
+    turns: Indices
     envelope: ComplexArray
     warnings: tuple[str, ...]
 
@@ -202,7 +198,7 @@ def _shots(ids: Sequence[int]) -> str:
 
 def _shot(
     signals: Array, near: Near, warn: Callable[[str], None]
-) -> tuple[LineFit, Mask, Modes] | None:
+) -> tuple[LineFit, Flags, Modes] | None:
     """Lines of one shot [signal, turn], the signals that have any, and the line of each mode."""
     there = np.isfinite(signals)
     with_beam = there.sum(axis=0) >= 0.5 * there.sum(axis=0).max()
@@ -239,14 +235,14 @@ def _shot(
     return fit, usable, modes
 
 
-def _moves(signals: Array, there: Mask) -> Mask:
+def _moves(signals: Array, there: Flags) -> Flags:
     """Signals whose readings are not all the same."""
     high = np.where(there, signals, -np.inf).max(axis=1)
     low = np.where(there, signals, np.inf).min(axis=1)
     return np.asarray(high > low)
 
 
-def _robust(residual: Array, there: Mask) -> Array:
+def _robust(residual: Array, there: Flags) -> Array:
     """Robust rms of the residual of each signal, from its median."""
     size = np.abs(residual)
     middle = np.median(size, axis=1)
@@ -256,7 +252,7 @@ def _robust(residual: Array, there: Mask) -> Array:
 
 
 # --- reported doubts ------------------------------------------------------------------------------
-def _doubts(fit: LineFit, planes: Planes, modes: Modes, warn: Callable[[str], None]) -> None:
+def _doubts(fit: LineFit, planes: Indices, modes: Modes, warn: Callable[[str], None]) -> None:
     turns = fit.envelope.shape[1]
     there = [line for line in modes if line is not None]
     for plane in (0, 1):
@@ -318,7 +314,7 @@ CHANCE = 1e-6
 """Probability that noise alone makes a line somewhere in the spectrum."""
 
 
-def betatron_lines(data: Array, there: Mask, planes: Planes, near: Near) -> LineFit:
+def betatron_lines(data: Array, there: Flags, planes: Indices, near: Near) -> LineFit:
     """Fit up to two betatron lines, the first two, and other significant lines.
 
     The strongest line is the first. The second is the strongest remaining line in the plane in
@@ -341,8 +337,8 @@ def betatron_lines(data: Array, there: Mask, planes: Planes, near: Near) -> Line
 
 def _strongest(
     data: Array,
-    there: Mask,
-    groups: Sequence[Mask],
+    there: Flags,
+    groups: Sequence[Flags],
     near: Near,
     away_from: float | None = None,
 ) -> tuple[float, int]:
@@ -367,7 +363,7 @@ def _strongest(
     return found, span
 
 
-def _power(data: Array, there: Mask) -> tuple[Array, Array]:
+def _power(data: Array, there: Flags) -> tuple[Array, Array]:
     """Frequencies, and each signal's spectrum in units of its own floor, [signal, frequency].
 
     The floor is that of the lowest quarter of the spectrum, which has no lines.
@@ -381,7 +377,7 @@ def _power(data: Array, there: Mask) -> tuple[Array, Array]:
     return np.arange(1, turns // 2 + 1) / turns, power / np.maximum(floor, 1e-300)
 
 
-def _allowed(frequency: Array, near: Near) -> Mask:
+def _allowed(frequency: Array, near: Near) -> Flags:
     """Frequencies at which a betatron line may be."""
     if near is None:
         return (frequency > SLOWEST) & (frequency < 0.5)
@@ -405,7 +401,7 @@ def _seen(signals: int, trials: int) -> float:
     return float(-np.log(betaincinv(above, signals - above + 1, CHANCE / trials)))
 
 
-def _other_lines(fit: LineFit, there: Mask, planes: Planes) -> list[float]:
+def _other_lines(fit: LineFit, there: Flags, planes: Indices) -> list[float]:
     """Frequencies of up to three significant lines other than the betatron lines."""
     turns = there.shape[1]
     if turns < 64:  # the floor between the lines is not resolved
@@ -423,14 +419,14 @@ def _other_lines(fit: LineFit, there: Mask, planes: Planes) -> list[float]:
     return found
 
 
-def share(fit: LineFit, planes: Planes, line: int) -> float:
+def share(fit: LineFit, planes: Indices, line: int) -> float:
     """Share of a line's power, less the noise's, that is in x, 0 to 1."""
     power = np.abs(fit.amplitude[:, line]) ** 2 - 2 * fit.variance[:, line] * fit.noise**2
     x, y = (max(float(_typical(power[planes == p, None])[0]), 0.0) for p in (0, 1))
     return x / (x + y) if x + y > 0 else 0.5
 
 
-def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
+def which(fit: LineFit, planes: Indices, near: Near) -> Modes:
     """Lines of the modes nearer to x and to y; None without a significant line.
 
     If one plane was measured the second line is none of these: the tune alone identifies the mode.
@@ -454,7 +450,7 @@ def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
     return kept[0], kept[1]
 
 
-def _significant(fit: LineFit, planes: Planes, line: int) -> bool:
+def _significant(fit: LineFit, planes: Indices, line: int) -> bool:
     """Whether a line exceeds what an envelope makes of noise, in the plane where it is larger.
 
     Its envelope has picked the largest of as many directions of noise as it has cosines: the

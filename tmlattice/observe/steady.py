@@ -10,17 +10,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.effects import Cause, find
 from tmlattice.effects.effect import MIN_STRENGTH
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.whitening import Projection
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 NOTHING = np.zeros(0)
 """Nuisances of a kind without any."""

@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.effects import Cause
 from tmlattice.inference.priors import Group
@@ -19,8 +19,6 @@ from tmlattice.lattice.slices import stem
 from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
 
 LARGEST_GRADIENT = 0.02
 """Largest prior rms of one magnet, relative: larger errors are faults."""

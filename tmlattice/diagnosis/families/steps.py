@@ -12,8 +12,8 @@ from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.dispersion import (
     HorizontalKicks,
     HorizontalOrbit,
@@ -37,9 +37,6 @@ from tmlattice.inference.priors import Group
 from tmlattice.lattice.alike import families
 from tmlattice.observe.orbit_response import DELTA, Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
-
 
 USUAL_OFFSET = 1e-3
 """Prior rms: an orbit of a millimetre where the dispersion is a metre."""

@@ -19,8 +19,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
 from tmlattice.diagnosis.families.family import StatedCause
@@ -57,8 +57,6 @@ from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_change import alike, response_change
 from tmlattice.observe.response_data import ResponseData, response_data
 from tmlattice.observe.split import Split, split_columns
-
-Array = NDArray[np.float64]
 
 ANY = 6.0
 """rms of the logarithm of a change's scale about its first guess: most families did not change."""

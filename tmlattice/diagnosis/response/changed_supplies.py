@@ -11,9 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.findings import cause_of, finding_of
@@ -31,8 +31,6 @@ from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_problem import Response
-
-Array = NDArray[np.float64]
 
 MOST = 40
 """Most changes of a plane: many supplies may be changed on purpose."""

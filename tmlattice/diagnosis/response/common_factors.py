@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.records import named
 from tmlattice.diagnosis.response.linear import linear, marginal
@@ -32,8 +32,6 @@ from tmlattice.inference.common_factors import (
 )
 from tmlattice.inference.normal import solve
 from tmlattice.lattice.supplies import magnets
-
-Array = NDArray[np.float64]
 
 USUAL = 1e-2
 """Prior rms of a shared error, relative."""
@@ -264,7 +262,7 @@ def weighed(
     families, others = np.flatnonzero(among.families), np.flatnonzero(~among.families)
     alone = np.diag(1.0 - np.minimum(among.members[:, families].sum(axis=1), 1.0))
 
-    def levels(at: NDArray[np.int64], between: float) -> FactorModel:
+    def levels(at: Indices, between: float) -> FactorModel:
         share = among.members[:, families] * between
         scatter = single + share @ share.T + between**2 * alone
         slab = np.full(len(at), max(USUAL, between))

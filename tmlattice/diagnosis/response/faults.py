@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
@@ -14,8 +14,6 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

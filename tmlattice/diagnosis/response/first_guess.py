@@ -12,8 +12,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import Trial
 from tmlattice.diagnosis.response.state import State, allow, begin
@@ -21,8 +21,6 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.lattice.supplies import magnets
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 

@@ -4,9 +4,9 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
@@ -14,8 +14,6 @@ from tmlattice.diagnosis.response.stated import Stated, stated
 from tmlattice.diagnosis.support import Correlation, Support, correlations_of, share_from_data
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.problem import Hypothesis
-
-Array = NDArray[np.float64]
 
 AGAINST, SHOWN = 0.4, 3
 """Posterior correlation above which numbers are degenerate, and how many of them are named."""

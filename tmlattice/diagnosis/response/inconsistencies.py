@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear
@@ -25,8 +25,6 @@ from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.normal import Normal, solve
 from tmlattice.lattice.supplies import magnets, supplied_alike
-
-Array = NDArray[np.float64]
 
 CLEAR = 5.0
 """Standard deviations above which gradients are reported."""

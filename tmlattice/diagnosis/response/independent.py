@@ -11,9 +11,8 @@ sum s = C M and E sum s^2 = C M (C + M + 1).)
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from tmlattice.arrays import Array
 
 CLIPPED = 3.0
 """Limit of a residual, in units of the typical one: an outlier is no common pattern."""

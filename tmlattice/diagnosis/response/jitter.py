@@ -19,17 +19,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.inference.normal import amounts, common, times_precision
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.findings import located
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.response.state import State, begin
@@ -28,9 +28,6 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import split_columns
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SHARE = 0.25
 """Largest ratio of the mean square residuals with and without a label."""

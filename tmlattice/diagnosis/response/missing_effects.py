@@ -14,17 +14,16 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State, rms_of
 from tmlattice.diagnosis.response.weights import weight
 
-Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array
 
 FREE = 30.0

@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

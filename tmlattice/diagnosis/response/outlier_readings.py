@@ -11,15 +11,12 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.state import State
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 GROSS = 20.0
 """Ratio of a residual to the typical ones of its corrector and of its BPM above which a reading is

@@ -28,15 +28,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.response.labels import SHARE, Label, swapped_correctors
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 TIMES = 5.0
 """Least ratio of an outlier to the typical one."""

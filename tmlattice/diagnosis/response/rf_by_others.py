@@ -11,15 +11,13 @@ by itself and predict none.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference.normal import Posterior
-
-Array = NDArray[np.float64]
 
 LEAST = 1e-9
 """Least share of a reading's weight after the fit, above rounding errors."""
@@ -48,7 +46,7 @@ def rf_by_others(state: State, there: Linear | None, found: Posterior | None) ->
     return out
 
 
-def rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
+def rf_fitted(state: State) -> tuple[Indices, Array, Array]:
     """Return the BPMs at which the RF's orbit is fitted, the inverse covariance of these readings,
     1/m2, and their residuals, m."""
     column = len(state.data.plane) - 1

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.supplies import supplied_alike
-
-Array = NDArray[np.float64]
 
 GAP = 2.5
 """Ratio to the typical distance of two bends above which a straight is between them."""
@@ -27,7 +25,7 @@ class Candidates(NamedTuple):
     kinds: tuple[str, ...]
     names: tuple[str, ...]
     members: Array
-    families: NDArray[np.bool_]
+    families: Flags
 
 
 def candidates(ring: Ring, own: Sequence[tuple[Element, ...]]) -> Candidates:

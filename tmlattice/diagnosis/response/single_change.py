@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.response.undetermined import Blur
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
@@ -22,9 +22,6 @@ from tmlattice.inference.distributed import MarginalProblem
 from tmlattice.inference.newton import Fit, Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.whitening import directions_of
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 AMOUNTS = np.geomspace(1e-5, 1.2, 120)
 """Start of the search for the most probable amount, as a share of the largest fault."""

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import (
@@ -42,9 +42,6 @@ from tmlattice.inference.priors import SMALLEST, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 

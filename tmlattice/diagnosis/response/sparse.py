@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.single_change import SingleChange
@@ -32,9 +32,6 @@ from tmlattice.observe.orbit_response import Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 MOST = 3
 """Most causes of a sparse solution: each costs a search of its own."""

@@ -9,17 +9,14 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 

@@ -8,16 +8,14 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import Apart, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import errors
 from tmlattice.inference.errors import MAX_MEMBERS, LinearFit, Rows, cluster_robust_errors, moments
 from tmlattice.inference.normal import Posterior
-
-Array = NDArray[np.float64]
 
 
 class Stated(NamedTuple):

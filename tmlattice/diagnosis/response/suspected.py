@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.others import KINDS
@@ -24,8 +24,6 @@ from tmlattice.effects.quadrupoles import FamilyGradient
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Hypothesis
-
-Array = NDArray[np.float64]
 
 AFFORDABLE = 4e9
 """Most products of signatures and derivatives; above it only numbers of families are compared."""

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, background_rms, find
@@ -22,8 +22,6 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.response_problem import Response
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """Weights of log rms in the validation score: in-plane, coupling, RF (one reading per BPM); and the

@@ -7,15 +7,12 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference.normal import amounts, common, times_precision
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 BAD = 5.0
 """Ratio of a BPM's rms residual, given its own gain, to the median one above which it is bad."""
