@@ -130,7 +130,7 @@ def outliers(
             continue
         amounts = np.array([places[0].amount for places, _ in own])
         off = np.abs(amounts - np.median(amounts))
-        scatter = chi2.MAD * float(np.median(off))
+        scatter = float(chi2.typical(off))
         for (places, sigma), distance in zip(own, off, strict=True):
             times = float(distance / max(scatter, sigma, 1e-30))
             if times > OUTLIER and not any((c.effect, c.element) in known for c in places):

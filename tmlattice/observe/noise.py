@@ -60,7 +60,7 @@ def estimate(data: Data, paths: Paths) -> Array:
     """rms noise of one reading in x and y, m, [2]; NaN for a plane with too few readings."""
     misfit = local_misfit(data, paths)
     planes = [misfit[:, :, plane][np.isfinite(misfit[:, :, plane])] for plane in (0, 1)]
-    return np.array([chi2.MAD * np.median(np.abs(p)) if len(p) > 20 else np.nan for p in planes])
+    return np.array([chi2.typical(p) if len(p) > 20 else np.nan for p in planes])
 
 
 LEAST_FREEDOM = 2
@@ -264,5 +264,5 @@ def _residual_noise(read: Array, s: Array, kicked: Array, length: float) -> floa
             miss = np.abs(own - others @ rule)
             kept = miss <= np.quantile(miss, 1 - WRONG)
         freedom = (kept.sum() - NEIGHBOURS) / kept.sum()
-        left.append(np.median(miss) * chi2.MAD / np.sqrt(freedom * (1 + rule @ rule)))
+        left.append(chi2.typical(miss) / np.sqrt(freedom * (1 + rule @ rule)))
     return float(np.median(left)) if left else float("nan")

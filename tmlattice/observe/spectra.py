@@ -243,12 +243,8 @@ def _moves(signals: Array, there: Flags) -> Flags:
 
 
 def _robust(residual: Array, there: Flags) -> Array:
-    """Robust rms of the residual of each signal, from its median."""
-    size = np.abs(residual)
-    middle = np.median(size, axis=1)
-    for i in np.flatnonzero(~there.all(axis=1)):
-        middle[i] = np.median(size[i, there[i]])
-    return np.asarray(chi2.MAD * middle)
+    """Robust rms of the residual of each signal."""
+    return np.asarray(chi2.typical(np.where(there, residual, np.nan), axis=1))
 
 
 # --- reported doubts ------------------------------------------------------------------------------

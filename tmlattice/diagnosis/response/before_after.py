@@ -49,6 +49,7 @@ from tmlattice.diagnosis.support import FREE
 from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
+from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.normal import solve
 from tmlattice.lattice import Ring
@@ -290,7 +291,7 @@ def _learnt_noise(state: State) -> State:
         left = (data.pick(state.at.left, block) / data.noise_of(block))[:-1]
         left = left[state.fitted[:-1]][:, state.good]
         left = left[np.isfinite(left)]
-        scales.append(float(np.median(np.abs(left))) / 0.6745 if len(left) else 1.0)
+        scales.append(float(chi2.typical(left)) if len(left) else 1.0)
     lower = float(np.clip(max(scales), LEAST_NOISE, 1.0))
     return _with_noise(state, lower * data.noise)
 
@@ -340,7 +341,7 @@ def _messages(
 ) -> list[str]:
     """Messages on the agreement of two measurements, and the scatter of magnets and supplies."""
     left = data.pick(state.at.left)[:-1][:, state.good]
-    agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
+    agree = 1e6 * float(chi2.typical(left))
     stated = 1e6 * float(np.median(data.noise))
     messages = [
         f"given the changes, the two measurements agree to {agree:.2g} µm (by their stated noise "

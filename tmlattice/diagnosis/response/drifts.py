@@ -15,6 +15,7 @@ from tmlattice.diagnosis.response.stated import unwidened
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.support import Support
 from tmlattice.effects import Cause
+from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.normal import solve
@@ -42,7 +43,7 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
     found = []
     for effect in dict.fromkeys(cause.effect for cause, _ in changes):
         rows = [row for row in changes if row[0].effect == effect]
-        usual = float(np.median([abs(cause.amount) for cause, _ in rows])) / 0.6745
+        usual = float(chi2.typical([cause.amount for cause, _ in rows]))
         for cause, sigma in rows:
             size = abs(cause.amount)
             if size > max(DRIFT, OUTSTANDING * usual) and size > 5 * sigma:

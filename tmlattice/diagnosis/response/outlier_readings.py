@@ -14,6 +14,7 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.state import State
+from tmlattice.inference import chi2
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -33,7 +34,6 @@ MANY = 8
 """Most outliers of the RF's orbit named in a message."""
 OFTEN = 2
 """Outliers of one BPM or corrector from which on it is named."""
-_MAD = 1.4826  # of a Gaussian
 
 
 def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitResponse, list[str]]:
@@ -78,7 +78,7 @@ def gross(data: ResponseData, read: Array) -> Flags:
             warnings.simplefilter("ignore", RuntimeWarning)  # no readings
             column, monitor = (np.nanmedian(own, axis=k, keepdims=True) for k in (1, 0))
         usual = np.fmax(np.fmax(column, monitor), data.noise[:, plane])
-        wrong[rows, :, plane] = np.nan_to_num(own) > GROSS * _MAD * usual
+        wrong[rows, :, plane] = np.nan_to_num(own) > GROSS * chi2.MAD * usual
     count = np.isfinite(data.orbits).sum(axis=(1, 2))
     wrong[wrong.sum(axis=(1, 2)) > np.maximum(MANY_OF_STEP * count, 1)] = False
     return wrong
@@ -133,7 +133,7 @@ def rf_shares(state: State, block: int, left: Array) -> Array:
     """
     own = np.ones((2, len(left))) if state.rf_share is None else state.rf_share.copy()
     if np.isfinite(left).sum() >= LEAST:
-        typical = _MAD * float(np.nanmedian(np.abs(left)))
+        typical = float(chi2.typical(left))
         pull = np.nan_to_num(np.abs(left) / np.maximum(state.data.noise_of(block)[-1], typical))
         own[block] = (OUT / np.maximum(pull, OUT)) ** 4
     return own
@@ -156,9 +156,7 @@ def shares(state: State, block: int, left: Array) -> Array:
 
 def _pulls(state: State, block: int, left: Array) -> Array:
     """Residuals in units of the column's typical one, or of the noise if that is larger."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # columns that are not fitted
-        typical = _MAD * np.nanmedian(np.abs(left), axis=1)
+    typical = chi2.typical(left, axis=1)
     return np.asarray(left / np.fmax(state.data.noise_of(block)[:-1], typical[:, None]))
 
 

@@ -33,6 +33,7 @@ from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.response.labels import SHARE, Label, swapped_correctors
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
+from tmlattice.inference import chi2
 
 TIMES = 5.0
 """Least ratio of an outlier to the typical one."""
@@ -53,7 +54,6 @@ MARGIN, SAME = 1.5, 1e-6
 distance, m, below which elements have one place."""
 GAINS, ROLLS = "monitor_gain", "corrector_roll"
 """Families without which residuals look like kicks, and rolled correctors like spurious kicks."""
-_MAD = 1.4826  # of a Gaussian
 
 
 def outlying(sizes: Array, of: Array, least: float) -> Flags:
@@ -201,7 +201,7 @@ class _Step:
         normal = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)])
         size = np.sqrt((normal**2).sum(axis=0))
         triples = (normal * np.stack([left[:-2], left[1:-1], left[2:]])).sum(axis=0)
-        return _MAD * float(np.median(np.abs(triples[size > 0] / size[size > 0])))
+        return float(chi2.typical(triples[size > 0] / size[size > 0]))
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -243,7 +243,7 @@ def _labels(state: State, kicked: int, read: int) -> Iterator[Label]:
     pairs, usual = list[Label](), np.inf
     if kicked == read:
         pairs = swapped_correctors(state, {names[steps[i].column] for i in np.flatnonzero(odd)})
-        usual = max(TIMES * _MAD * float(np.median([abs(s.by) for s in steps])), LEAST)
+        usual = max(TIMES * float(chi2.typical([s.by for s in steps])), LEAST)
     kicks = _kicks(state, read) if gains else np.zeros((0, data.shape[1]))
     for step in (steps[i] for i in np.flatnonzero(odd)):
         least, label = SHARE * step.missed(half=True), None

@@ -13,6 +13,7 @@ import numpy as np
 from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference import chi2
 from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -136,7 +137,7 @@ def begin(data: ResponseData, split: Split) -> State:
     """The state of the design."""
     at = Predicted(data, Errors.none(data))
     gap = data.pick(at.left)[~split.held]
-    size = float(np.nanmedian(np.abs(gap))) / 0.6745
+    size = float(chi2.typical(gap))
     return State(
         data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
     )

@@ -12,6 +12,7 @@ from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
+from tmlattice.inference import chi2
 from tmlattice.inference.normal import amounts, common, times_precision
 
 BAD = 5.0
@@ -109,7 +110,7 @@ def look(state: State, block: int) -> State:
     left, alone = _without_jitter(state, block, left)
     if state.share is not None:
         state = replace(state, share=shares(state, block, left[:-1]))
-    typical = float(np.nanmedian(np.abs(left[:-1, state.good]))) / 0.6745
+    typical = float(chi2.typical(left[:-1, state.good]))
     noise = float(np.median(data.noise))
     share = 1.0 if state.share is None else state.share[block]
     shared = TYPICAL * typical**2 + np.nansum(share * left**2, axis=1)
