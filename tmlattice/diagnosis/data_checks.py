@@ -33,6 +33,7 @@ from tmlattice.errors import (
     UnknownNameError,
     first_of,
 )
+from tmlattice.inference.judgement import FEW, GROSS, MISSTATED
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
@@ -69,12 +70,8 @@ NOTHING_FROM, SURE, NO_BEAM, HALF = 2, 4, 0.75, 0.5
 """Sections at the end that follow no trajectory, from which on the beam may be lost, and is: a few
 swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9; and the share
 that separates them from others."""
-SECTIONS = 4
-"""Fewest passes that determine the usual misfit."""
 SPOILT = 3.0
 """Misfit of a section over the typical one above which it is not used."""
-OVER, UNDER = 2.5, 3.0
-"""Factors by which a stated noise may be too large, and too small."""
 GLOBAL = "signs, units and order"
 MOST_ERRORS = 4
 """Global errors of one measurement at most."""
@@ -82,8 +79,6 @@ _UNIT = "-in-"
 """In the names of assumptions about a unit."""
 SCALED = 3.0
 """Ratio of the RF's orbit to the design's, or its inverse, that no ring has."""
-SPIKE = 20.0
-"""Sigma above which a single reading is an outlier, if its neighbours agree without it."""
 
 
 @by_name
@@ -351,7 +346,7 @@ def _launches(checked: OfTurns) -> Check:
     own, misfit = checked.launches(square, EXACT)
     good = misfit < SPOILT * square  # else a fault of the first magnets biases the fit
     sections = checked.found(data)[1].misfit.shape[1]
-    if not good.any() or sections < SECTIONS:
+    if not good.any() or sections < FEW:
         return fine("launches", "too few good BPMs near the start to check the launches")
     worst = float(np.median(own[good], axis=0).max())
     if worst > FAR:
@@ -373,7 +368,7 @@ def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
     typical = float(np.median(passes.sigma))
     if checked.data.noise is None:
         return fine("noise", f"none is stated; the residuals are {_micro(level * typical)}")
-    if level < 1 / OVER:
+    if level < 1 / MISSTATED:
         return wrong(
             "noise",
             f"the stated noise of {_micro(typical)} is {1 / level:.1f} times the residuals "
@@ -383,7 +378,7 @@ def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
     random = noise_scatter(passes, found)
-    if random is not None and random > UNDER:
+    if random is not None and random > MISSTATED:
         return wrong(
             "noise",
             f"the stated noise of {_micro(typical)} is too small: from shot to shot the readings "
@@ -393,7 +388,7 @@ def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
     text = f"{_micro(typical)} is stated, neighbouring BPMs show {_micro(level * typical)}"
-    if level <= UNDER:
+    if level <= MISSTATED:
         return fine("noise", text)
     if random is None:
         return note(
@@ -429,7 +424,7 @@ def _outliers(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
         alone = found.left[p, w] ** 2 / np.maximum(found.free[p, w], 0.05)
         worst = int(alone.argmax())
         rest = found.misfit[p, w] * found.freedom[p, w] - alone[worst]
-        if alone[worst] > SPIKE**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
+        if alone[worst] > GROSS**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
             name = checked.data.monitors[found.owner[w, worst]]
             shot = checked.data.shots[passes.shot[p]]
             reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
@@ -507,8 +502,6 @@ def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
 
 MOST = 0.5
 """Share of the names that may be unknown."""
-SHOWN = 8
-"""Names in a sentence at most."""
 MEANT = "did you mean"
 """Phrase in the message about a misspelt name."""
 
@@ -545,7 +538,7 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
         typed = MEANT in fix and len(unknown) == 1
         messages.append(
             f"not in the lattice, and left out: {len(unknown)} of {len(names)} {what} "
-            f"({first_of(unknown, SHOWN)})" + (f"; {fix.partition('; ')[2]}" if typed else "")
+            f"({first_of(unknown)})" + (f"; {fix.partition('; ')[2]}" if typed else "")
         )
     return own, messages
 

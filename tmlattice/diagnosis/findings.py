@@ -16,7 +16,7 @@ from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.inference.alternatives import Alternative, Detection
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.newton import Outcome, fit
+from tmlattice.inference.newton import ITERATIONS, Outcome, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
 from tmlattice.inference.search import Explanation, Identified
@@ -32,16 +32,12 @@ def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternati
     return list(rivals[:size]), probability
 
 
-FINAL_STEPS = 60
-"""Iterations of the reported fit at most."""
-
-
 def finished(explanation: Explanation) -> Explanation:
     """The fit of the causes, iterated until it converges or reaches the maximum."""
     last = explanation.fit
     if last.outcome is not Outcome.STEPS:
         return explanation
-    again = fit(explanation.problem, last.causes, last.nuisances, last.kicks, steps=FINAL_STEPS)
+    again = fit(explanation.problem, last.causes, last.nuisances, last.kicks, steps=ITERATIONS)
     return replace(explanation, fit=again) if again.good else explanation
 
 

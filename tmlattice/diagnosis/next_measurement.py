@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import TINY, Array
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
 from tmlattice.diagnosis.records import OPTIONAL, named, record_of
@@ -143,7 +143,7 @@ def separations(
         # another amount, given its prior, would explain a part of it
         row = projection.out(problem.slope(point, point.causes.index(own.cause)))
         row = row.reshape(parts, -1)
-        known = 1 / max(float(own.fit.covariance[-1, -1]), 1e-300)
+        known = 1 / max(float(own.fit.covariance[-1, -1]), TINY)
         square -= (row * clean).sum(axis=1) ** 2 / ((row**2).sum(axis=1) + known) / 2
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags
+from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
@@ -22,10 +22,11 @@ from tmlattice.inference.distributed import (
     chain_factors,
     signatures_of,
 )
+from tmlattice.inference.judgement import SIGNIFICANT
 from tmlattice.inference.newton import Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
-from tmlattice.inference.validation import DETERMINED, Gap, Misfit, held_out_gap
+from tmlattice.inference.validation import Gap, Misfit, held_out_gap
 from tmlattice.inference.whitening import Blocks
 from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
 
@@ -193,7 +194,7 @@ def held_out(
     readings = sum(int((judge.valid & own).sum()) for judge, own in zip(judges, among, strict=True))
     gap = Gap(tuple(misfits), np.zeros((0, 0, 0)), None, None, since, readings)
     before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
-    if readings and before > DETERMINED * np.sqrt(2 / readings) and since < len(misfits) - 1:
+    if readings and before > SIGNIFICANT * np.sqrt(2 / readings) and since < len(misfits) - 1:
         return replace(gap, explained=1 - after / before)
     return gap
 
@@ -292,5 +293,5 @@ def seen_by(
     row = point.projection.out(problem.slope(point, own[0]))
     assert isinstance(point.projection, Blocks)
     squares = [float(mine @ mine) for mine in point.projection.split(row)][: len(parts)]
-    total = max(sum(squares), 1e-300)
+    total = max(sum(squares), TINY)
     return {part.label: square / total for part, square in zip(parts, squares, strict=True)}

@@ -14,11 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tmlattice.arrays import TINY
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.records import OPTIONAL, record_of
 from tmlattice.effects import Cause
 from tmlattice.inference import chi2
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import ENOUGH, SIGNIFICANT, Judgement
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Element, Ring
@@ -27,13 +28,6 @@ MOST = 3
 """Suspects of each kind."""
 
 SuspectKind = Literal["monitor", "corrector", "magnet", "section"]
-
-OUTLIER = 5.0
-"""Distance from the family's median, in units of its robust scatter and of the amount's error,
-above which an amount is an outlier."""
-
-ENOUGH, SHOWN = 8, 8
-"""Amounts of a family that determine a scatter; outliers that are listed."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +43,7 @@ class Suspect:
         statistic: fall of chi-square by it; or, of an outlier of a family, its distance from the
             median in units of the family's scatter.
         threshold: of the whole scan; a larger one that is no finding is less probably a
-            fault than a large distributed error. Or `OUTLIER`.
+            fault than a large distributed error. Or `SIGNIFICANT`.
         measure: "chi2" or "scatter": of which the statistic is.
         elements: all that share the amount.
         amount, amount_sigma: in the effect's unit; None of a scan's.
@@ -132,17 +126,17 @@ def outliers(
         off = np.abs(amounts - np.median(amounts))
         scatter = float(chi2.typical(off))
         for (places, sigma), distance in zip(own, off, strict=True):
-            times = float(distance / max(scatter, sigma, 1e-30))
-            if times > OUTLIER and not any((c.effect, c.element) in known for c in places):
+            times = float(distance / max(scatter, sigma, TINY))
+            if times > SIGNIFICANT and not any((c.effect, c.element) in known for c in places):
                 elements = tuple(c.element for c in places if c.element is not None)
                 element = ring[elements[0]]
                 found.append(
                     Suspect(
                         _kind(element), effect, element.name, *between(ring, [element.s]), times,
-                        OUTLIER, "scatter", elements, places[0].amount, sigma,
+                        SIGNIFICANT, "scatter", elements, places[0].amount, sigma,
                     )
                 )  # fmt: skip
-    return tuple(sorted(found, key=lambda one: -one.statistic)[:SHOWN])
+    return tuple(sorted(found, key=lambda one: -one.statistic)[:ENOUGH])
 
 
 def numbers(amounts: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...], float]]:

@@ -28,18 +28,12 @@ import numpy as np
 from scipy.linalg import lu_factor, lu_solve
 from scipy.special import logsumexp
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import INVISIBLE, TINY, Array
+from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT
+from tmlattice.inference.newton import ROUNDS
 
-MIN_CHI2 = 25.0
-"""Chi-square of a selected factor, at least: five standard deviations."""
-SWEEPS = 5
-"""Rounds in which every factor is exchanged against its alternatives."""
-MIN_INFORMATION = 1e-6
-"""Share of a candidate's information that the selected factors must leave, at least."""
-MIN_SCALE_EVIDENCE = 2.0
-"""Log evidence that the common scale of unresolved factors must gain to be used."""
-MAX_BEHIND = 3.0
-"""Log evidence below the best at which an alternative is still reported: odds of 1 to 20."""
+MIN_CHI2 = SIGNIFICANT**2
+"""Chi-square of a selected factor, at least."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +124,7 @@ class FactorModel:
             sizes = [0.0, *rms] if others else [0.0]
             made = [self.given(others, one) if one else self for one in sizes]
             logs = np.array([own.background + own.log_evidence(chosen) for own in made])
-            best = int(np.argmax(logs - MIN_SCALE_EVIDENCE * (np.array(sizes) > 0)))
+            best = int(np.argmax(logs - DEFAULT.behind * (np.array(sizes) > 0)))
             stay = made[best]._pruned(list(chosen), MIN_CHI2)
             if len(stay) == len(chosen):
                 logs[1:] -= np.log(max(len(rms), 1))
@@ -161,7 +155,7 @@ class FactorModel:
         variance = np.diag(covariance)
         known = 1 / variance - self.slab[np.array(chosen, dtype=int)] ** -2.0
         known = np.maximum(known, 0)
-        return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, 1e-300), 0.0)
+        return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, TINY), 0.0)
 
     def _given(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
         """Score and information of each candidate given some, and the change of the amounts of
@@ -177,8 +171,8 @@ class FactorModel:
         score, own, _ = self._given(chosen)
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
-        square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
-        seen = own > MIN_INFORMATION * np.diag(self.information)  # else redundant
+        square = np.where(own > 0, score**2 / np.maximum(own, TINY), 0.0)
+        seen = own > INVISIBLE * np.diag(self.information)  # else redundant
         gain = np.where(seen, gain, 0.0) - self.cost
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
@@ -198,7 +192,7 @@ class FactorModel:
             chosen = self._pruned([*chosen, best], clear)
             if best not in chosen:
                 break
-        for _ in range(SWEEPS):
+        for _ in range(ROUNDS):
             before = list(chosen)
             for own in before:
                 others = [c for c in chosen if c != own]
@@ -233,7 +227,7 @@ class FactorModel:
         spread = own + self.slab**-2.0
         moved = -lessened * (score / spread)
         gain = self.gains(chosen)[0]
-        gain[own <= MIN_INFORMATION * np.diag(self.information)] = -np.inf  # redundant
+        gain[own <= INVISIBLE * np.diag(self.information)] = -np.inf  # redundant
         there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
         more = moved @ there
         wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there
@@ -262,9 +256,10 @@ class FactorModel:
         found = []
         for i, own in enumerate(chosen):
             gain, square = self.gains([c for c in chosen if c != own])
-            linearise = [int(c) for c in np.flatnonzero(gain > gain[own] - MAX_BEHIND) if c != own]
-            odds = np.exp(gain[[own, *linearise]] - gain[own])
-            ranked = sorted(zip([own, *linearise], odds / odds.sum(), strict=True),
+            near = np.flatnonzero(gain > gain[own] - DEFAULT.behind).tolist()
+            others = [c for c in near if c != own]
+            odds = np.exp(gain[[own, *others]] - gain[own])
+            ranked = sorted(zip([own, *others], odds / odds.sum(), strict=True),
                           key=lambda row: (row[0] != own, -row[1]))  # fmt: skip
             found.append(
                 CommonFactor(
@@ -374,7 +369,7 @@ def over_sets(levels: FactorModel, sets: Sequence[LikelySet]) -> list[tuple[Comm
         alternatives = [(c, first.probability)]
         for one in sets[1:]:
             (*more,) = frozenset(one.chosen) - others
-            likely = one.probability > np.exp(-MAX_BEHIND) * first.probability
+            likely = one.probability > (1 - DEFAULT.mass) * first.probability
             if likely and len(one.chosen) == len(first.chosen) and len(more) == 1:
                 alternatives.append((more[0], one.probability))
         total = sum(chance for _, chance in alternatives)

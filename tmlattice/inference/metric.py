@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tmlattice.arrays import Array, Indices
+from tmlattice.arrays import AT_ONCE, Array, Indices
 from tmlattice.inference.whitening import Projection
 
 Hypothesis = tuple[str, str | None]
@@ -50,10 +50,9 @@ class Metric:
         chunk: hypotheses at a time, which bounds the memory of a scan.
     """
 
-    chunk = 512
-
     def __init__(self, projection: Projection) -> None:
         self.projection = projection
+        self.chunk = max(AT_ONCE // max(projection.rows, 1), 1)
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
         """Whitened signatures, d rows / d amount ** power, [hypothesis, row]; of a discrete effect

@@ -10,13 +10,16 @@ from enum import StrEnum
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import ROUNDING, TINY, Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.scan import free_scan
 from tmlattice.inference.whitening import Projection
 
-STEP_SHARES = (1.0, 0.5, 0.25, 0.0625)
+ROUNDS, ITERATIONS = 8, 60
+"""Largest number of repetitions of what settles in two or three (linearisations, selections, Newton
+steps), and of iterations that converge slowly; each ends by its own test."""
+STEP_SHARES = (1.0, 0.5, 0.25, 0.125)
 """Shares of a step, tried in turn until the cost falls."""
 
 MIN_INFORMATION = 1e-12
@@ -123,7 +126,7 @@ def fit(
     nuisances: Array,
     kicks: Kicks = NO_KICKS,
     *,
-    steps: int = 8,
+    steps: int = ROUNDS,
     tolerance: float = 0.02,
     hopeless: float = -np.inf,
     slopes: Slopes = NO_SLOPES,
@@ -242,7 +245,7 @@ def _step(problem: Problem, point: Point, rows: Array) -> tuple[Array, Array, fl
         size = np.sqrt(np.einsum("kr,kr->k", own, own) + precision)
         scale = np.where(size > 0, size, 1.0)
         unit = own / scale[:, None]
-        gram = unit @ unit.T + np.diag(precision / scale**2 + 1e-10)
+        gram = unit @ unit.T + np.diag(precision / scale**2 + ROUNDING)
         inner = unit @ clean - precision * amount / scale
         solved = np.linalg.solve(gram, inner)
         expected_fall += float(inner @ solved)
@@ -293,8 +296,8 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
         full = gram + np.diag(_prior_terms(problem, point, len(rows))[0])
         if (np.diagonal(full)[: len(named)] < MIN_INFORMATION).any():
             return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
-        size = np.sqrt(np.maximum(np.diagonal(full), 1e-300))
-        scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))
+        size = np.sqrt(np.maximum(np.diagonal(full), TINY))
+        scaled = full / size[:, None] / size + ROUNDING * np.eye(len(full))
         inverse = np.linalg.inv(scaled) / size[:, None] / size
         covariance[np.ix_(named, named)] = inverse[: len(named), : len(named)]
         sign, determinant = np.linalg.slogdet(covariance[np.ix_(named, named)])

@@ -22,12 +22,9 @@ from scipy.linalg.blas import dsyrk, dtrmm
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 from scipy.sparse import csr_array
 
-from tmlattice.arrays import Array, Indices
+from tmlattice.arrays import ROUNDING, Array, Indices
 from tmlattice.compiled import jit_sums
 from tmlattice.inference.priors import Group
-
-ROUNDING = 1e-11
-
 
 AT_ONCE = 2048
 """Readings weighed at a time: enough for matrix products, within the cache."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from tmlattice.arrays import Array, Indices
+from tmlattice.arrays import INVISIBLE, ROUNDING, TINY, Array, Indices
 from tmlattice.effects import find
 from tmlattice.inference import chi2
 from tmlattice.inference.metric import Hypothesis, Metric
@@ -20,8 +20,6 @@ from tmlattice.inference.metric import Hypothesis, Metric
 DRAWS = 64
 """Simulations of pure noise for the threshold: the effective number is known to 12 %."""
 
-MIN_VISIBLE = 1e-9
-"""Share of a signature's square that launches must leave, at least."""
 
 MAX_FAULTS = 100.0
 """Largest faults that a hypothesis must need for one standard deviation, at most."""
@@ -113,7 +111,7 @@ def scan(
     reach = np.array(
         [MAX_FAULTS * find(name).largest ** find(name).power for name, _ in hypotheses]
     )
-    seen = (norm > MIN_VISIBLE * sums.whole) & (norm * reach**2 > 1.0)
+    seen = (norm > INVISIBLE * sums.whole) & (norm * reach**2 > 1.0)
     safe = np.where(seen, norm, 1.0)
     squares = np.where(seen[:, None], sums.inner**2 / safe[:, None], 0.0)
     if effective is None:
@@ -178,8 +176,8 @@ def free_scan(places: Indices, gram: Array, inner: Array) -> FreeScan:
         inner: signatures times residual, [place, block, p].
     """
     values, vectors = np.linalg.eigh(gram)
-    top = np.maximum(values.max(axis=(1, 2), keepdims=True), 1e-300)
-    seen = values > 1e-10 * top
+    top = np.maximum(values.max(axis=(1, 2), keepdims=True), TINY)
+    seen = values > ROUNDING * top
     along = np.einsum("kbpq,kbp->kbq", vectors, inner)
     safe = np.where(seen, values, 1.0)
     scaled = np.where(seen, along / np.sqrt(safe), 0.0).reshape(len(gram), -1)

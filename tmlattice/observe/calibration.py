@@ -13,9 +13,8 @@ from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import located, read_document
+from tmlattice.observe.orbit_response import DELTA
 
-ENERGY = 1e-3
-"""Energy step of the differences for an energy spread."""
 FORMAT = "tmlattice-calibration"
 CALIBRATES = tuple(name for name, effect in CATALOGUE.items() if effect.calibrates)
 """Effects in a calibration file."""
@@ -246,8 +245,8 @@ def _of_centroid(
     square = sum(cause.amount**2 for cause in causes if cause.effect == "energy_spread")
     if not square:
         return one
-    up, down = (response(model.at_energy(side * ENERGY)) for side in (1, -1))
-    return np.asarray(one + square / ENERGY**2 * ((up + down) / 2 - one))
+    up, down = (response(model.at_energy(side * DELTA)) for side in (1, -1))
+    return np.asarray(one + square / DELTA**2 * ((up + down) / 2 - one))
 
 
 def _check(causes: Iterable[Cause]) -> None:

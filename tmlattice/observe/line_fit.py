@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.fft import dct, idct
 
-from tmlattice.arrays import Array, ComplexArray, Flags, Indices
+from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.harmonics import frequency as strongest
 
 WIDEST = 0.05
@@ -25,7 +25,6 @@ ROUNDS = 4
 """Rounds of the alternation: it starts within the noise of its end, and three reach it."""
 QUIETEST = 0.1
 """Smallest noise of a signal over the typical one, so that none dominates."""
-TINY = 1e-30
 _SMALL = 1e-6
 """Smallest eigenvalue: one monitor cannot separate the quadratures of a turn; the band does."""
 
@@ -232,9 +231,9 @@ def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
 
     def statistical(power: Array) -> float:
         own = turn[: len(power)]
-        middle = (power * own).sum() / max(power.sum(), 1e-300)
+        middle = (power * own).sum() / max(power.sum(), TINY)
         lever = (power * (own - middle) ** 2).sum()
-        return float(variance / max(lever, 1e-300) / (2 * np.pi) ** 2)
+        return float(variance / max(lever, TINY) / (2 * np.pi) ** 2)
 
     middle = int(np.searchsorted(np.cumsum(power), power.sum() / 2))
     halves = [slice(0, middle), slice(middle, len(power))]  # of the power
@@ -243,7 +242,7 @@ def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
     drift = max((peaks[0] - peaks[1]) ** 2 - 9 * expected, 0.0) / 4
     peak, mean = _peak(np.abs(envelope) * envelope), growth(envelope).imag / (2 * np.pi)
     noise = (np.abs(np.gradient(envelope)) ** 2).sum() + power[0] + power[-1]
-    noise *= variance / max(2 * np.pi * power.sum(), 1e-300) ** 2
+    noise *= variance / max(2 * np.pi * power.sum(), TINY) ** 2
     if (peak - mean) ** 2 > 9 * noise:
         return mean, float(np.sqrt(noise + drift))
     return peak, float(np.sqrt(statistical(power) + drift))
@@ -261,7 +260,7 @@ def floor(fit: LineFit) -> Array:
         return np.ones(len(fit.residual))
     window = np.hanning(turns + 2)[1:-1]
     power = np.abs(np.fft.rfft(fit.residual * window)[:, 1:]) ** 2
-    mean = np.maximum(power.mean(axis=1), 1e-300)
+    mean = np.maximum(power.mean(axis=1), TINY)
     return np.asarray(np.sqrt(np.median(power, axis=1) / np.log(2) / mean))
 
 
@@ -280,7 +279,7 @@ def noise_at(fit: LineFit, line: int, quiet: Array, planes: Indices) -> Array:
     turns = fit.envelope.shape[1]
     envelope = np.abs(fit.envelope[line])
     power = np.abs(np.fft.rfft(fit.residual * envelope)) ** 2
-    power /= np.maximum(quiet**2 * (envelope**2).sum(), 1e-300)[:, None]
+    power /= np.maximum(quiet**2 * (envelope**2).sum(), TINY)[:, None]
     wide = round(2 * turns * (envelope**4).sum() / (envelope**2).sum() ** 2)
     away = np.abs(np.arange(power.shape[1]) - round(fit.frequency[line] * turns))
     away[0] = turns  # the offset
@@ -355,4 +354,4 @@ def change(fit: LineFit, line: int, planes: Indices) -> Array:
 def growth(envelope: ComplexArray) -> complex:
     """Growth of an envelope per turn, averaged over the line's power."""
     power = (np.abs(envelope) ** 2).sum()
-    return complex(np.vdot(envelope, np.gradient(envelope)) / max(power, 1e-300))
+    return complex(np.vdot(envelope, np.gradient(envelope)) / max(power, TINY))

@@ -17,11 +17,6 @@ from tmlattice.effects import ReadingEffect, find
 from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.whitening import Projection, Whitening
 
-MAX_NUMBERS = 20_000_000
-"""Numbers of signatures in memory: with many shots, fewer hypotheses at a time."""
-KICKS = 128
-"""Layers at a time, of free kicks."""
-
 
 def behind(values: Array) -> Array:
     """Sums over all readings from each on, [shot, reading, ...] -> [shot, reading + 1, ...]."""
@@ -53,7 +48,6 @@ class TurnMetric(Metric):
         self.active = active
         self.shots = np.flatnonzero(active)
         self.weight = whitening.weight * active[:, None, None]
-        self.chunk = int(np.clip(MAX_NUMBERS // self.weight.size, 1, Metric.chunk))
 
     # --- named hypotheses -----------------------------------------------------------------------
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
@@ -100,7 +94,7 @@ class TurnMetric(Metric):
             independent.
         """
         grams, inners = [], []
-        count = min(self.chunk, KICKS)
+        count = max(self.chunk // len(self.shots), 1)
         for start in range(0, len(layers), count):
             rows, parts = self._free_rows(layers[start : start + count], clean)
             grams.append(np.einsum("kbpr,kbqr->kbpq", rows, rows, optimize=True))

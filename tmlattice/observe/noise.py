@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import TINY, Array
 from tmlattice.beam.model import Paths
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
+from tmlattice.inference.judgement import ENOUGH, MISSTATED, OUTLIERS
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.data import Data
@@ -60,13 +61,11 @@ def estimate(data: Data, paths: Paths) -> Array:
     """rms noise of one reading in x and y, m, [2]; NaN for a plane with too few readings."""
     misfit = local_misfit(data, paths)
     planes = [misfit[:, :, plane][np.isfinite(misfit[:, :, plane])] for plane in (0, 1)]
-    return np.array([chi2.typical(p) if len(p) > 20 else np.nan for p in planes])
+    return np.array([chi2.typical(p) if len(p) > ENOUGH else np.nan for p in planes])
 
 
 LEAST_FREEDOM = 2
 """Shots beyond those absorbed by errors between neighbours, for an estimate."""
-LEAST_READINGS = 8
-"""Readings of the median, at least: with two further shots it is known to a fifth."""
 
 
 def scatter(data: Data, paths: Paths) -> Array:
@@ -93,13 +92,13 @@ def scatter(data: Data, paths: Paths) -> Array:
                 continue
             linear = orbit[there, i - 1 : i + 1][:, :, slice(None) if both else plane]
             fixed = np.column_stack([np.ones(count), linear.reshape(count, columns)])
-            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), 1e-30)
+            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), TINY)
             left = misfit[there, i, plane]
             left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
             usual = float(chi2.median_per_freedom(freedom))
             variances[plane].append(float(np.sum(left**2)) / freedom / usual)
     return np.array([
-        np.sqrt(np.median(own)) if len(own) >= LEAST_READINGS else np.nan for own in variances
+        np.sqrt(np.median(own)) if len(own) >= ENOUGH else np.nan for own in variances
     ])  # fmt: skip
 
 
@@ -130,12 +129,12 @@ def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
                 continue
             plane = slice(0, 4) if both else slice(2 * (reading % 2), 2 * (reading % 2) + 2)
             fixed = np.column_stack([np.ones(count), found.start[:, w, plane]])
-            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), 1e-30)
+            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), TINY)
             left = found.left[:, w, reading]
             left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
             share = found.freedom[:, w].mean() / found.there[:, w].sum(axis=1).mean()
             ratios.append(float(np.sum(left**2) / (count - fixed.shape[1]) / share))
-    if len(ratios) < 8:
+    if len(ratios) < ENOUGH:
         return None
     random = float(np.sqrt(np.median(ratios)))
     orbit = float(np.sqrt(np.nanmean(passes.readings**2)))
@@ -148,10 +147,6 @@ NEIGHBOURS = 4
 """Neighbours of a monitor: two for the orbit, one for the energy, one more."""
 SPARE = 2
 """Columns over neighbours, at least, for a fit."""
-WRONG = 0.1
-"""Share of the columns that may be outliers."""
-OVERSTATED = 3.0
-"""Ratio to the estimate above which stated noise is too large, or includes beam jitter."""
 
 
 class Places(NamedTuple):
@@ -238,7 +233,7 @@ def overstated(ring: Ring, measured: OrbitResponse) -> bool:
     """Whether the noise stated in one plane is far above the estimate from neighbours: it includes
     beam jitter, which neighbours share, or is wrong."""
     both = stated_and_estimated(ring, measured)
-    return both is not None and bool((both[0] > OVERSTATED * both[1]).any())
+    return both is not None and bool((both[0] > MISSTATED * both[1]).any())
 
 
 def _residual_noise(read: Array, s: Array, kicked: Array, length: float) -> float:
@@ -262,7 +257,7 @@ def _residual_noise(read: Array, s: Array, kicked: Array, length: float) -> floa
         for _ in range(3):
             rule = np.linalg.lstsq(others[kept], own[kept], rcond=None)[0]
             miss = np.abs(own - others @ rule)
-            kept = miss <= np.quantile(miss, 1 - WRONG)
+            kept = miss <= np.quantile(miss, 1 - OUTLIERS)
         freedom = (kept.sum() - NEIGHBOURS) / kept.sum()
         left.append(chi2.typical(miss) / np.sqrt(freedom * (1 + rule @ rule)))
     return float(np.median(left)) if left else float("nan")

@@ -20,6 +20,7 @@ from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
 from tmlattice.errors import EffectError, UnstableRingError
 from tmlattice.observe.response_data import ResponseData
+from tmlattice.observe.stored import SMALL
 
 Hypothesis = tuple[str, str | None]
 
@@ -28,8 +29,6 @@ DELTA = 1e-3
 spread."""
 TURN = 0.1
 """Roll with which a corrector's kick in the other plane is computed, rad."""
-SMALL = 1e-3
-"""Step of the differences, as a share of a monitor's largest error."""
 MIN_KICK = 0.1
 """Kick over the set one below which a corrector's plane is undetermined."""
 

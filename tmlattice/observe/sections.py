@@ -18,20 +18,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import Array, Flags, Indices
+from tmlattice.arrays import TINY, Array, Flags, Indices
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
 from tmlattice.inference import chi2
+from tmlattice.inference.newton import ROUNDS
 from tmlattice.lattice import Ring
 
 Places = NDArray[np.intp]
 
-_KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates, without tau
+KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates, without tau
 WEAK = 1e-8
 """Weight of unmeasured directions of a trajectory, over the strongest direction's."""
-STEPS = 8
-"""Newton steps at most: the maps are nearly linear."""
 TWO = 2
 """Coordinates of a trajectory in a plane, and so readings that determine it."""
 DIVERGED_SIGMA = 1e15
@@ -89,8 +88,8 @@ def _five(weights: Sequence[Array]) -> Maps:
     T[..., rows, columns] = W2 / 2
     T = T + np.swapaxes(T, -1, -2)
     if W0.shape[-1] == n:
-        W0, W1, T = W0[..., _KEPT], W1[..., _KEPT, :], T[..., _KEPT, :, :]
-    return Maps(W0, W1[..., _KEPT], T[..., _KEPT, :][..., _KEPT])
+        W0, W1, T = W0[..., KEPT], W1[..., KEPT, :], T[..., KEPT, :, :]
+    return Maps(W0, W1[..., KEPT], T[..., KEPT, :][..., KEPT])
 
 
 def _stacked(several: Sequence[Maps]) -> Maps:
@@ -327,12 +326,12 @@ class Sections:
         x[..., 4] = passes.delta[:, None]
         moved, by_energy = np.inf, np.zeros((P, W, 4))
         with np.errstate(all="ignore"):
-            for step in range(STEPS):
+            for step in range(ROUNDS):
                 image, slope = maps(x[:, :, None])
                 left = np.where(there, (data - image) / sigma, 0.0).reshape(P, W, -1)
                 A = (slope[..., :4] / sigma[..., None]).reshape(P, W, -1, 4)
                 curvature = _regularised(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
-                if step == STEPS - 1 or not moved > SETTLED:
+                if step == ROUNDS - 1 or not moved > SETTLED:
                     break
                 own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
                 back: Array = np.linalg.solve(curvature, np.swapaxes(A, -1, -2)).astype(float)
@@ -468,7 +467,7 @@ def _prior_precision(passes: Passes, slopes: Array, members: Flags, count: Indic
     own = np.stack([slopes[..., 0, 0:2], slopes[..., 1, 2:4]], axis=-2)  # [..., plane, coordinate]
     square = np.where(members[..., None, None], own**2, 0.0).sum(axis=2)
     square = square / members.sum(axis=1)[:, None, None]
-    precision = square / np.maximum(size, 1e-30) ** 2
+    precision = square / np.maximum(size, TINY) ** 2
     unread = (count < TWO) & (count.max(axis=2, keepdims=True) >= TWO)
     return np.where(unread[..., None], precision, 0.0).reshape(*count.shape[:2], 4)
 
@@ -481,7 +480,7 @@ def _regularised(curvature: Array) -> Array:
     """Normal equations [..., 4, 4] regularised in every direction."""
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", curvature), 0.0))
     scale = np.where(np.isfinite(scale), scale, 0.0)
-    largest = np.maximum(scale.max(axis=-1, keepdims=True), 1e-30)
+    largest = np.maximum(scale.max(axis=-1, keepdims=True), TINY)
     scale = np.maximum(scale, 1e-2 * largest)
     held = np.nan_to_num(curvature, posinf=0.0, neginf=0.0)
     return np.asarray(held + WEAK * scale[..., None] ** 2 * np.eye(4))

@@ -20,10 +20,11 @@ from functools import partial
 import numpy as np
 from scipy.special import betaincinv
 
-from tmlattice.arrays import Array, ComplexArray, Flags, Indices
+from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.errors import TooFewTurnsError, first_of
 from tmlattice.harmonics import MIN_TURNS
 from tmlattice.inference import chi2
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.line_fit import (
@@ -306,8 +307,6 @@ SHORTEST = 32
 """Fewest turns of a longer measurement in which a line is sought."""
 MAX_OTHERS = 3
 """Largest number of other lines that are fitted."""
-CHANCE = 1e-6
-"""Probability that noise alone makes a line somewhere in the spectrum."""
 
 
 def betatron_lines(data: Array, there: Flags, planes: Indices, near: Near) -> LineFit:
@@ -370,7 +369,7 @@ def _power(data: Array, there: Flags) -> tuple[Array, Array]:
     power = np.abs(np.fft.rfft((data - mean * there) * window)[:, 1:]) ** 2
     quarter = power.shape[1] // 4
     floor = np.partition(power, quarter, axis=1)[:, quarter, None] / -np.log(0.75)
-    return np.arange(1, turns // 2 + 1) / turns, power / np.maximum(floor, 1e-300)
+    return np.arange(1, turns // 2 + 1) / turns, power / np.maximum(floor, TINY)
 
 
 def _allowed(frequency: Array, near: Near) -> Flags:
@@ -392,9 +391,9 @@ def _typical(power: Array) -> Array:
 
 def _seen(signals: int, trials: int) -> float:
     """Level that `_typical` of noise signals exceeds in some of the trials with probability
-    CHANCE."""
+    DEFAULT.noise[1]."""
     above = signals - signals // 2
-    return float(-np.log(betaincinv(above, signals - above + 1, CHANCE / trials)))
+    return float(-np.log(betaincinv(above, signals - above + 1, DEFAULT.noise[1] / trials)))
 
 
 def _other_lines(fit: LineFit, there: Flags, planes: Indices) -> list[float]:
@@ -456,6 +455,6 @@ def _significant(fit: LineFit, planes: Indices, line: int) -> bool:
     plane = 0 if share(fit, planes, line) >= 0.5 else 1
     own = planes == plane
     size = np.abs(fit.amplitude[own, line]) ** 2
-    over = size / (2 * fit.variance[own, line] * fit.noise[own] ** 2 + 1e-300)
+    over = size / (2 * fit.variance[own, line] * fit.noise[own] ** 2 + TINY)
     picked = (1 + np.sqrt(2 * WIDEST * turns / own.sum())) ** 2
     return bool(_typical(over[:, None])[0] > picked * _seen(int(own.sum()), turns))

@@ -22,9 +22,6 @@ from tmlattice.inference.whitening import Projection
 NOTHING = np.zeros(0)
 """Nuisances of a kind without any."""
 
-MAX_NUMBERS = 2**24
-"""Numbers of signatures in memory."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Steady(Problem):
@@ -145,7 +142,6 @@ class SteadyMetric(Metric):
         assert point.projection is not None
         super().__init__(point.projection)
         self.problem, self.point = problem, point
-        self.chunk = int(np.clip(MAX_NUMBERS // max(problem.used.size, 1), 1, 512))
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
         """See `Metric.rows`."""

@@ -20,6 +20,9 @@ from tmlattice.lattice.supplies import magnets, supplied_alike
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
+USUAL, REPRODUCED = 1e-2, 1e-4
+"""Prior rms of a change, or of an error that magnets share, relative or in 1/m; and the relative
+reproducibility of a magnet, twice that of a supply, below which changes are ignored."""
 LARGEST_GRADIENT = 0.02
 """Largest prior rms of one magnet, relative: larger errors are faults."""
 FURTHEST = 0.05

@@ -24,7 +24,7 @@ from tmlattice.arrays import Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
 from tmlattice.diagnosis.families.family import StatedCause
-from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.families.fields import REPRODUCED, FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, EnergyOffset, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
@@ -33,7 +33,7 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.changed_supplies import MOST, REPRODUCED, changed_supplies
+from tmlattice.diagnosis.response.changed_supplies import MOST, changed_supplies
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
@@ -44,13 +44,14 @@ from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.validation import Step, score
+from tmlattice.diagnosis.response.weights import LEAST
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import FREE
 from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
-from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
@@ -63,10 +64,6 @@ ANY = 6.0
 """rms of the logarithm of a change's scale about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
 """Relative scatter of magnets above which it is reported without a single detected change."""
-SEEN = 3.0
-"""Standard deviations above which an energy offset of the reference is reported."""
-LEAST_NOISE = 0.2
-"""Least noise of the difference of two measurements, as a share of the stated noise."""
 
 
 def diagnose_change(
@@ -235,7 +232,7 @@ def _of_the_ring(fitted: State) -> Iterator[str]:
     if energy:
         there = linear(fitted, EnergyOffset.block)
         sigma = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where[where]]
-        if abs(energy) > SEEN * sigma[0]:
+        if abs(energy) > SIGNIFICANT * sigma[0]:
             yield (
                 f"its beam differs from the nominal energy by {energy:.2e} ± {sigma[0]:.0e} "
                 "(relative), "
@@ -292,7 +289,7 @@ def _learnt_noise(state: State) -> State:
         left = left[state.fitted[:-1]][:, state.good]
         left = left[np.isfinite(left)]
         scales.append(float(chi2.typical(left)) if len(left) else 1.0)
-    lower = float(np.clip(max(scales), LEAST_NOISE, 1.0))
+    lower = float(np.clip(max(scales), LEAST, 1.0))
     return _with_noise(state, lower * data.noise)
 
 

@@ -15,7 +15,12 @@ from scipy.linalg import block_diag
 
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.family import Family
-from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.families.fields import (
+    REPRODUCED,
+    USUAL,
+    FamilyGradient,
+    QuadrupoleGradient,
+)
 from tmlattice.diagnosis.findings import cause_of, finding_of
 from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
 from tmlattice.diagnosis.response.state import State
@@ -26,6 +31,7 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.common_factors import CommonFactor, FactorModel, GivenOthers
 from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.newton import ROUNDS
 from tmlattice.inference.normal import solve
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import supplied_alike
@@ -34,16 +40,10 @@ from tmlattice.observe.response_problem import Response
 
 MOST = 40
 """Most changes of a plane: many supplies may be changed on purpose."""
-REPRODUCED = 1e-4
-"""Relative reproducibility of a magnet, and twice that of a supply; smaller changes are ignored."""
 STRAY = 3e-5
 """Reproducibility of a gradient outside quadrupoles, 1/m: the orbit in a sextupole moves."""
-USUAL = 1e-2
-"""Prior rms of a change: relative, or of integrated gradients in 1/m."""
 ALONE = 2.0
 """Log odds of a changed supply against one of its magnets alone, or a field elsewhere."""
-AGAIN = 3
-"""Repetitions of the selection, with undetermined errors of the ring linearised at the findings."""
 FINER = 0.5
 """Factor between the smaller scatters that are tried."""
 OTHERS = tuple(float(own) for own in np.geomspace(1e-4, 1e-2, 9))
@@ -88,7 +88,7 @@ def changed_supplies(
     data = state.data
     base = Predicted(data, Errors.none(data)).bend()
     problem = Response(base=base, used=np.isfinite(data.orbits), places={})
-    for _ in range(AGAIN):
+    for _ in range(ROUNDS):
         before = {(own.effect, own.element) for own in found}
         try:
             blurred = _blurred(problem, open_, found)

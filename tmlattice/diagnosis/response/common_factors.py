@@ -15,9 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array, Indices
-from tmlattice.diagnosis.families.fields import QuadrupoleGradient
+from tmlattice.arrays import TINY, Array, Indices
+from tmlattice.diagnosis.families.fields import (
+    LARGEST_GRADIENT,
+    REPRODUCED,
+    USUAL,
+    QuadrupoleGradient,
+)
 from tmlattice.diagnosis.records import named
+from tmlattice.diagnosis.response.fitted_causes import AGAINST, SHOWN
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
@@ -30,29 +36,14 @@ from tmlattice.inference.common_factors import (
     likely_sets,
     over_sets,
 )
+from tmlattice.inference.judgement import DEFAULT, FEW
 from tmlattice.inference.normal import solve
 from tmlattice.lattice.supplies import magnets
 
-USUAL = 1e-2
-"""Prior rms of a shared error, relative."""
-LEAST_SCATTER = 1e-4
-"""Least scatter of single magnets, relative."""
-TOLERANCE = 0.02
-"""Largest distance of a healthy magnet from its family, relative."""
 BETWEEN = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
 """Scatters of families, relative rms, that are tried."""
-MORE = 3.0
-"""Log evidence required for a scatter of families."""
-FEWEST = 3
-"""Fewest families for their scatter."""
 MOST = 20
 """Most common factors."""
-SETS, LIKELY = 3, 0.05
-"""Most alternative sets that are reported, and their least probability."""
-AGAINST = 0.4
-"""Correlation above which neighbours of an outlier are named."""
-SHOWN = 3
-"""Most neighbours that are named."""
 COST = {"all": 0.0, "focusing": 1.0, "region": 1.0, "type": 1.0, "family": 1.0, "magnet": 3.0}
 """Log prior odds against a common factor of each kind."""
 MAKES = {
@@ -178,19 +169,19 @@ def explain_gradients(state: State) -> CommonFactors | None:
     among = candidates(state.data.ring, own)
     kinds, names, members, _ = among
     known = state.groups.get(family.name)
-    scatter = max(LEAST_SCATTER if known is None else known.rms, LEAST_SCATTER)
+    scatter = max(REPRODUCED if known is None else known.rms, REPRODUCED)
     posterior = solve(there.normal, there.groups, there.start, rounds=0)
     rows = there.where[family.variable]
     spread = posterior.spread[rows]
     covariance = spread @ posterior.covariance @ spread.T
     # the excess of stated errors over posterior ones is in every error, but is no scatter
-    plain = np.maximum(np.diag(covariance), 1e-24)
+    plain = np.maximum(np.diag(covariance), TINY)
     wider = of_readings(state, 0, there, posterior)[rows] / np.sqrt(plain)
     sizes = of_sizes(state, 0, there)[rows]
     more = np.sqrt(np.maximum(wider**2 - 1, 0))
     single = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
     covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), TINY))
     between, levels, sets = weighed(information, pull, among, single)
     found = [
         (one, chance)
@@ -219,7 +210,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
             for c, square in zip(one.chosen, levels.squares(one.chosen), strict=True)
             if square >= MIN_CHI2
         ))
-        for one in sets[1 : SETS + 1] if one.probability > LIKELY
+        for one in sets[1 : SHOWN + 1] if one.probability > 1 - DEFAULT.mass
     )  # fmt: skip
     return CommonFactors(
         common_factors,
@@ -269,8 +260,8 @@ def weighed(
         return FactorModel(information, pull, among.members[:, at], scatter, slab, cost[at])
 
     alike = levels(np.arange(len(cost)), 0.0)
-    best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + MORE
-    for between in BETWEEN if len(families) >= FEWEST else ():
+    best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + DEFAULT.behind
+    for between in BETWEEN if len(families) >= FEW else ():
         tried = levels(others, between)
         evidence = tried.background + tried.log_evidence(tried.choose(MOST))
         if evidence > known:
@@ -296,7 +287,7 @@ def _outliers(
     prior: Array,
 ) -> tuple[Outlier, ...]:
     found = []
-    for i in np.flatnonzero(np.abs(left) - sigma > TOLERANCE).tolist():
+    for i in np.flatnonzero(np.abs(left) - sigma > LARGEST_GRADIENT).tolist():
         other = np.argsort(-np.abs(correlation[i]))
         pulls = [int(j) for j in other if j != i and abs(correlation[i, j]) > AGAINST][:SHOWN]
         against = tuple((places[j], float(values[j]), float(correlation[i, j])) for j in pulls)

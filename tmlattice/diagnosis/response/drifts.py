@@ -17,11 +17,11 @@ from tmlattice.diagnosis.support import Support
 from tmlattice.effects import Cause
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
 
-DRIFT, OUTSTANDING = 0.03, 8.0
-"""Least change of a BPM or corrector that is a finding, and its least ratio to the typical one."""
+DRIFT = 0.03
+"""Least change of a BPM or corrector that is a finding."""
 
 
 def drifts(state: State) -> list[tuple[StatedCause, Support]]:
@@ -46,7 +46,7 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
         usual = float(chi2.typical([cause.amount for cause, _ in rows]))
         for cause, sigma in rows:
             size = abs(cause.amount)
-            if size > max(DRIFT, OUTSTANDING * usual) and size > 5 * sigma:
+            if size > max(DRIFT, SIGNIFICANT * usual) and size > SIGNIFICANT * sigma:
                 square = (size / max(sigma, 1e-12)) ** 2
                 seen = Detection.among(square, len(rows))
                 found.append(

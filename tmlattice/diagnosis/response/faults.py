@@ -10,7 +10,7 @@ from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.common_factors import MIN_CHI2
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import SIGNIFICANT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors
 from tmlattice.observe.response_data import ResponseData
@@ -44,10 +44,6 @@ class Fault:
         return finding_of(ring, self.rivals, chance, shown, self.sigma, seen, judgement.mass)
 
 
-CLEARLY = 5.0
-"""Standard errors of a corrector's kick in the other plane above which it is significant."""
-
-
 def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:
     """Return the fault, reported as a roll if the corrector kicks significantly in the other plane:
     it has one number for each plane, and the kick that is missing in one is no calibration error. A
@@ -57,7 +53,7 @@ def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:
     ring, name = data.ring, fault.cause.element
     columns = [ring[own].name for own in data.measured.correctors]
     column = columns.index(ring[name or ""].name)
-    if not errors.turned[column] or abs(errors.roll[column]) < CLEARLY * fault.sigma:
+    if not errors.turned[column] or abs(errors.roll[column]) < SIGNIFICANT * fault.sigma:
         return fault
     roll = Cause("corrector_roll", name, float(errors.angle[column]))
     others = [i for i, own in enumerate(fault.rivals)

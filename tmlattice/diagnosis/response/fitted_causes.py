@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import TINY, Array
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
@@ -59,7 +59,7 @@ def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: 
             if hypothesis in place:
                 slopes[place[hypothesis], number] = amount
     both = slopes @ covariance @ slopes.T
-    width = np.sqrt(np.maximum(np.diag(both), 1e-300))
+    width = np.sqrt(np.maximum(np.diag(both), TINY))
     correlation = both / width[:, None] / width
     np.fill_diagonal(correlation, 1.0)
     sigma = np.array([own for _, own in rows])
@@ -126,7 +126,7 @@ def _support(
         return support
     here = (cause.effect, cause.element)
     mine = [i for i in range(own.start, own.stop) if here in numbers.get(i, {})]
-    width = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    width = np.sqrt(np.maximum(np.diag(covariance), TINY))
     near: dict[int, float] = {}
     for i in mine:
         correlation = covariance[i] / (width[i] * width)

@@ -15,21 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import INVISIBLE, Array
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.rf_by_others import rf_fitted
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
-from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT
 from tmlattice.inference.normal import Normal, solve
 from tmlattice.lattice.supplies import magnets, supplied_alike
-
-CLEAR = 5.0
-"""Standard deviations above which gradients are reported."""
-ROUNDING = 1e-6
-"""Share of a variance below which a difference of two is a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +117,7 @@ def _pulls(
     names: list[str], alone: Array, wide: Array, both: Array, narrow: Array, families: int
 ) -> tuple[Pull, ...]:
     """Inconsistent families, then single magnets."""
-    more = np.maximum(wide - narrow, ROUNDING * wide)  # the information of the RF's orbit
+    more = np.maximum(wide - narrow, INVISIBLE * wide)  # the information of the RF's orbit
     pulls = np.where(more > 0, (both - alone) / np.sqrt(np.where(more > 0, more, 1.0)), 0.0)
     order = sorted(range(len(names)), key=lambda i: (i >= families, -abs(pulls[i])))
     return tuple(
@@ -131,5 +126,5 @@ def _pulls(
             float(np.sqrt(narrow[i])), float(pulls[i]),
         )
         for i in order
-        if abs(pulls[i]) >= CLEAR
+        if abs(pulls[i]) >= SIGNIFICANT
     )  # fmt: skip

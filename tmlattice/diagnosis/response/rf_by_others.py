@@ -13,14 +13,11 @@ by itself and predict none.
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from tmlattice.arrays import Array, Indices
+from tmlattice.arrays import INVISIBLE, Array, Indices
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference.normal import Posterior
-
-LEAST = 1e-9
-"""Least share of a reading's weight after the fit, above rounding errors."""
 
 
 def rf_by_others(state: State, there: Linear | None, found: Posterior | None) -> Array:
@@ -42,7 +39,7 @@ def rf_by_others(state: State, there: Linear | None, found: Posterior | None) ->
         fitted = solve_triangular(found.factor, (weights @ rows @ found.spread).T, lower=True)
         precision -= (fitted**2).sum(axis=0)
     out = np.full(state.data.shape[1], np.nan)
-    out[read] = weights @ left / np.maximum(precision, LEAST * weights.diagonal())
+    out[read] = weights @ left / np.maximum(precision, INVISIBLE * weights.diagonal())
     return out
 
 

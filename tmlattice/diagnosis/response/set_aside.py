@@ -13,19 +13,17 @@ import numpy as np
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import good_monitors, sound_monitors
+from tmlattice.inference.judgement import GROSS
 
 log = logging.getLogger(__name__)
 
-HOPELESS = 20.0
-"""Ratio to the median rms residual above which a BPM stays rejected: with all families fitted, no
-magnet's error has that effect on a sound BPM."""
 WORTH = 0.5
 """Log evidence that the other readings may lose for each reading regained: one standard error."""
 
 
 def taken_back(state: State) -> State:
     """Return the converged state with the rejected neighbours that agree with the fit."""
-    aside = ~state.good & good_monitors(state, HOPELESS)
+    aside = ~state.good & good_monitors(state, GROSS)
     together = aside & (np.roll(aside, 1) | np.roll(aside, -1))
     if not together.any():
         return state

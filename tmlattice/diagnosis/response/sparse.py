@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags
+from tmlattice.arrays import AT_ONCE, Array, Flags
+from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
+from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import StepwiseFit
@@ -25,7 +27,7 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection, leading
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.newton import ITERATIONS, ROUNDS, Fit, fit
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Identified, Search, explain
 from tmlattice.observe.orbit_response import Hypothesis, Predicted
@@ -39,8 +41,8 @@ MOST = 3
 RARER = 100.0
 """Log prior odds of each further cause: the residual of an inexact cause looks like one more."""
 
-NOISE, REST = 1.5, 0.01
-"""Chi-square per reading, and share of the gap, below which a sparse solution is accepted although
+REST = 0.01
+"""Share of the gap below which a sparse solution is accepted although
 it leaves more than noise. Understated noise leaves as much, distributed errors leave more."""
 
 
@@ -48,19 +50,16 @@ PATTERNS, SPARE = 2, 2
 """Patterns of a cause: a thin error at one place changes each plane's response by a product of a
 column and a row. Spare patterns are for a magnet's length and sextupoles."""
 
-ROUNDS, SETTLED = 30, 0.99
-"""Rounds of filling in missing readings, and the least gain of chi-square in a round."""
+SETTLED = 0.99
+"""Least gain of chi-square in a round of filling in missing readings."""
 
-LESS = 0.98
-"""Ratio of rms, both planes multiplied, below which the hierarchical fit is preferred."""
 
 LARGER = 2.0
 """Ratio to the largest fault above which a kick is implausible: it fits tunes by sextupoles."""
 
 
-BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12
-"""Most products of readings and undetermined errors; most searches; and hypotheses, before and
-after one of them explains the readings."""
+LEADING, NEAR = 3, 12
+"""Hypotheses that are tried, before and after one of them explains the readings."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def sparse_fit(
     count = int(problem.used.sum())
     gap = max(before.chi2 - count, 1.0)
     stated = float(chi2.isf(judgement.noise[1], count))
-    enough = max(stated, min(NOISE * count, count + REST * gap))
+    enough = max(stated, min(MISSING * count, count + REST * gap))
     search = _Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress,
         stated=stated,
@@ -146,7 +145,7 @@ def sparse_fit(
         found = _explained(search, problem, before, gap)
     except UnstableRingError:  # the sparse solution stores no beam
         found = None
-    if open_ is not None and open_.root.size and open_.size(problem) <= BLURRED:
+    if open_ is not None and open_.root.size and open_.size(problem) <= AT_ONCE:
         found = _among_open(search, problem, before, found, open_)
     if found is None:
         return None
@@ -163,7 +162,7 @@ def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bo
     of_all = fit.heldout[1]
     of_few = score(replace(state, good=fit.state.good), state.split.held)
     gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
-    return bool(np.nansum(gained) < np.log(LESS))
+    return bool(np.nansum(gained) < np.log(HELPS))
 
 
 def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> Explanation | None:
@@ -240,7 +239,7 @@ def _among_open(
 def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
     """The search repeated given undetermined errors; its log evidence, -inf if it fails."""
     evidence = -np.inf
-    for _ in range(AGAIN):
+    for _ in range(ROUNDS):
         problem = blur.among(blur.of(found.fit.causes))
         there = replace(search, problem=problem, most=MOST)
         again = explain(there, fit(problem, (), problem.first))
@@ -275,7 +274,7 @@ def _beyond(problem: Response, before: Fit, patterns: int, enough: float) -> flo
     left = problem.left(before.point)[0].reshape(len(problem.used), -1)
     used = problem.used.reshape(left.shape)
     filled, rest = left, np.inf
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         columns, size, rows = np.linalg.svd(filled, full_matrices=False)
         model = (columns[:, :patterns] * size[:patterns]) @ rows[:patterns]
         before_that, rest = rest, float(((left - model)[used] ** 2).sum())

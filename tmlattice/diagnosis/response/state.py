@@ -14,6 +14,7 @@ from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
+from tmlattice.inference.judgement import FEW
 from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -23,8 +24,6 @@ log = logging.getLogger(__name__)
 
 ALONE = 0.3
 """Ratio to which a column's misfit falls by its own number if it has no other significant error."""
-FEW = 3
-"""Readings required to check the gain of a BPM."""
 
 
 @dataclass(frozen=True, eq=False)

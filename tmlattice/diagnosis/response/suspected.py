@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import INVISIBLE, Array
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.others import KINDS
@@ -27,8 +27,6 @@ from tmlattice.observe.orbit_response import Hypothesis
 
 AFFORDABLE = 4e9
 """Most products of signatures and derivatives; above it only numbers of families are compared."""
-BLIND = 1e-6
-"""Least share of a signature's information that remains given the distributed errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +216,7 @@ class Seen:
             along = found.spread.T @ it.across
             taken = np.einsum("ph,ph->h", along, found.covariance @ along)
             information[block] = np.maximum(it.own - taken, 0.0)
-            information[block][information[block] < BLIND * it.own] = 0.0
+            information[block][information[block] < INVISIBLE * it.own] = 0.0
             inner[block] = it.left - (found.values - it.there.start) @ it.across
         inner[information == 0] = 0.0
         total = information.sum(axis=0)

@@ -8,26 +8,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags
+from tmlattice.arrays import INVISIBLE, TINY, Array, Flags
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
+from tmlattice.inference.judgement import FEW, OUTLIERS, SIGNIFICANT
 from tmlattice.inference.normal import amounts, common, times_precision
 
-BAD = 5.0
-"""Ratio of a BPM's rms residual, given its own gain, to the median one above which it is bad."""
-SPARED = 0.1
-"""Share of a BPM's readings, the largest residuals, without which it must be bad too: few outliers
-are rejected as readings."""
-FEW = 4
-"""Fewest correctors of a plane for the test of BPMs."""
 TYPICAL = 10.0
 """Number of readings by which the typical misfit counts in the model discrepancy of each column."""
 LEAST = 0.2
 """Least model discrepancy, and least noise given jitter, as a share of the noise."""
-ROUNDED = 1e-6
-"""Relative size of rounding errors: two equal responses differ by less."""
+BLIND = 0.2
+"""Gain below which a BPM does not read the beam."""
 DISPERSION = "quadrupole_gradient"
 """The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
 many times all others, and would bias the BPM gains."""
@@ -137,7 +131,7 @@ def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     return replace(state, independent=own)
 
 
-def good_monitors(state: State, bad: float = BAD) -> Flags:
+def good_monitors(state: State, bad: float = SIGNIFICANT) -> Flags:
     """Return the BPMs that agree with the others in the kicked plane, [monitor].
 
     Args:
@@ -152,10 +146,10 @@ def good_monitors(state: State, bad: float = BAD) -> Flags:
         if rows.sum() < FEW:
             continue
         own = np.full(data.shape[1], np.inf)
-        rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
-        for spared in (0.0, SPARED):
+        rounded = INVISIBLE * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
+        for spared in (0.0, OUTLIERS):
             rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
-            rms[gain < 0.2] = np.inf  # reversed, until gains are fitted
+            rms[gain < BLIND] = np.inf  # reversed, until gains are fitted
             read_at_all = count > 0  # a plane may have no readings
             typical = max(np.median(rms[read_at_all]), rounded) if read_at_all.any() else np.inf
             # otherwise the fit has diverged, and BPMs are not bad
@@ -182,10 +176,10 @@ def _good_across(state: State) -> Flags:
         if rows.sum() < FEW:
             continue
         bad = np.ones(data.shape[1], dtype=bool)
-        for spared in (0.0, SPARED):
+        for spared in (0.0, OUTLIERS):
             rms, _, count = _given_own_gain(read[rows], orbits[rows], spared)
             usual = rms[(count > 0) & state.good]
-            bad &= rms > BAD * np.median(usual) if len(usual) else False
+            bad &= rms > SIGNIFICANT * np.median(usual) if len(usual) else False
         good &= ~bad
     return good
 
@@ -211,4 +205,4 @@ def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Ar
 
 def _gain(read: Array, orbits: Array, seen: Flags) -> Array:
     u, d = np.where(seen, read, 0), np.where(seen, orbits, 0)
-    return np.asarray((u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30))
+    return np.asarray((u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), TINY))
