@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.diagnosis.records import OPTIONAL, record_of
+from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, of, record_of
 from tmlattice.diagnosis.support import share_of_fault
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.effects.effect import FamilyEffect, StrengthEffect
@@ -55,11 +55,11 @@ class RecommendedAction:
     effect: str
     element: str | None
     pieces: tuple[str, ...]
-    kind: Kind | None
+    kind: Kind | None = field(metadata=HIDDEN)
     amount: float
     amount_sigma: float | None
     probability: float
-    mechanisms: tuple[tuple[str, float], ...]
+    mechanisms: tuple[tuple[str, float], ...] = field(metadata=of("effect", "probability"))
     strength: Strength | None
     device: str | None = field(default=None, metadata=OPTIONAL)
 
@@ -75,16 +75,14 @@ class RecommendedAction:
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        effect, own = find(self.effect), record_of(self)
-        del own["kind"]
-        return own | {
+        effect = find(self.effect)
+        return record_of(self) | {
             "action": self.action,
             "check": effect.to_check,
             "quantity": effect.quantity or effect.words,
             "share_from_data": share_of_fault(self.effect, self.amount_sigma),
             "unit": effect.unit,
             "probability": min(self.probability, 1.0),  # a sum of shares
-            "mechanisms": [{"effect": e, "probability": p} for e, p in self.mechanisms],
         }
 
 

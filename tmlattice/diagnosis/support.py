@@ -5,12 +5,12 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from tmlattice.arrays import Array
+from tmlattice.diagnosis.records import of
 from tmlattice.effects import find
 from tmlattice.inference.problem import Hypothesis
 
@@ -30,22 +30,14 @@ class Support:
     """
 
     share_from_data: float
-    degenerate_with: tuple[tuple[str, str | None, float], ...] = ()
+    degenerate_with: tuple[tuple[str, str | None, float], ...] = field(
+        default=(), metadata=of("effect", "element", "correlation")
+    )
 
     @property
     def determined(self) -> bool:
         """Whether the data determine the number."""
         return self.share_from_data >= DETERMINED
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields of a number in the diagnosis."""
-        return {
-            "share_from_data": self.share_from_data,
-            "degenerate_with": [
-                {"effect": effect, "element": element, "correlation": correlation}
-                for effect, element, correlation in self.degenerate_with
-            ],
-        }
 
 
 def share_from_data(sigma: float, prior: float) -> float:
@@ -90,16 +82,9 @@ class Correlation:
         correlation: of their errors, between -1 and 1.
     """
 
-    first: Hypothesis
-    second: Hypothesis
+    first: Hypothesis = field(metadata=of("effect", "element"))
+    second: Hypothesis = field(metadata=of("effect", "element"))
     correlation: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        one, other = (
-            {"effect": effect, "element": element} for effect, element in (self.first, self.second)
-        )
-        return {"first": one, "second": other, "correlation": self.correlation}
 
 
 def correlations_of(amounts: Sequence[Hypothesis], covariance: Array) -> tuple[Correlation, ...]:

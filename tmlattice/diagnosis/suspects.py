@@ -10,13 +10,13 @@ fit it is an amount that is an outlier of its family.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from tmlattice.arrays import TINY
 from tmlattice.diagnosis.places import between
-from tmlattice.diagnosis.records import OPTIONAL, record_of
+from tmlattice.diagnosis.records import OPTIONAL, of
 from tmlattice.effects import Cause
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import ENOUGH, SIGNIFICANT, Judgement
@@ -53,7 +53,7 @@ class Suspect:
     kind: SuspectKind
     effect: str | None
     element: str
-    where: tuple[float, float]
+    where: tuple[float, float] = field(metadata=of("s_from", "s_to"))
     near: tuple[str, ...]
     statistic: float
     threshold: float
@@ -62,12 +62,6 @@ class Suspect:
     amount: float | None = None
     amount_sigma: float | None = None
     device: str | None = field(default=None, metadata=OPTIONAL)
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        where = {"s_from": self.where[0], "s_to": self.where[1]}
-        elements = list(self.elements or (self.element,))
-        return {**record_of(self), "where": where, "elements": elements}
 
 
 Candidate = tuple[str | None, str, float]
@@ -95,7 +89,9 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
         if kind == "magnet":
             kind, key = "section", where
         if (kind, key) not in found and sum(k == kind for k, _ in found) < MOST:
-            found[kind, key] = Suspect(kind, effect, name, where, near, statistic, threshold)
+            found[kind, key] = Suspect(
+                kind, effect, name, where, near, statistic, threshold, elements=(name,)
+            )
     return tuple(found.values())
 
 

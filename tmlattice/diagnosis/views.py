@@ -1,12 +1,11 @@
 """Parts of a measurement that a diagnosis keeps for plots and tables."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
-from tmlattice.diagnosis.records import OPTIONAL, named, record_of
+from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, named
 from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Misfit
@@ -119,15 +118,9 @@ class PartView:
     readings: int
     before: Misfit
     after: Misfit
-    monitors: tuple[str, ...]
-    left: Array = field(repr=False)
+    monitors: tuple[str, ...] = field(metadata=HIDDEN)
+    left: Array = field(repr=False, metadata=HIDDEN)
     numbers: tuple[NumberRead, ...] = field(default=(), metadata=OPTIONAL)
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        own = record_of(self)
-        del own["monitors"], own["left"]
-        return own
 
 
 @dataclass(frozen=True, eq=False)

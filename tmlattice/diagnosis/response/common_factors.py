@@ -11,7 +11,6 @@ scatter of single magnets is in every error. Outlier magnets are reported, with 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from tmlattice.diagnosis.families.fields import (
     USUAL,
     QuadrupoleGradient,
 )
-from tmlattice.diagnosis.records import named
+from tmlattice.diagnosis.records import named, of
 from tmlattice.diagnosis.response.fitted_causes import AGAINST, SHOWN
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.sharing import Candidates, candidates
@@ -86,13 +85,8 @@ class Reason:
     probability: float
     statistic: float
     makes: str
-    rivals: tuple[tuple[str, float], ...]
+    rivals: tuple[tuple[str, float], ...] = field(metadata=of("name", "probability"))
     share_from_data: float = 1.0
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        rivals = [{"name": name, "probability": p} for name, p in self.rivals]
-        return {**vars(self), "members": list(self.members), "rivals": rivals}
 
 
 @dataclass(frozen=True)
@@ -105,12 +99,9 @@ class Instead:
     """
 
     probability: float
-    amounts: tuple[tuple[str, float, float], ...] = field(metadata=named("common_factors"))
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        common_factors = [{"name": n, "amount": a, "amount_sigma": e} for n, a, e in self.amounts]
-        return {"probability": self.probability, "common_factors": common_factors}
+    amounts: tuple[tuple[str, float, float], ...] = field(
+        metadata=named("common_factors") | of("name", "amount", "amount_sigma")
+    )
 
 
 @dataclass(frozen=True)
@@ -127,13 +118,10 @@ class Outlier:
     element: str
     amount: float
     amount_sigma: float
-    against: tuple[tuple[str, float, float], ...]
+    against: tuple[tuple[str, float, float], ...] = field(
+        metadata=of("element", "amount", "correlation")
+    )
     share_from_data: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        against = [{"element": n, "amount": a, "correlation": c} for n, a, c in self.against]
-        return {**vars(self), "against": against}
 
 
 @dataclass(frozen=True)

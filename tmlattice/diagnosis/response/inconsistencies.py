@@ -11,7 +11,6 @@ with its weights and without the kicks.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -62,10 +61,6 @@ class Inconsistency:
     chi2: float
     readings: int
     pulls: tuple[Pull, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {**vars(self), "pulls": [dict(vars(own)) for own in self.pulls]}
 
 
 def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> Inconsistency | None:

@@ -70,10 +70,6 @@ class Weighed:
     control_in_plane: float | None
     judgement: str
 
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return dict(vars(self))
-
 
 HELPS = 0.98
 """Ratio of held-out rms, with and without a hypothesis, below which it improves the prediction."""

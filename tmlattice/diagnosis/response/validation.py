@@ -5,12 +5,13 @@ scored on the other half. The outer validation set (`score`) selects nothing. Th
 (`inner`) selects families, with standard errors, because it may have only four correctors.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
+from tmlattice.diagnosis.records import HIDDEN
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
@@ -72,7 +73,7 @@ class Step:
     dispersion_rms: float
     heldout_rms_position: float = float("nan")
     heldout_rms_roll: float = float("nan")
-    kept: bool = True
+    kept: bool = field(default=True, metadata=HIDDEN)
 
     @classmethod
     def scored(cls, effect: str, parameters: int, s: Score) -> "Step":
@@ -81,10 +82,6 @@ class Step:
             effect, parameters, s.in_plane, s.coupling, s.chi2_per_dof, s.dispersion, s.position,
             s.roll,
         )  # fmt: skip
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {name: value for name, value in vars(self).items() if name != "kept"}
 
 
 class _Missed(NamedTuple):
