@@ -28,8 +28,12 @@ def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternati
     evidence = np.array([rival.fit.log_evidence for rival in rivals])
     probability = np.exp(evidence - evidence.max())
     probability /= probability.sum()
-    size = int(np.searchsorted(np.cumsum(probability), mass)) + 1
-    return list(rivals[:size]), probability
+    return list(rivals[: size_of(probability, mass)]), probability
+
+
+def size_of(probability: Array, mass: float) -> int:
+    """The size of the credible set of this mass, by falling probability."""
+    return int(np.searchsorted(np.cumsum(probability), mass)) + 1
 
 
 def finished(explanation: Explanation) -> Explanation:
@@ -56,7 +60,7 @@ def findings_of(
     sure = Detection(float("inf"), float("nan"), 0.0)  # the readings alone show the fault
     for m, amount in dead:
         cause = Cause("monitor_dead", ring.monitors[m].name, amount)
-        found.append(finding_of(ring, [cause], np.ones(1), [cause], 0.0, sure, judgement.mass))
+        found.append(finding_of(ring, [cause], np.ones(1), 0.0, sure, judgement.mass))
     return strongest_first(found)
 
 
@@ -78,17 +82,15 @@ def least_certain(found: Sequence[Finding], without: str) -> str:
 def _named(ring: Ring, explanation: Explanation, k: int, named: Identified, mass: float) -> Finding:
     cause = explanation.fit.causes[k]
     sigma = float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0)))
-    members, probability = credible(named.alternatives, mass)
+    probability = credible(named.alternatives, mass)[1]
     causes = [cause, *(m.cause for m in named.alternatives[1:])]
-    shown = [m.cause for m in members]
-    return finding_of(ring, causes, probability, shown, sigma, named.detection, mass)
+    return finding_of(ring, causes, probability, sigma, named.detection, mass)
 
 
 def finding_of(
     ring: Ring,
     causes: Sequence[Cause],
     probability: Array,
-    shown: Sequence[Cause],
     sigma: float,
     detection: Detection,
     mass: float,
@@ -99,12 +101,11 @@ def finding_of(
         ring: the design.
         causes: the cause, and its alternatives by falling probability.
         probability: of each.
-        shown: the first of them, which form the credible set.
         sigma: standard error of the amount.
         detection: how clearly it was seen.
         mass: of the credible set.
     """
-    cause = causes[0]
+    cause, shown = causes[0], causes[: size_of(probability, mass)]
     actions = recommended_actions(ring, causes, probability, sigma)
     positions = [s for m in shown for s in _positions(ring, (m.effect, m.element))]
     where, near = between(ring, positions) if positions else (None, ())
@@ -251,4 +252,4 @@ def swap_of(state: State, name: str, judgement: Judgement) -> Finding:
     statistic = float(np.sum(as_read / data.noise[at] ** 2))
     cause = Cause("monitor_swap", data.ring[name].name, 1.0)
     seen = Detection.among(statistic, 2 * len(data.at))
-    return finding_of(data.ring, [cause], np.ones(1), [cause], 0.0, seen, judgement.mass)
+    return finding_of(data.ring, [cause], np.ones(1), 0.0, seen, judgement.mass)

@@ -23,7 +23,7 @@ from tmlattice.inference.distributed import (
     signatures_of,
 )
 from tmlattice.inference.judgement import SIGNIFICANT
-from tmlattice.inference.newton import Fit, fit_nuisances
+from tmlattice.inference.newton import STEP_SHARES, Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Gap, Misfit, held_out_gap
@@ -73,10 +73,6 @@ def stages_of(
     return [_settled(problem, *model, about) for model in models]
 
 
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
-"""The share of the step to the most probable distributed errors that stores a beam."""
-
-
 def _settled(
     problem: CombinedProblem,
     static: tuple[Cause, ...],
@@ -84,7 +80,7 @@ def _settled(
     nuisances: Array,
     about: Mapping[Hypothesis, float],
 ) -> Stage:
-    for share in SHARES:
+    for share in (*STEP_SHARES, 0.0):
         some = tuple(
             replace(c, amount=start + share * (c.amount - start))
             for c in static for start in [about[c.effect, c.element]]

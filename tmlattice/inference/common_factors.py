@@ -125,7 +125,7 @@ class FactorModel:
             made = [self.given(others, one) if one else self for one in sizes]
             logs = np.array([own.background + own.log_evidence(chosen) for own in made])
             best = int(np.argmax(logs - DEFAULT.behind * (np.array(sizes) > 0)))
-            stay = made[best]._pruned(list(chosen), MIN_CHI2)
+            stay = made[best]._pruned(list(chosen))
             if len(stay) == len(chosen):
                 logs[1:] -= np.log(max(len(rms), 1))
                 chance = np.exp(logs - logsumexp(logs)).tolist()
@@ -177,19 +177,17 @@ class FactorModel:
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
 
-    def choose(
-        self, most: int, clear: float = MIN_CHI2, without: Collection[int] = ()
-    ) -> list[int]:
+    def choose(self, most: int, without: Collection[int] = ()) -> list[int]:
         """Select factors, except some."""
         chosen: list[int] = []
         while len(chosen) < most:
             gain, square = self.gains(chosen)
             gain[list(without)] = -np.inf
-            gain[square < clear] = -np.inf
+            gain[square < MIN_CHI2] = -np.inf
             best = int(np.argmax(gain))
             if not gain[best] > 0:
                 break
-            chosen = self._pruned([*chosen, best], clear)
+            chosen = self._pruned([*chosen, best])
             if best not in chosen:
                 break
         for _ in range(ROUNDS):
@@ -198,21 +196,21 @@ class FactorModel:
                 others = [c for c in chosen if c != own]
                 gain, square = self.gains(others)
                 gain[list(without)] = -np.inf
-                best = int(np.argmax(np.where(square < clear, -np.inf, gain)))
+                best = int(np.argmax(np.where(square < MIN_CHI2, -np.inf, gain)))
                 if gain[best] > gain[own] + 1e-9:
                     chosen = [*others, best]
-            chosen = self._pruned(chosen, clear)
+            chosen = self._pruned(chosen)
             if set(chosen) == set(before):
                 break
         return chosen
 
-    def _pruned(self, chosen: list[int], clear: float) -> list[int]:
+    def _pruned(self, chosen: list[int]) -> list[int]:
         """Remove redundant factors, the weakest first."""
         while chosen:
             worth = []
             for own in chosen:
                 gain, square = self.gains([c for c in chosen if c != own])
-                worth.append(gain[own] if square[own] >= clear else -np.inf)
+                worth.append(gain[own] if square[own] >= MIN_CHI2 else -np.inf)
             least = int(np.argmin(worth))
             if worth[least] > 0:
                 break
@@ -321,22 +319,21 @@ class LikelySet:
         return float(self.covariance[at, at])
 
 
-def likely_sets(levels: FactorModel, most: int, clear: float = MIN_CHI2) -> list[LikelySet]:
+def likely_sets(levels: FactorModel, most: int) -> list[LikelySet]:
     """Sets in which every factor is significant given the others, the most probable first.
 
     Args:
         levels: the candidates.
         most: candidates in a set at most.
-        clear: smallest chi-square of a factor.
 
     Returns:
         At least one set.
     """
     rests = _rests(levels.candidates)
     chances: dict[frozenset[int], float] = {}
-    for one in _likely(levels, _starts(levels, most, clear), most, clear):
+    for one in _likely(levels, _starts(levels, most), most):
         parts = _in_parts(rests, one)
-        reported = parts if (levels.squares(sorted(parts)) >= clear).all() else one
+        reported = parts if (levels.squares(sorted(parts)) >= MIN_CHI2).all() else one
         chance = levels.log_evidence(sorted(one))
         chances[reported] = max(chance, chances.get(reported, -np.inf))
     sets = list(chances)
@@ -380,7 +377,7 @@ def over_sets(levels: FactorModel, sets: Sequence[LikelySet]) -> list[tuple[Comm
     return found
 
 
-def _starts(levels: FactorModel, most: int, clear: float) -> list[frozenset[int]]:
+def _starts(levels: FactorModel, most: int) -> list[frozenset[int]]:
     """Ends of stepwise selection with all candidates, and without each selected one, in turn from
     each likely end; the most probable first."""
     ends = {frozenset[int](): 0.0}
@@ -388,7 +385,7 @@ def _starts(levels: FactorModel, most: int, clear: float) -> list[frozenset[int]
     tried = set(waiting)
     while waiting:
         without = waiting.pop(0)
-        end = frozenset(levels.choose(most, clear, without))
+        end = frozenset(levels.choose(most, without))
         ends[end] = levels.log_evidence(sorted(end))
         if len(without) < MAX_EXCLUDED and ends[end] > max(ends.values()) - NEGLIGIBLE:
             more = [without | {own} for own in sorted(end)]
@@ -400,7 +397,7 @@ def _starts(levels: FactorModel, most: int, clear: float) -> list[frozenset[int]
 
 
 def _likely(
-    levels: FactorModel, starts: Sequence[frozenset[int]], most: int, clear: float
+    levels: FactorModel, starts: Sequence[frozenset[int]], most: int
 ) -> list[frozenset[int]]:
     """Likely sets that are reached from the starts over significant ones, by one candidate more,
     less or exchanged; the most probable are expanded first, `MAX_EXPANDED` of them."""
@@ -417,7 +414,7 @@ def _likely(
 
     while waiting and len(found) < MAX_EXPANDED and -waiting[0][0] > best - NEGLIGIBLE:
         negative, here = heappop(waiting)
-        if not (levels.squares(here) >= clear).all():
+        if not (levels.squares(here) >= MIN_CHI2).all():
             continue
         found.append(frozenset(here))
         best = max(best, -negative)
@@ -427,7 +424,7 @@ def _likely(
             gain, square = levels.gains(others)
             left = -negative if own is None else -negative - float(gain[own])
             meet(frozenset(others), left)
-            values = np.where(square >= clear, left + gain, -np.inf)
+            values = np.where(square >= MIN_CHI2, left + gain, -np.inf)
             for candidate in np.flatnonzero(values > best - NEGLIGIBLE).tolist():
                 meet(frozenset([*others, candidate]), float(values[candidate]))
     return [one for one in found if met[one] > best - NEGLIGIBLE]

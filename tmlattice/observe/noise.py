@@ -91,15 +91,19 @@ def scatter(data: Data, paths: Paths) -> Array:
             if freedom < LEAST_FREEDOM:
                 continue
             linear = orbit[there, i - 1 : i + 1][:, :, slice(None) if both else plane]
-            fixed = np.column_stack([np.ones(count), linear.reshape(count, columns)])
-            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), TINY)
-            left = misfit[there, i, plane]
-            left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
+            square = _scattered(misfit[there, i, plane], linear.reshape(count, columns))
             usual = float(chi2.median_per_freedom(freedom))
-            variances[plane].append(float(np.sum(left**2)) / freedom / usual)
+            variances[plane].append(square / freedom / usual)
     return np.array([
         np.sqrt(np.median(own)) if len(own) >= ENOUGH else np.nan for own in variances
     ])  # fmt: skip
+
+
+def _scattered(left: Array, linear: Array) -> float:
+    """Sum of squares beyond a constant and a part that is linear in columns, [row, column]."""
+    fixed = np.column_stack([np.ones(len(left)), linear])
+    fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), TINY)
+    return float(np.sum((left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]) ** 2))
 
 
 SCATTER = 3
@@ -128,12 +132,10 @@ def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
             if not found.there[:, w, reading].all() or (found.freedom[:, w] < 2).any():
                 continue
             plane = slice(0, 4) if both else slice(2 * (reading % 2), 2 * (reading % 2) + 2)
-            fixed = np.column_stack([np.ones(count), found.start[:, w, plane]])
-            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), TINY)
-            left = found.left[:, w, reading]
-            left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
+            linear = found.start[:, w, plane]
             share = found.freedom[:, w].mean() / found.there[:, w].sum(axis=1).mean()
-            ratios.append(float(np.sum(left**2) / (count - fixed.shape[1]) / share))
+            square = _scattered(found.left[:, w, reading], linear)
+            ratios.append(float(square / (count - 1 - linear.shape[1]) / share))
     if len(ratios) < ENOUGH:
         return None
     random = float(np.sqrt(np.median(ratios)))

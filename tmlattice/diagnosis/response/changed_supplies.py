@@ -204,6 +204,5 @@ def _finding(
 ) -> Finding:
     chance = np.array([p for _, p in own.alternatives])
     causes = [Cause(*names[c], own.amount) for c, _ in own.alternatives]
-    shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
     seen = Detection.among(own.statistic, len(names))
-    return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)
+    return finding_of(ring, causes, chance, own.sigma, seen, judgement.mass)

@@ -50,7 +50,7 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
                 square = (size / max(sigma, 1e-12)) ** 2
                 seen = Detection.among(square, len(rows))
                 found.append(
-                    finding_of(state.data.ring, [cause], np.ones(1), [cause], sigma, seen,
+                    finding_of(state.data.ring, [cause], np.ones(1), sigma, seen,
                                judgement.mass)
                 )  # fmt: skip
     return found

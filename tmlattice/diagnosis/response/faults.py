@@ -39,9 +39,8 @@ class Fault:
         """The fault as a hypothesis of the report."""
         chance = np.exp(self.evidence - self.evidence.max())
         chance /= chance.sum()
-        shown = self.rivals[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
         seen = Detection(self.statistic, MIN_CHI2, self.p_value)
-        return finding_of(ring, self.rivals, chance, shown, self.sigma, seen, judgement.mass)
+        return finding_of(ring, self.rivals, chance, self.sigma, seen, judgement.mass)
 
 
 def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:

@@ -121,16 +121,15 @@ def label_messages(labels: Iterable[Label]) -> list[str]:
 
 
 # --- swaps ----------------------------------------------------------------------------------------
-def swaps(state: State, rejected: Collection[Label], among: Collection[str] = ()) -> list[Label]:
+def swaps(state: State, rejected: Collection[Label]) -> list[Label]:
     """Return the swapped correctors of a state; if there are none, the swapped BPMs.
 
     Args:
         state: with the model's readings.
         rejected: channels; if the phase advance is wrong, other BPMs look shifted by one cell.
-        among: correctors, besides rejected ones, that may be swapped with any other of these.
     """
     gone = {label.elements[0] for label in rejected}
-    return swapped_correctors(state, gone.union(among)) or swapped_monitors(state, gone)
+    return swapped_correctors(state, gone) or swapped_monitors(state, gone)
 
 
 def swapped_correctors(state: State, among: Collection[str]) -> list[Label]:

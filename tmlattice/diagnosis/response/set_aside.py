@@ -12,7 +12,7 @@ import numpy as np
 
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.weights import good_monitors, sound_monitors
+from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.inference.judgement import GROSS
 
 log = logging.getLogger(__name__)
@@ -23,13 +23,13 @@ WORTH = 0.5
 
 def taken_back(state: State) -> State:
     """Return the converged state with the rejected neighbours that agree with the fit."""
-    aside = ~state.good & good_monitors(state, GROSS)
+    aside = ~state.good & good_monitors(state, bad=GROSS)
     together = aside & (np.roll(aside, 1) | np.roll(aside, -1))
     if not together.any():
         return state
     good = state.good | together
     trial = settle(replace(state, good=good), look_at_monitors=False)
-    sound = sound_monitors(trial)
+    sound = good_monitors(trial) & good_monitors(trial, 1)
     back = together & sound
     lost = log_evidence(state, state.good, state.independent) - log_evidence(
         trial, state.good, state.independent

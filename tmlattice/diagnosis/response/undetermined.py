@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from tmlattice.arrays import Array
+from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, background_rms, find
@@ -42,8 +43,7 @@ class Undetermined:
 
 
 ORBITS = (
-    "quadrupole_offset_x", "quadrupole_offset_y", "dipole_field", "dipole_roll",
-    "sextupole_offset_x", "sextupole_offset_y",
+    *HorizontalOrbit.effects, *VerticalOrbit.effects, "sextupole_offset_x", "sextupole_offset_y",
 )  # fmt: skip
 """Effects that make orbits: a response hardly shows them, but a change of sextupoles does."""
 

@@ -114,7 +114,9 @@ def look(state: State, block: int) -> State:
         state = replace(state, rf_share=rf_shares(state, block, left[-1]))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
-    good = state.good & _good_across(state) if block else good_monitors(state)
+    good = good_monitors(state, block)
+    if block:
+        good &= state.good
     return _independent(replace(state, lacking=lacking, good=good), block, left, alone)
 
 
@@ -131,17 +133,19 @@ def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     return replace(state, independent=own)
 
 
-def good_monitors(state: State, bad: float = SIGNIFICANT) -> Flags:
-    """Return the BPMs that agree with the others in the kicked plane, [monitor].
+def good_monitors(state: State, block: int = 0, bad: float = SIGNIFICANT) -> Flags:
+    """Return the BPMs that agree with the others, given gains, [monitor]; in the plane that is not
+    kicked also given fitted skew gradients, before which all are good.
 
     Args:
         state: of the fit.
+        block: 0 in-plane, 1 coupling.
         bad: ratio to the median rms residual, given gains, above which a BPM is bad.
     """
     data = state.data
-    read, orbits = data.pick(state.at.read), data.pick(data.orbits)
     ratio = np.zeros(data.shape[1])
-    for p in (0, 1):
+    read, orbits = data.pick(state.at.read, block), data.pick(data.orbits, block)
+    for p in (0, 1) if block == 0 or state.allows(COUPLING) else ():
         rows = state.fitted & (data.plane == p)
         if rows.sum() < FEW:
             continue
@@ -149,39 +153,15 @@ def good_monitors(state: State, bad: float = SIGNIFICANT) -> Flags:
         rounded = INVISIBLE * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
         for spared in (0.0, OUTLIERS):
             rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
-            rms[gain < BLIND] = np.inf  # reversed, until gains are fitted
+            if block == 0:
+                rms[gain < BLIND] = np.inf  # reversed, until gains are fitted
             read_at_all = count > 0  # a plane may have no readings
             typical = max(np.median(rms[read_at_all]), rounded) if read_at_all.any() else np.inf
             # otherwise the fit has diverged, and BPMs are not bad
-            share = rms / typical if np.isfinite(typical) else np.zeros_like(rms)
+            share = rms / typical if 0 < typical < np.inf else np.zeros_like(rms)
             own = np.minimum(own, np.where(read_at_all, share, 0.0))
         ratio = np.maximum(ratio, own)
     return np.asarray(ratio <= bad)
-
-
-def sound_monitors(state: State) -> Flags:
-    """Return the BPMs that agree with the others in both planes, [monitor]."""
-    return good_monitors(state) & _good_across(state)
-
-
-def _good_across(state: State) -> Flags:
-    """The good BPMs in the plane that is not kicked, given gains and fitted skew gradients."""
-    data = state.data
-    good = np.ones(data.shape[1], dtype=bool)
-    if not state.allows(COUPLING):
-        return good
-    read, orbits = data.pick(state.at.read, 1), data.pick(data.orbits, 1)
-    for p in (0, 1):
-        rows = state.fitted & (data.plane == p)
-        if rows.sum() < FEW:
-            continue
-        bad = np.ones(data.shape[1], dtype=bool)
-        for spared in (0.0, OUTLIERS):
-            rms, _, count = _given_own_gain(read[rows], orbits[rows], spared)
-            usual = rms[(count > 0) & state.good]
-            bad &= rms > SIGNIFICANT * np.median(usual) if len(usual) else False
-        good &= ~bad
-    return good
 
 
 def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
