@@ -24,7 +24,7 @@ from tmlattice.arrays import Array
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
-from tmlattice.diagnosis.signals import Check, Checkup, fine, note, wrong
+from tmlattice.diagnosis.signals import HALF, Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
 from tmlattice.errors import (
     MeasurementError,
@@ -66,10 +66,9 @@ FAR = 100.0
 benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first BPMs change."""
-NOTHING_FROM, SURE, NO_BEAM, HALF = 2, 4, 0.75, 0.5
+NOTHING_FROM, SURE, NO_BEAM = 2, 4, 0.75
 """Sections at the end that follow no trajectory, from which on the beam may be lost, and is: a few
-swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9; and the share
-that separates them from others."""
+swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9."""
 SPOILT = 3.0
 """Misfit of a section over the typical one above which it is not used."""
 GLOBAL = "signs, units and order"
@@ -77,8 +76,6 @@ MOST_ERRORS = 4
 """Global errors of one measurement at most."""
 _UNIT = "-in-"
 """In the names of assumptions about a unit."""
-SCALED = 3.0
-"""Ratio of the RF's orbit to the design's, or its inverse, that no ring has."""
 
 
 @by_name
@@ -430,7 +427,7 @@ def _outliers(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
             reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
     if not reported:
         return none
-    return note("outliers", f"{signals.some(reported)}; leave them empty")
+    return note("outliers", f"{first_of(reported)}; leave them empty")
 
 
 # --- what is compared with the design's -----------------------------------------------------------
@@ -483,7 +480,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
 
 def _rf_step(checked: OfResponse) -> list[Check]:
     scale = checked.rf_scale()
-    if not max(abs(scale), 1 / abs(scale)) > SCALED:
+    if not max(abs(scale), 1 / abs(scale)) > MISSTATED:
         return []
     text = (
         f"the RF's orbit is {scale:.3g} times the design's for its step: correct its unit "
@@ -500,8 +497,6 @@ def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
         return None
 
 
-MOST = 0.5
-"""Share of the names that may be unknown."""
 MEANT = "did you mean"
 """Phrase in the message about a misspelt name."""
 
@@ -530,7 +525,7 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
         if not unknown:
             continue
         fix = _hint(find, unknown[0])
-        if len(unknown) > MOST * len(names):
+        if len(unknown) > HALF * len(names):
             raise UnknownNameError(
                 f"{len(unknown)} of {len(names)} {what} are not in the lattice: {fix}"
             )

@@ -12,6 +12,7 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.records import of
 from tmlattice.effects import find
+from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.problem import Hypothesis
 
 DETERMINED = 0.5
@@ -69,8 +70,6 @@ FREE = Support(1.0)
 STRONG = 0.9
 """Correlation from which on a pair is reported: the error of each is 2.3 times the one given the
 other."""
-MOST = 8
-"""Pairs that are reported."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def correlations_of(amounts: Sequence[Hypothesis], covariance: Array) -> tuple[C
     order = np.argsort(-np.abs(matrix[rows, columns]), kind="stable")
     found: list[Correlation] = []
     for i, j in zip(known[rows[order]], known[columns[order]], strict=True):
-        if amounts[i] != amounts[j] and len(found) < MOST:
+        if amounts[i] != amounts[j] and len(found) < ENOUGH:
             value = float(covariance[i, j] / sigma[i] / sigma[j])
             found.append(Correlation(amounts[i], amounts[j], float(np.clip(value, -1, 1))))
     return tuple(found)

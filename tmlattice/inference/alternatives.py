@@ -9,6 +9,7 @@ from tmlattice.arrays import Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference import chi2
 from tmlattice.inference.common_factors import MIN_CHI2
+from tmlattice.inference.judgement import BEYOND
 from tmlattice.inference.newton import Fit, Outcome, fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan
@@ -128,7 +129,7 @@ def _first_guess(found: Scan, index: int) -> Cause | None:
         amount = float(np.sqrt(amount))
     elif effect.one_sign and amount <= 0:
         return None
-    limit = 1.5 * effect.largest
+    limit = BEYOND * effect.largest
     return Cause(name, place, float(np.clip(amount, -limit, limit)))
 
 

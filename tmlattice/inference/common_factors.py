@@ -285,12 +285,12 @@ class GivenOthers:
     over: tuple[tuple[FactorModel, float], ...]
 
 
+MAX_CHOSEN = 40
+"""Selected factors at most: many supplies may be changed on purpose."""
 MAX_EXCLUDED = 2
 """Selected factors that are excluded together for another start."""
 MAX_EXPANDED = 300
 """Sets that are expanded at most. ESRF-EBS with 857 candidates needs 150."""
-NEGLIGIBLE = 6.0
-"""Log probability below the best at which a set is ignored: odds of 1 to 400."""
 
 
 @dataclass(frozen=True)
@@ -387,12 +387,12 @@ def _starts(levels: FactorModel, most: int) -> list[frozenset[int]]:
         without = waiting.pop(0)
         end = frozenset(levels.choose(most, without))
         ends[end] = levels.log_evidence(sorted(end))
-        if len(without) < MAX_EXCLUDED and ends[end] > max(ends.values()) - NEGLIGIBLE:
+        if len(without) < MAX_EXCLUDED and ends[end] > max(ends.values()) - DEFAULT.log_odds:
             more = [without | {own} for own in sorted(end)]
             waiting += [one for one in more if one not in tried]
             tried.update(more)
     best = max(ends.values())
-    likely = [one for one, value in ends.items() if value > best - NEGLIGIBLE]
+    likely = [one for one, value in ends.items() if value > best - DEFAULT.log_odds]
     return sorted(likely, key=lambda one: (-ends[one], sorted(one)))
 
 
@@ -408,11 +408,11 @@ def _likely(
     found: list[frozenset[int]] = []
 
     def meet(one: frozenset[int], value: float) -> None:
-        if value > best - NEGLIGIBLE and one not in met:
+        if value > best - DEFAULT.log_odds and one not in met:
             met[one] = value
             heappush(waiting, (-value, sorted(one)))
 
-    while waiting and len(found) < MAX_EXPANDED and -waiting[0][0] > best - NEGLIGIBLE:
+    while waiting and len(found) < MAX_EXPANDED and -waiting[0][0] > best - DEFAULT.log_odds:
         negative, here = heappop(waiting)
         if not (levels.squares(here) >= MIN_CHI2).all():
             continue
@@ -425,9 +425,9 @@ def _likely(
             left = -negative if own is None else -negative - float(gain[own])
             meet(frozenset(others), left)
             values = np.where(square >= MIN_CHI2, left + gain, -np.inf)
-            for candidate in np.flatnonzero(values > best - NEGLIGIBLE).tolist():
+            for candidate in np.flatnonzero(values > best - DEFAULT.log_odds).tolist():
                 meet(frozenset([*others, candidate]), float(values[candidate]))
-    return [one for one in found if met[one] > best - NEGLIGIBLE]
+    return [one for one in found if met[one] > best - DEFAULT.log_odds]
 
 
 def _rests(candidates: Array) -> dict[tuple[int, int], int]:

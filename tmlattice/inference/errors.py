@@ -31,7 +31,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from tmlattice.arrays import ROUNDING, TINY, Array, Flags, Indices
-from tmlattice.inference.newton import ITERATIONS
+from tmlattice.inference.newton import ITERATIONS, SETTLED
 from tmlattice.inference.normal import Normal, Slopes, shared_by, times_precision
 from tmlattice.inference.priors import Group
 
@@ -223,8 +223,6 @@ DAMPING, LARGEST = 0.3, 0.5
 updated at once, and two that compensate each other would oscillate."""
 DATA_ALONE = 1e3
 """Information over that of the narrowest prior component above which the prior is ignored."""
-CONVERGED = 1e-2
-"""Largest change in a sweep, of a mean in standard deviations or of a log variance, at the end."""
 
 
 class Moments(NamedTuple):
@@ -316,7 +314,7 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
             np.abs((center - mean) / np.sqrt(variance)).max(),
             np.abs(np.log((wanted + rest) * variance)).max(),
         )
-        if changed < CONVERGED:
+        if changed < SETTLED:
             break
         step = DAMPING * np.log(wanted / precision)
         precision = precision * np.exp(np.clip(step, -LARGEST, LARGEST))

@@ -21,7 +21,9 @@ OUTLIERS, WRONG = 0.1, 0.25
 """Shares of the readings that may be outliers, and of the channels or steps that may be wrong: of
 more of them the model is."""
 MISSTATED = 3.0
-"""Ratio of stated to measured noise, or its inverse, above which the stated noise is wrong."""
+"""Ratio of a stated to a measured size, or its inverse, above which the stated one is wrong."""
+BEYOND = 1.5
+"""Ratio to the largest fault above which an amount is implausible."""
 
 
 @dataclass(frozen=True)

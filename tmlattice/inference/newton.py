@@ -19,6 +19,8 @@ from tmlattice.inference.whitening import Projection
 ROUNDS, ITERATIONS = 8, 60
 """Largest number of repetitions of what settles in two or three (linearisations, selections, Newton
 steps), and of iterations that converge slowly; each ends by its own test."""
+SETTLED = 1e-2
+"""Change, in standard deviations or of a log variance, below which iterations end."""
 STEP_SHARES = (1.0, 0.5, 0.25, 0.125)
 """Shares of a step, tried in turn until the cost falls."""
 

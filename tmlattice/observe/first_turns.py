@@ -25,9 +25,7 @@ from tmlattice.observe.data import Data
 from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
 from tmlattice.observe.sections import TWO
-
-MIN_FIXED = 10
-"""Number of fixed causes above which they are built into the model."""
+from tmlattice.observe.stored import MAX_CHANGES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +77,7 @@ class FirstTurns(Problem):
         for cause in causes:
             of_model = isinstance(find(cause.effect), RingEffect | ReadingEffect)
             (built if of_model else rest).append(cause)
-        if len(built) < MIN_FIXED and self.alone:
+        if len(built) < MAX_CHANGES and self.alone:
             return super().with_fixed(causes)
         return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 

@@ -64,8 +64,11 @@ def estimate(data: Data, paths: Paths) -> Array:
     return np.array([chi2.typical(p) if len(p) > ENOUGH else np.nan for p in planes])
 
 
-LEAST_FREEDOM = 2
-"""Shots beyond those absorbed by errors between neighbours, for an estimate."""
+SCATTER = 2
+"""Passes beyond those absorbed by errors of monitors and magnets: a constant, and a part linear in
+the trajectory in its plane (or in both, with enough passes)."""
+PASSES = 5 + SCATTER
+"""Passes from which errors of both planes are subtracted."""
 
 
 def scatter(data: Data, paths: Paths) -> Array:
@@ -85,10 +88,10 @@ def scatter(data: Data, paths: Paths) -> Array:
         for i in range(1, misfit.shape[1]):
             there = np.isfinite(misfit[:, i, plane])
             count = int(there.sum())
-            both = count >= 5 + LEAST_FREEDOM  # the other plane too, with enough shots
+            both = count >= PASSES  # the other plane too, with enough shots
             columns = 4 if both else 2
             freedom = count - columns - 1
-            if freedom < LEAST_FREEDOM:
+            if freedom < SCATTER:
                 continue
             linear = orbit[there, i - 1 : i + 1][:, :, slice(None) if both else plane]
             square = _scattered(misfit[there, i, plane], linear.reshape(count, columns))
@@ -106,11 +109,6 @@ def _scattered(left: Array, linear: Array) -> float:
     return float(np.sum((left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]) ** 2))
 
 
-SCATTER = 3
-"""Passes beyond those absorbed by errors of monitors and magnets: a constant, and a part linear in
-the trajectory in its plane (or in both, with enough passes)."""
-PASSES = 5 + SCATTER
-"""Passes from which errors of both planes are subtracted."""
 IN_PROPORTION = 0.015
 """Share of the orbit that unknown errors leave in proportion to what is not subtracted."""
 
@@ -124,7 +122,7 @@ def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
     """
     count = len(found.left)
     both = count >= PASSES
-    if count < 3 + SCATTER - 1:
+    if count < 3 + SCATTER:
         return None
     ratios = []
     for w in range(found.left.shape[1]):
@@ -147,8 +145,6 @@ def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
 
 NEIGHBOURS = 4
 """Neighbours of a monitor: two for the orbit, one for the energy, one more."""
-SPARE = 2
-"""Columns over neighbours, at least, for a fit."""
 
 
 class Places(NamedTuple):
@@ -252,7 +248,7 @@ def _residual_noise(read: Array, s: Array, kicked: Array, length: float) -> floa
         at = (m + np.arange(-(NEIGHBOURS // 2), NEIGHBOURS // 2 + 1)) % len(s)
         among = (kicked - s[at[0]]) % length <= (s[at[-1]] - s[at[0]]) % length
         rows = ~among & np.isfinite(read[:, at]).all(axis=1)
-        if rows.sum() < SPARE * NEIGHBOURS:
+        if rows.sum() < ENOUGH:
             continue
         others, own = read[rows][:, np.delete(at, NEIGHBOURS // 2)], read[rows, m]
         kept = np.ones(len(own), dtype=bool)

@@ -15,13 +15,11 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError, UnstableRingError
+from tmlattice.inference.judgement import FEW
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-MIN_SHARED = 3
-"""Common monitors, and correctors, at least."""
 
 
 def alike(
@@ -40,7 +38,7 @@ def alike(
     for what, own, all_of in (
         ("correctors", columns, after.correctors), ("BPMs", monitors, after.monitors),
     ):  # fmt: skip
-        if len(own) < max(MIN_SHARED, len(all_of) // 4):
+        if len(own) < max(FEW, len(all_of) // 4):
             raise MeasurementError(
                 f"the reference shares {len(own)} of {len(all_of)} {what}: it is not of this "
                 "machine; give one with the same names"

@@ -23,7 +23,7 @@ from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
 from tmlattice.inference import chi2
-from tmlattice.inference.newton import ROUNDS
+from tmlattice.inference.newton import ROUNDS, SETTLED
 from tmlattice.lattice import Ring
 
 Places = NDArray[np.intp]
@@ -35,9 +35,6 @@ TWO = 2
 """Coordinates of a trajectory in a plane, and so readings that determine it."""
 DIVERGED_SIGMA = 1e15
 """Residual in sigma of a trajectory that diverges."""
-SETTLED = 1e-2
-"""Change of the typical reading, in units of its noise or residual, below which no further step is
-made."""
 ENERGY = 5e-3
 """Relative; prior rms of a pass's energy deviation."""
 MOST = 8

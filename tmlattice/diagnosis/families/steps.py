@@ -196,10 +196,6 @@ class MonitorGain(_Monitors):
         return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
 
 
-LEAST_GAIN = 1e-3
-"""Least gain in the errors of rolls."""
-
-
 class MonitorRoll(_Monitors):
     """The cross-talk of a BPM's planes: roll and coupling."""
 
@@ -217,7 +213,7 @@ class MonitorRoll(_Monitors):
     ) -> list[StatedCause]:
         """Causes: for small values x reads (coupling + roll) y, and y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
-        own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
+        own = np.maximum(np.abs(1 + monitors.gain), LEAST_KICK)
         spread = np.hypot(*(sigma.reshape(-1, 2) / own).T) / 2
         return [
             (Cause(effect, name, float(amount[i])), float(spread[i]))

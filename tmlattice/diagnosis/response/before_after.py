@@ -33,7 +33,7 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.changed_supplies import MOST, changed_supplies
+from tmlattice.diagnosis.response.changed_supplies import changed_supplies
 from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
@@ -51,6 +51,7 @@ from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference import chi2
+from tmlattice.inference.common_factors import MAX_CHOSEN
 from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
 from tmlattice.lattice import Ring
@@ -73,7 +74,7 @@ def diagnose_change(
     *,
     holdout: float = 0.2,
     effects: Sequence[str] | None = None,
-    max_effects: int = MOST,
+    max_effects: int = MAX_CHOSEN,
     false_alarm: float = DEFAULT.false_alarm,
     assume: Sequence[str] = (),
     seed: int = 0,
@@ -318,7 +319,7 @@ def _sparse_or_all(
     """The sparse solution of a change, or the fit of all possible changes."""
     asked = changes() if effects is None else effects
     sparse = sparse_fit(
-        data, split, asked, MOST, judgement, seed, progress, and_orbits(data.ring, open_)
+        data, split, asked, MAX_CHOSEN, judgement, seed, progress, and_orbits(data.ring, open_)
     )
     if sparse is not None and all(is_drift(cause) for cause, _ in sparse.fitted_causes):
         sparse = None

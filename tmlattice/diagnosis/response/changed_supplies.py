@@ -29,7 +29,7 @@ from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Detection
-from tmlattice.inference.common_factors import CommonFactor, FactorModel, GivenOthers
+from tmlattice.inference.common_factors import MAX_CHOSEN, CommonFactor, FactorModel, GivenOthers
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import ROUNDS
 from tmlattice.inference.normal import solve
@@ -38,8 +38,6 @@ from tmlattice.lattice.supplies import supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_problem import Response
 
-MOST = 40
-"""Most changes of a plane: many supplies may be changed on purpose."""
 STRAY = 3e-5
 """Reproducibility of a gradient outside quadrupoles, 1/m: the orbit in a sextupole moves."""
 ALONE = 2.0
@@ -148,7 +146,7 @@ def _by_evidence(
             np.full(len(odds), USUAL), np.array(odds),
         )  # fmt: skip
         supplies = [i for i, (name, _) in enumerate(among.causes) if name == FamilyGradient.name]
-        there = levels.given_others(levels.choose(MOST), supplies, OTHERS)
+        there = levels.given_others(levels.choose(MAX_CHOSEN), supplies, OTHERS)
         evidence = there.levels.background + there.levels.log_evidence(there.chosen)
         return _Weighed(among, there, evidence)
 

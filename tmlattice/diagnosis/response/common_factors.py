@@ -29,6 +29,7 @@ from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes
 from tmlattice.diagnosis.support import share_from_data
 from tmlattice.inference.common_factors import (
+    MAX_CHOSEN,
     MIN_CHI2,
     FactorModel,
     LikelySet,
@@ -41,8 +42,6 @@ from tmlattice.lattice.supplies import magnets
 
 BETWEEN = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
 """Scatters of families, relative rms, that are tried."""
-MOST = 20
-"""Most common factors."""
 COST = {"all": 0.0, "focusing": 1.0, "region": 1.0, "type": 1.0, "family": 1.0, "magnet": 3.0}
 """Log prior odds against a common factor of each kind."""
 MAKES = {
@@ -248,19 +247,22 @@ def weighed(
         return FactorModel(information, pull, among.members[:, at], scatter, slab, cost[at])
 
     alike = levels(np.arange(len(cost)), 0.0)
-    best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + DEFAULT.behind
+    best, known = (
+        0.0,
+        alike.background + alike.log_evidence(alike.choose(MAX_CHOSEN)) + DEFAULT.behind,
+    )
     for between in BETWEEN if len(families) >= FEW else ():
         tried = levels(others, between)
-        evidence = tried.background + tried.log_evidence(tried.choose(MOST))
+        evidence = tried.background + tried.log_evidence(tried.choose(MAX_CHOSEN))
         if evidence > known:
             best, known = between, evidence
     if not best:
-        return 0.0, alike, likely_sets(alike, MOST)
+        return 0.0, alike, likely_sets(alike, MAX_CHOSEN)
     slab = np.full(len(cost), max(USUAL, best))
     slab[families] = best
     whole = FactorModel(information, pull, among.members, single + best**2 * alone, slab, cost)
     sets = []
-    for one in likely_sets(levels(others, best), MOST):
+    for one in likely_sets(levels(others, best), MAX_CHOSEN):
         chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())
         sets.append(LikelySet(chosen, one.probability, *whole.fitted(chosen)))
     return best, whole, sets

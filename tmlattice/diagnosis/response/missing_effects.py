@@ -23,15 +23,12 @@ from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State, rms_of
 from tmlattice.diagnosis.response.weights import weight
+from tmlattice.inference.judgement import ENOUGH
 
 Patterns: TypeAlias = Array | csr_array
 
 FREE = 30.0
 """Prior rms of a single parameter, in units of the largest plausible amount: nearly flat."""
-FEW = 6
-"""Largest number of amounts with such a prior."""
-CONTROL = 17
-"""Seed of the random parameters of the control."""
 SPARSE = 0.1
 """Share of non-zero readings below which patterns are sparse."""
 
@@ -174,7 +171,7 @@ def control(hypothesis: Hypothesis) -> Hypothesis:
     Parameters of single columns are estimated from half of a held-out corrector's BPMs, so any
     smooth orbit improves the other half.
     """
-    rng = np.random.default_rng(CONTROL)
+    rng = np.random.default_rng(0)
     patterns = hypothesis.patterns.copy()
     monitors = patterns.shape[2]
     for c in range(patterns.shape[1]):
@@ -281,7 +278,7 @@ class Fitted:
         r = np.concatenate([part.flat @ target for part in parts]) - half.T @ self.vector
         # single amounts are free; many have the most probable scale, within physics
         owner = np.repeat(np.arange(len(parts)), np.diff(edge))
-        many = [len(part.across.T) > FEW for part in parts]
+        many = [len(part.across.T) > ENOUGH for part in parts]
         most = [one.most if m else FREE * min(one.most, 1e3)
                 for one, m in zip(hypotheses, many, strict=True)]  # fmt: skip
         spread = np.array(most)[owner]

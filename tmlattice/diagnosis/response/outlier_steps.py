@@ -31,6 +31,7 @@ import numpy as np
 
 from tmlattice.arrays import TINY, Array, Flags, Indices
 from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.families.fields import FURTHEST
 from tmlattice.diagnosis.response.labels import SHARE, Label, swapped_correctors
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.weights import BLIND
@@ -40,8 +41,6 @@ from tmlattice.observe.noise import SAME_PLACE
 
 ANYWHERE = 2.0
 """Weight of the residual given a kick, whose place is free."""
-LEAST = 0.05
-"""Displacement of a corrector, m, that the shape of any field explains."""
 MARGIN = 1.5
 """Margin beyond the estimated place, as a share of the distance, that counts as between."""
 GAINS, ROLLS = "monitor_gain", "corrector_roll"
@@ -235,7 +234,7 @@ def _labels(state: State, kicked: int, read: int) -> Iterator[Label]:
     pairs, usual = list[Label](), np.inf
     if kicked == read:
         pairs = swapped_correctors(state, {names[steps[i].column] for i in np.flatnonzero(odd)})
-        usual = max(SIGNIFICANT * float(chi2.typical([s.by for s in steps])), LEAST)
+        usual = max(SIGNIFICANT * float(chi2.typical([s.by for s in steps])), FURTHEST)
     kicks = _kicks(state, read) if gains else np.zeros((0, data.shape[1]))
     for step in (steps[i] for i in np.flatnonzero(odd)):
         least, label = SHARE * step.missed(half=True), None

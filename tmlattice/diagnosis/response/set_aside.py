@@ -17,9 +17,6 @@ from tmlattice.inference.judgement import GROSS
 
 log = logging.getLogger(__name__)
 
-WORTH = 0.5
-"""Log evidence that the other readings may lose for each reading regained: one standard error."""
-
 
 def taken_back(state: State) -> State:
     """Return the converged state with the rejected neighbours that agree with the fit."""
@@ -36,8 +33,9 @@ def taken_back(state: State) -> State:
     )
     orbits = state.data.pick(state.data.orbits)[state.fitted]
     readings = int(np.isfinite(orbits[:, back]).sum())
+    # each regained reading may cost a standard error
     log.info("rejected neighbours: %s, sound: %s; evidence of the others falls by %.1f",
              np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
-    if not back.any() or (state.good & ~sound).any() or lost > WORTH * readings:
+    if not back.any() or (state.good & ~sound).any() or lost > readings / 2:
         return state
     return settle(replace(trial, good=state.good | back))

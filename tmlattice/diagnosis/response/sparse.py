@@ -26,7 +26,7 @@ from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection, leading
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import BEYOND, Judgement
 from tmlattice.inference.newton import ITERATIONS, ROUNDS, Fit, fit
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Identified, Search, explain
@@ -52,10 +52,6 @@ column and a row. Spare patterns are for a magnet's length and sextupoles."""
 
 SETTLED = 0.99
 """Least gain of chi-square in a round of filling in missing readings."""
-
-
-LARGER = 2.0
-"""Ratio to the largest fault above which a kick is implausible: it fits tunes by sextupoles."""
 
 
 LEADING, NEAR = 3, 12
@@ -263,7 +259,7 @@ def _hopeless(
     others = [h for h in hypotheses
               if not find(h[0]).responds or isinstance(find(h[0]), LaunchEffect)]  # fmt: skip
     seen = scan(problem.metric(left.point), others, left.residual, effective=1.0)
-    fault = np.abs(seen.amount) < LARGER * np.array([find(h[0]).largest for h in seen.hypotheses])
+    fault = np.abs(seen.amount) < BEYOND * np.array([find(h[0]).largest for h in seen.hypotheses])
     return bool(seen.statistic[fault].max(initial=0.0) < (left.chi2 - problem.used.sum()) / 2)
 
 

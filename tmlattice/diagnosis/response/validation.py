@@ -20,8 +20,8 @@ fall of the score that rejects a family against the evidence, which may fit mode
 FLOOR = np.array([0.1, 0.1, 1.0])
 """Share of the noise that is added to each rms in quadrature, in-plane, coupling and RF: for
 readings without noise (simulated ones) a smaller residual is no improvement."""
-SURELY, WORTH = 1.0, 0.05
-"""Least significant fall of the score, in standard errors; the least one that rejects jitter."""
+WORTH = 0.05
+"""Least fall of the score that rejects jitter."""
 
 
 class Chi2(NamedTuple):
@@ -266,8 +266,8 @@ def lost(without: Validated, within: Validated) -> tuple[float, float]:
 
 
 def against(change: tuple[float, float], least: float = VETO) -> bool:
-    """Return whether validation is significantly better without, by `lost`, and by `least`."""
-    return change[0] < -max(least, SURELY * change[1])
+    """Return whether validation is better without, by `lost`: by a standard error and `least`."""
+    return change[0] < -max(least, change[1])
 
 
 def in_favour(change: tuple[float, float]) -> bool:
