@@ -321,6 +321,11 @@ class Posterior:
         return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
     @property
+    def whole(self) -> Array:
+        """Covariance of the base parameters, [parameter, parameter]."""
+        return np.asarray(self.spread @ self.covariance @ self.spread.T)
+
+    @property
     def sigma(self) -> Array:
         """Posterior standard deviations of the base parameters, [parameter]."""
         square = ((self.spread @ self.covariance) * self.spread).sum(axis=1)

@@ -37,6 +37,7 @@ from tmlattice.observe.sections import (
     distance,
     log_uncertainty,
     mean_pass,
+    scaled,
 )
 
 SHOTS, TURNS = 8, 3
@@ -145,8 +146,7 @@ class Split:
             square: variance of the noise, in units of the stated one.
             kicks: variances of the kicks, in units of the noise's variance.
         """
-        size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("tii->ti", self.spread)), 1e-60))
-        even = np.nan_to_num(self.spread / size[..., None] / size[:, None], posinf=0, neginf=0)
+        size, even = scaled(self.spread)
         width, axes = np.linalg.eigh(even)
         back = np.swapaxes(axes / np.sqrt(np.maximum(width, INVISIBLE))[:, None], 1, 2)
         kicked = back @ np.nan_to_num(self.kicked / size[..., None], posinf=0, neginf=0)

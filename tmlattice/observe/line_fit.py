@@ -248,15 +248,15 @@ def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
     return peak, float(np.sqrt(statistical(power) + drift))
 
 
-MIN_TURNS = 64
-"""Turns of which half determine a change."""
+LONG = 64
+"""Turns of which half determine a change, and that resolve the floor between lines."""
 
 
 def floor(fit: LineFit) -> Array:
     """Noise over the rms of the residual, [signal]: 1 unless lines remain, as sextupoles make them
     of a large oscillation. Lines fill few frequencies: the spectrum's median shows the noise."""
     turns = fit.residual.shape[1]
-    if turns < 2 * MIN_TURNS:
+    if turns < 2 * LONG:
         return np.ones(len(fit.residual))
     window = np.hanning(turns + 2)[1:-1]
     power = np.abs(np.fft.rfft(fit.residual * window)[:, 1:]) ** 2
@@ -323,7 +323,7 @@ def change(fit: LineFit, line: int, planes: Indices) -> Array:
     """
     turns = fit.envelope.shape[1]
     found = np.zeros(len(planes))
-    if turns < MIN_TURNS:
+    if turns < LONG:
         return found
     envelope = fit.envelope[line]
     moving = envelope * np.exp(2j * np.pi * fit.frequency[line] * np.arange(turns))

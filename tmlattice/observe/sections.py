@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import TINY, Array, Flags, Indices
+from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
@@ -167,7 +167,7 @@ class SectionFits:
         if enough.sum() < 3:
             return float("nan")
         part, whole = self._squares(passes)
-        shares = np.sqrt(part / np.maximum(whole, 1e-60))[:, enough]
+        shares = np.sqrt(part / np.maximum(whole, TINY))[:, enough]
         return float(np.median(shares, axis=1).min())
 
     def shares(self, passes: Passes) -> Array:
@@ -175,8 +175,8 @@ class SectionFits:
         [1 + pass, section]; NaN if undetermined."""
         enough = self.freedom > 3
         part, whole = (np.where(enough, own, 0.0) for own in self._squares(passes))
-        together = (part.sum(axis=1) / np.maximum(whole.sum(axis=1), 1e-60)).min(axis=0)
-        each = part.min(axis=0) / np.maximum(whole[0], 1e-60)
+        together = (part.sum(axis=1) / np.maximum(whole.sum(axis=1), TINY)).min(axis=0)
+        each = part.min(axis=0) / np.maximum(whole[0], TINY)
         own = np.sqrt(np.vstack([together, each]))
         return np.where(np.vstack([enough.any(axis=0), enough]), own, np.nan)
 
@@ -204,12 +204,18 @@ def mean_pass(values: Array, there: Flags) -> Array:
     return np.asarray(total / np.maximum(there.sum(axis=0), 1))
 
 
+def scaled(covariance: Array) -> tuple[Array, Array]:
+    """Standard deviations [..., n], and the correlations of covariances [..., n, n]."""
+    size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), TINY))
+    even = covariance / size[..., None] / size[..., None, :]
+    return size, np.nan_to_num(even, posinf=0, neginf=0)
+
+
 def distance(miss: Array, covariance: Array) -> Array:
     """Mean square of a mismatch in units of its covariance, [...]."""
-    size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), 1e-60))
-    even = np.nan_to_num(covariance / size[..., None] / size[..., None, :], posinf=0, neginf=0)
+    size, even = scaled(covariance)
     miss = np.clip(np.nan_to_num(miss / size, nan=DIVERGED_SIGMA), -DIVERGED_SIGMA, DIVERGED_SIGMA)
-    solved = np.linalg.solve(even + 1e-9 * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
+    solved = np.linalg.solve(even + INVISIBLE * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
     return np.asarray(np.einsum("...i,...i->...", miss, solved) / miss.shape[-1])
 
 
@@ -217,7 +223,7 @@ def log_uncertainty(covariance: Array) -> float:
     """Sum of the log root determinants of covariances [..., n, n]."""
     covariance = np.nan_to_num(covariance, nan=1e30, posinf=1e30, neginf=-1e30)
     sign, log = np.linalg.slogdet(covariance)
-    diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), 1e-60)).sum(axis=-1)
+    diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), TINY)).sum(axis=-1)
     return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: use the diagonal
 
 
@@ -411,9 +417,9 @@ def _joints(
     slope = np.nan_to_num(drift[:, 1:] - pushed[:, :-1])
     carried = J @ covariance @ np.swapaxes(J, -1, -2)
     spread = np.nan_to_num(covariance[:, 1:] + carried[:, :-1])
-    size = np.sqrt(np.maximum(np.einsum("...ii->...i", spread), 1e-60))
-    even = spread / size[..., None] / size[..., None, :] + 1e-9 * np.eye(4)
-    both = np.linalg.solve(even, np.stack([miss / size, slope / size], axis=-1))
+    size, even = scaled(spread)
+    right = np.stack([miss / size, slope / size], axis=-1)
+    both = np.linalg.solve(even + INVISIBLE * np.eye(4), right)
     misfit = (both[..., 0] * miss / size).sum(axis=-1) / 4
     return (
         misfit,

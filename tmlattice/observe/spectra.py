@@ -28,6 +28,7 @@ from tmlattice.inference.judgement import DEFAULT
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.line_fit import (
+    LONG,
     NARROW,
     WIDEST,
     LineFit,
@@ -399,7 +400,7 @@ def _seen(signals: int, trials: int) -> float:
 def _other_lines(fit: LineFit, there: Flags, planes: Indices) -> list[float]:
     """Frequencies of up to three significant lines other than the betatron lines."""
     turns = there.shape[1]
-    if turns < 64:  # the floor between the lines is not resolved
+    if turns < LONG:  # the floor between the lines is not resolved
         return []
     frequency, power = _power(fit.residual, there)
     seen = [power[planes == plane] for plane in (0, 1)]

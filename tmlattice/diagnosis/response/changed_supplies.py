@@ -32,7 +32,6 @@ from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.common_factors import MAX_CHOSEN, CommonFactor, FactorModel, GivenOthers
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import ROUNDS
-from tmlattice.inference.normal import solve
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -191,7 +190,7 @@ def _candidates(
 
 def _widened(state: State, block: int, there: Linear) -> float:
     """Factor on the errors, because the noise was learnt from fitted readings."""
-    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    posterior = there.posterior
     fitted = float(np.sum(1 - np.diag(posterior.covariance)))
     count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())
     return float(np.sqrt(count / max(count - fitted, count / 4)))

@@ -12,7 +12,7 @@ from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import Stated, stated
 from tmlattice.diagnosis.support import Correlation, Support, correlations_of, share_from_data
-from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.normal import Posterior
 from tmlattice.inference.problem import Hypothesis
 
 AGAINST, SHOWN = 0.4, 3
@@ -35,7 +35,7 @@ def fitted_causes(
         if not families:
             continue
         there = linear(state, block)
-        posterior = solve(there.normal, there.groups, there.start, rounds=0)
+        posterior = there.posterior
         known = stated(state, block, there, posterior)
         own: list[StatedCause] = []
         for row, support in with_support(state, families.values(), there, known):

@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.state import State, rms_of
+from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.inference.judgement import ENOUGH
 
@@ -329,9 +329,7 @@ class Fitted:
             near, far = seen & split.half[c], seen & ~split.half[c]
             for more, into in (([], inside), ([jumps[c]], jumped)):
                 both = np.stack([*patterns, *more], axis=1)
-                scale = np.abs(both[near]).max(axis=0)
-                amounts = np.linalg.lstsq(both[near] / scale, data[c, near], rcond=None)[0]
-                into.append(data[c, far] - (both[far] / scale) @ amounts)
+                into.append(amplitudes(both, data[c], near, far)[1])
         return rms_of(inside), rms_of(jumped)
 
 

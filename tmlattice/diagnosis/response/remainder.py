@@ -18,7 +18,7 @@ from tmlattice.diagnosis.assessment import Block
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_sizes
-from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.normal import Posterior
 
 BLOCKS = ("in-plane", "coupling", "RF")
 
@@ -56,7 +56,7 @@ def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, 
     if not state.of_block(block):
         return None, None, None
     there = linear(state, block)
-    found = solve(there.normal, there.groups, there.start, rounds=0)
+    found = there.posterior
     return there, found, of_sizes(state, block, there)
 
 

@@ -6,7 +6,7 @@ the residual is (Q y) / Q_ii. For a linear fit with priors, Q y is the weighted 
 weights less the information that the fit takes. These residuals reveal families that fit each BPM
 by itself and predict none.
 
->>> there = linear(state, 0); found = solve(there.normal, there.groups, there.start, rounds=0)
+>>> there = linear(state, 0); found = there.posterior
 >>> rf_by_others(state, there, found)
 """
 

@@ -19,7 +19,6 @@ from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, background_rms, find
 from tmlattice.inference.distributed import MarginalProblem
-from tmlattice.inference.normal import solve
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.response_problem import Response
@@ -53,7 +52,7 @@ def undetermined(state: State) -> Undetermined:
     blocks: list[dict[Hypothesis, Array]] = []
     for block in (block for block in (0, 1) if state.of_block(block)):
         there = linear(state, block)
-        found = solve(there.normal, there.groups, there.start, rounds=0)
+        found = there.posterior
         numbers = found.spread @ np.linalg.cholesky(found.covariance)
         amounts: dict[Hypothesis, Array] = {}
         for family in {f.variable: f for f in state.of_block(block)}.values():
