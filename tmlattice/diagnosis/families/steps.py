@@ -81,12 +81,6 @@ class EnergyOffset(_OfBeam):
         """The errors with this energy."""
         return replace(errors, energy=float(values[0]))
 
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """The energy offset as a cause."""
-        return [(Cause(self.name, None, float(values[0])), float(sigma[0]))]
-
     def doubt(self, values: Array, data: ResponseData) -> str | None:
         """The message that so large an offset is implausible; None where it is plausible."""
         offset, most = float(values[0]), find(self.name).largest
