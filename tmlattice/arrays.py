@@ -16,3 +16,6 @@ ROUNDING = 1e-11
 """Relative rounding error of a sum over all readings."""
 INVISIBLE = 1e-9
 """Share of a square below which what is left of it may be rounding."""
+REDUNDANT = 1e-6
+"""Share of the information on a number below which the others determine it: what remains may be the
+rounding of large sums."""

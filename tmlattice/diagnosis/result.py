@@ -47,7 +47,7 @@ VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
 
 
 MOST = 4
-"""Findings in the line of a diagnosis."""
+"""Findings in the line of a diagnosis, and outliers in a warning."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.linalg import lu_factor, lu_solve
 from scipy.special import logsumexp
 
-from tmlattice.arrays import INVISIBLE, TINY, Array
+from tmlattice.arrays import REDUNDANT, TINY, Array
 from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT
 from tmlattice.inference.newton import ROUNDS
 
@@ -172,7 +172,7 @@ class FactorModel:
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
         square = np.where(own > 0, score**2 / np.maximum(own, TINY), 0.0)
-        seen = own > INVISIBLE * np.diag(self.information)  # else redundant
+        seen = own > REDUNDANT * np.diag(self.information)  # else redundant
         gain = np.where(seen, gain, 0.0) - self.cost
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
@@ -225,7 +225,7 @@ class FactorModel:
         spread = own + self.slab**-2.0
         moved = -lessened * (score / spread)
         gain = self.gains(chosen)[0]
-        gain[own <= INVISIBLE * np.diag(self.information)] = -np.inf  # redundant
+        gain[own <= REDUNDANT * np.diag(self.information)] = -np.inf  # redundant
         there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
         more = moved @ there
         wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there

@@ -10,18 +10,18 @@ from enum import StrEnum
 
 import numpy as np
 
-from tmlattice.arrays import ROUNDING, TINY, Array
+from tmlattice.arrays import TINY, Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.scan import free_scan
 from tmlattice.inference.whitening import Projection
 
-ROUNDS, ITERATIONS = 8, 60
-"""Largest number of repetitions of what settles in two or three (linearisations, selections, Newton
-steps), and of iterations that converge slowly; each ends by its own test."""
+AGAIN, ROUNDS, ITERATIONS = 3, 8, 100
+"""Largest number of repetitions of what settles in two (selections that are linearised again), of
+Newton steps and linearisations, and of iterations that converge slowly."""
 SETTLED = 1e-2
 """Change, in standard deviations or of a log variance, below which iterations end."""
-STEP_SHARES = (1.0, 0.5, 0.25, 0.125)
+STEP_SHARES = (1.0, 0.5, 0.25, 0.0625)
 """Shares of a step, tried in turn until the cost falls."""
 
 MIN_INFORMATION = 1e-12
@@ -174,10 +174,6 @@ def fit(
     return _finished(problem, point, slopes, rows, outcome)
 
 
-NUISANCE_STEPS = 3
-"""Newton steps for nuisances alone: they are nearly linear."""
-
-
 def fit_nuisances(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
     """Return the point of fixed causes at the best nuisances.
 
@@ -187,7 +183,7 @@ def fit_nuisances(problem: Problem, causes: Sequence[Cause], nuisances: Array) -
         nuisances: first guess.
     """
     point = problem.at(causes, nuisances)
-    for _ in range(NUISANCE_STEPS):
+    for _ in range(AGAIN):  # nearly linear
         if point.projection is None:
             break
         change = point.projection.coordinates(point.residual)
@@ -247,7 +243,7 @@ def _step(problem: Problem, point: Point, rows: Array) -> tuple[Array, Array, fl
         size = np.sqrt(np.einsum("kr,kr->k", own, own) + precision)
         scale = np.where(size > 0, size, 1.0)
         unit = own / scale[:, None]
-        gram = unit @ unit.T + np.diag(precision / scale**2 + ROUNDING)
+        gram = unit @ unit.T + np.diag(precision / scale**2 + 1e-10)
         inner = unit @ clean - precision * amount / scale
         solved = np.linalg.solve(gram, inner)
         expected_fall += float(inner @ solved)
@@ -299,7 +295,7 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
         if (np.diagonal(full)[: len(named)] < MIN_INFORMATION).any():
             return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
         size = np.sqrt(np.maximum(np.diagonal(full), TINY))
-        scaled = full / size[:, None] / size + ROUNDING * np.eye(len(full))
+        scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))
         inverse = np.linalg.inv(scaled) / size[:, None] / size
         covariance[np.ix_(named, named)] = inverse[: len(named), : len(named)]
         sign, determinant = np.linalg.slogdet(covariance[np.ix_(named, named)])

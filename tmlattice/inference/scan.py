@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from tmlattice.arrays import INVISIBLE, ROUNDING, TINY, Array, Indices
+from tmlattice.arrays import INVISIBLE, TINY, Array, Indices
 from tmlattice.effects import find
 from tmlattice.inference import chi2
 from tmlattice.inference.metric import Hypothesis, Metric
@@ -177,7 +177,7 @@ def free_scan(places: Indices, gram: Array, inner: Array) -> FreeScan:
     """
     values, vectors = np.linalg.eigh(gram)
     top = np.maximum(values.max(axis=(1, 2), keepdims=True), TINY)
-    seen = values > ROUNDING * top
+    seen = values > 1e-10 * top
     along = np.einsum("kbpq,kbp->kbq", vectors, inner)
     safe = np.where(seen, values, 1.0)
     scaled = np.where(seen, along / np.sqrt(safe), 0.0).reshape(len(gram), -1)

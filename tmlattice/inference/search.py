@@ -18,7 +18,7 @@ import numpy as np
 from tmlattice.arrays import Flags
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Alternative, Detection, alternatives, linear_evidence
-from tmlattice.inference.newton import ROUNDS, Fit, Outcome, fit
+from tmlattice.inference.newton import AGAIN, Fit, Outcome, fit
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.scan import (
     NO_SCAN,
@@ -420,7 +420,7 @@ def revised(search: Search, state: AnyState, quick: bool = False) -> AnyState:
         quick: once, and only causes that are not the leader of a scan, and kicks against three
             alternatives: all of eight after each choice would take most of the time.
     """
-    for _ in range(1 if quick else ROUNDS):
+    for _ in range(1 if quick else AGAIN):
         names = state.names
         for monitor in list(state.monitors):
             state = _monitor_revised(search, state, monitor)

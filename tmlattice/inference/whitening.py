@@ -24,11 +24,15 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import block_diag, eigh
 
-from tmlattice.arrays import ROUNDING, TINY, Array, Flags
+from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.inference.normal import inverse_of_lower, lower_factor
 
 EXACT = 1e-12
 """m, rad or relative: rms of a launch coordinate that is known exactly."""
+ROUNDING = 1e-13
+"""Share of a direction below which it is rounding, given the directions before it."""
+SMALLEST_SHARE = 1e-12
+"""Share of the largest variance below which a variance is rounding."""
 
 
 class Root(ABC):
@@ -122,7 +126,7 @@ def directions_of(spread: Array) -> tuple[Array, Array]:
         values, vectors = eigh(spread.T @ spread, overwrite_a=True, check_finite=False)
         return np.maximum(values, 0.0), vectors.T
     values, vectors = eigh(spread @ spread.T, overwrite_a=True, check_finite=False)
-    kept = values > ROUNDING * values.max(initial=TINY)
+    kept = values > SMALLEST_SHARE * values.max(initial=TINY)
     values = values[kept]
     return values, (vectors[:, kept] / np.sqrt(values)).T @ spread
 

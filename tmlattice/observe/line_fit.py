@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.fft import dct, idct
 
-from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
+from tmlattice.arrays import REDUNDANT, TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.harmonics import frequency as strongest
 
 WIDEST = 0.05
@@ -25,8 +25,6 @@ ROUNDS = 4
 """Rounds of the alternation: it starts within the noise of its end, and three reach it."""
 QUIETEST = 0.1
 """Smallest noise of a signal over the typical one, so that none dominates."""
-_SMALL = 1e-6
-"""Smallest eigenvalue: one monitor cannot separate the quadratures of a turn; the band does."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,8 @@ def least_squares(
 
 
 def _inverse(normal: Array) -> Array:
-    return np.asarray(np.linalg.pinv(normal, rcond=_SMALL, hermitian=True))
+    # one monitor cannot separate the quadratures of a turn; the band does
+    return np.asarray(np.linalg.pinv(normal, rcond=REDUNDANT, hermitian=True))
 
 
 def _quadratures(values: ComplexArray) -> Array:

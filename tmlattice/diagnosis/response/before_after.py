@@ -63,8 +63,8 @@ from tmlattice.observe.response_change import alike, response_change
 from tmlattice.observe.response_data import ResponseData, response_data
 from tmlattice.observe.split import Split, split_columns
 
-DRIFT = 0.03
-"""Least change of a BPM or corrector that is a finding."""
+DRIFT, OUTSTANDING = 0.03, 8.0
+"""Least change of a BPM or corrector that is a finding, and its least ratio to the typical one."""
 ANY = 6.0
 """rms of the logarithm of a change's scale about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
@@ -332,7 +332,7 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
         usual = float(chi2.typical([cause.amount for cause, _ in rows]))
         for cause, sigma in rows:
             size = abs(cause.amount)
-            if size > max(DRIFT, SIGNIFICANT * usual) and size > SIGNIFICANT * sigma:
+            if size > max(DRIFT, OUTSTANDING * usual) and size > SIGNIFICANT * sigma:
                 square = (size / max(sigma, 1e-12)) ** 2
                 seen = Detection.among(square, len(rows))
                 found.append(

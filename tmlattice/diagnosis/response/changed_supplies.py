@@ -31,7 +31,7 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.common_factors import MAX_CHOSEN, CommonFactor, FactorModel, GivenOthers
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.newton import ROUNDS
+from tmlattice.inference.newton import AGAIN
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -85,7 +85,7 @@ def changed_supplies(
     data = state.data
     base = Predicted(data, Errors.none(data)).bend()
     problem = Response(base=base, used=np.isfinite(data.orbits), places={})
-    for _ in range(ROUNDS):
+    for _ in range(AGAIN):
         before = {(own.effect, own.element) for own in found}
         try:
             blurred = _blurred(problem, open_, found)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tmlattice.arrays import INVISIBLE, Array
+from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear
@@ -112,7 +112,7 @@ def _pulls(
     names: list[str], alone: Array, wide: Array, both: Array, narrow: Array, families: int
 ) -> tuple[Pull, ...]:
     """Inconsistent families, then single magnets."""
-    more = np.maximum(wide - narrow, INVISIBLE * wide)  # the information of the RF's orbit
+    more = np.maximum(wide - narrow, REDUNDANT * wide)  # the information of the RF's orbit
     pulls = np.where(more > 0, (both - alone) / np.sqrt(np.where(more > 0, more, 1.0)), 0.0)
     order = sorted(range(len(names)), key=lambda i: (i >= families, -abs(pulls[i])))
     return tuple(

@@ -28,6 +28,7 @@ from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.inference.judgement import DEFAULT, ENOUGH
+from tmlattice.inference.newton import AGAIN
 from tmlattice.inference.normal import amounts, common, times_precision
 
 log = logging.getLogger(__name__)
@@ -39,8 +40,6 @@ SHARE = 0.25
 explain: less is not worth a covariance."""
 SIZES = np.geomspace(0.01, 3.0, 30)
 """Prior rms of the amplitudes that are tried, in units of the typical column's rms residual."""
-PASSES = 3
-"""Repetitions of the search: the weights depend on the residual given the sources."""
 ROUNDS = 30
 """Iterations of EM for the prior rms of all sources together."""
 
@@ -126,7 +125,7 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
     orbits *= np.median(_rms(without)) / np.maximum(_rms(orbits), TINY)
     least = (NOISE_LEFT * data.noise_of(1)[read]) ** 2
     count = 1.0  # jitter itself would reduce the effective sample size
-    for _ in range(PASSES):
+    for _ in range(AGAIN):
         weights = count * _weights(weights > 0, rest, least)
         found, which = _places(weights, left, rolls, orbits)
         rest = _rest(weights, left, _patterns(rolls, found))

@@ -20,7 +20,7 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.distributed import MarginalProblem
 from tmlattice.inference.judgement import DEFAULT
-from tmlattice.inference.newton import ROUNDS, Fit, Outcome
+from tmlattice.inference.newton import AGAIN, Fit, Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.whitening import directions_of
 
@@ -102,7 +102,7 @@ class SingleChange:
         try:
             unit = self.blur.of((Cause(*hypothesis, at),)) / at**effect.power
             spread = self.plain.as_rows(unit)
-            for _ in range(ROUNDS):
+            for _ in range(AGAIN):
                 slope = self._made((Cause(*hypothesis, at),)) / at**effect.power
                 line = _Line(self.left, slope, spread)
                 near = None if found is None else at

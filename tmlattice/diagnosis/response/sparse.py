@@ -27,7 +27,7 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection, leading
 from tmlattice.inference.judgement import BEYOND, Judgement
-from tmlattice.inference.newton import ITERATIONS, ROUNDS, Fit, fit
+from tmlattice.inference.newton import AGAIN, ITERATIONS, Fit, fit
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Identified, Search, explain
 from tmlattice.observe.orbit_response import Hypothesis, Predicted
@@ -235,7 +235,7 @@ def _among_open(
 def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
     """The search repeated given undetermined errors; its log evidence, -inf if it fails."""
     evidence = -np.inf
-    for _ in range(ROUNDS):
+    for _ in range(AGAIN):
         problem = blur.among(blur.of(found.fit.causes))
         there = replace(search, problem=problem, most=MOST)
         again = explain(there, fit(problem, (), problem.first))

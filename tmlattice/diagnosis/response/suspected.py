@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tmlattice.arrays import INVISIBLE, Array
+from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.others import KINDS
@@ -216,7 +216,7 @@ class Seen:
             along = found.spread.T @ it.across
             taken = np.einsum("ph,ph->h", along, found.covariance @ along)
             information[block] = np.maximum(it.own - taken, 0.0)
-            information[block][information[block] < INVISIBLE * it.own] = 0.0
+            information[block][information[block] < REDUNDANT * it.own] = 0.0
             inner[block] = it.left - (found.values - it.there.start) @ it.across
         inner[information == 0] = 0.0
         total = information.sum(axis=0)

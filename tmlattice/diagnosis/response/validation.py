@@ -116,7 +116,8 @@ def _missed(
     """Residuals of held-out correctors; see `score`.
 
     Args:
-        state, validation, rf: as there.
+        state, validation: as there.
+        rf: BPMs that validate the RF's response, [monitor]; None: those that are not fitted.
         jitter: orbits of beam jitter, see `State`, whose amplitudes the near BPMs determine, too.
     """
     data, at, half = state.data, state.at, state.split.half
@@ -169,15 +170,14 @@ def _missed(
                    of_rf**2 / variance[-1, scored], scored)  # fmt: skip
 
 
-def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
+def score(state: State, validation: Flags) -> Score:
     """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
     Args:
         state: to validate.
         validation: the held-out correctors, [column].
-        rf: BPMs that validate the RF's response, [monitor]; None: those that are not fitted.
     """
-    missed = _missed(state, validation, rf)
+    missed = _missed(state, validation)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
     return Score(
         in_plane=rms_of(missed.inside),

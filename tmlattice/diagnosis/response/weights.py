@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tmlattice.arrays import INVISIBLE, TINY, Array, Flags
+from tmlattice.arrays import REDUNDANT, TINY, Array, Flags
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
@@ -150,7 +150,7 @@ def good_monitors(state: State, block: int = 0, bad: float = SIGNIFICANT) -> Fla
         if rows.sum() < FEW:
             continue
         own = np.full(data.shape[1], np.inf)
-        rounded = INVISIBLE * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
+        rounded = REDUNDANT * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
         for spared in (0.0, OUTLIERS):
             rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
             if block == 0:
