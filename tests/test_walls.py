@@ -15,6 +15,7 @@ ORDER = (
     "challenge", "systems", "plots", "report", "cli",
 )  # fmt: skip
 BESIDE = {
+    "arrays",
     "errors",
     "files",
     "input_files",

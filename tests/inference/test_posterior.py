@@ -51,7 +51,7 @@ def same(one, other, tolerance):
 
 
 def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
-    monkeypatch.setattr(response_problem, "MAX_NUMBERS", PIECE)
+    monkeypatch.setattr(response_problem, "AT_ONCE", PIECE)
     point = response.at((Cause("monitor_roll", "end_1", 0.02),), response.first)
     some = [*everywhere[::3], ("energy_spread", None), ("skew_gradient", "QF::5")]
     metric = response.metric(point)
@@ -65,7 +65,7 @@ def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
 
 
 def test_sums_give_the_posterior_of_all_signatures(response, everywhere, monkeypatch):
-    monkeypatch.setattr(response_problem, "MAX_NUMBERS", PIECE)
+    monkeypatch.setattr(response_problem, "AT_ONCE", PIECE)
     usual = DistributedErrors.usual(everywhere, USUAL)
     direct = fit_distributed_errors(response, usual, response.first)
     sums_at = posterior(response, usual)

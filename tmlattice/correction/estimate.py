@@ -19,13 +19,11 @@ from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.metric import Hypothesis
+from tmlattice.inference.newton import STEP_SHARES
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
 
 Array = NDArray[np.float64]
-
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
-"""Shares of a posterior mean that are tried until the ring stores a beam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +58,7 @@ class Estimate:
         linearised, or a half of it, a quarter, ...; unchanged if it stores none."""
         if self.found is None or self.known is None:
             return self
-        for share in SHARES:
+        for share in (*STEP_SHARES, 0.0):
             ring = _with_mean(self.found, self.known, self.kept, share)
             try:
                 StoredBeam(ResponseModel(ring))

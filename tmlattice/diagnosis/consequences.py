@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
@@ -24,7 +24,6 @@ from tmlattice.lattice import Element, Ring
 from tmlattice.maps import TaylorMap
 from tmlattice.optics import normal_modes
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 """(x, y)."""
 

@@ -20,10 +20,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
-from tmlattice.diagnosis.signals import Check, Checkup, fine, note, wrong
+from tmlattice.diagnosis.signals import HALF, Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
 from tmlattice.errors import (
     MeasurementError,
@@ -32,6 +33,7 @@ from tmlattice.errors import (
     UnknownNameError,
     first_of,
 )
+from tmlattice.inference.judgement import FEW, GROSS, MISSTATED
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
@@ -64,25 +66,16 @@ FAR = 100.0
 benchmarks/data_checks.py."""
 EXACT = 0.01
 """Share of the launches that gains of the first BPMs change."""
-NOTHING_FROM, SURE, NO_BEAM, HALF = 2, 4, 0.75, 0.5
+NOTHING_FROM, SURE, NO_BEAM = 2, 4, 0.75
 """Sections at the end that follow no trajectory, from which on the beam may be lost, and is: a few
-swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9; and the share
-that separates them from others."""
-SECTIONS = 4
-"""Fewest passes that determine the usual misfit."""
+swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9."""
 SPOILT = 3.0
 """Misfit of a section over the typical one above which it is not used."""
-OVER, UNDER = 2.5, 3.0
-"""Factors by which a stated noise may be too large, and too small."""
 GLOBAL = "signs, units and order"
 MOST_ERRORS = 4
 """Global errors of one measurement at most."""
 _UNIT = "-in-"
 """In the names of assumptions about a unit."""
-SCALED = 3.0
-"""Ratio of the RF's orbit to the design's, or its inverse, that no ring has."""
-SPIKE = 20.0
-"""Sigma above which a single reading is an outlier, if its neighbours agree without it."""
 
 
 @by_name
@@ -328,7 +321,7 @@ def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
     )]  # fmt: skip
 
 
-def _follows_nothing(shares: NDArray[np.float64]) -> NDArray[np.intp]:
+def _follows_nothing(shares: Array) -> NDArray[np.intp]:
     """The last sections that follow no trajectory, by their shares [section]; none, if those before
     do not either."""
     read = np.flatnonzero(np.isfinite(shares))
@@ -350,7 +343,7 @@ def _launches(checked: OfTurns) -> Check:
     own, misfit = checked.launches(square, EXACT)
     good = misfit < SPOILT * square  # else a fault of the first magnets biases the fit
     sections = checked.found(data)[1].misfit.shape[1]
-    if not good.any() or sections < SECTIONS:
+    if not good.any() or sections < FEW:
         return fine("launches", "too few good BPMs near the start to check the launches")
     worst = float(np.median(own[good], axis=0).max())
     if worst > FAR:
@@ -372,7 +365,7 @@ def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
     typical = float(np.median(passes.sigma))
     if checked.data.noise is None:
         return fine("noise", f"none is stated; the residuals are {_micro(level * typical)}")
-    if level < 1 / OVER:
+    if level < 1 / MISSTATED:
         return wrong(
             "noise",
             f"the stated noise of {_micro(typical)} is {1 / level:.1f} times the residuals "
@@ -382,7 +375,7 @@ def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
     random = noise_scatter(passes, found)
-    if random is not None and random > UNDER:
+    if random is not None and random > MISSTATED:
         return wrong(
             "noise",
             f"the stated noise of {_micro(typical)} is too small: from shot to shot the readings "
@@ -392,7 +385,7 @@ def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
             before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
     text = f"{_micro(typical)} is stated, neighbouring BPMs show {_micro(level * typical)}"
-    if level <= UNDER:
+    if level <= MISSTATED:
         return fine("noise", text)
     if random is None:
         return note(
@@ -428,13 +421,13 @@ def _outliers(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
         alone = found.left[p, w] ** 2 / np.maximum(found.free[p, w], 0.05)
         worst = int(alone.argmax())
         rest = found.misfit[p, w] * found.freedom[p, w] - alone[worst]
-        if alone[worst] > SPIKE**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
+        if alone[worst] > GROSS**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
             name = checked.data.monitors[found.owner[w, worst]]
             shot = checked.data.shots[passes.shot[p]]
             reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
     if not reported:
         return none
-    return note("outliers", f"{signals.some(reported)}; leave them empty")
+    return note("outliers", f"{first_of(reported)}; leave them empty")
 
 
 # --- what is compared with the design's -----------------------------------------------------------
@@ -487,7 +480,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
 
 def _rf_step(checked: OfResponse) -> list[Check]:
     scale = checked.rf_scale()
-    if not max(abs(scale), 1 / abs(scale)) > SCALED:
+    if not max(abs(scale), 1 / abs(scale)) > MISSTATED:
         return []
     text = (
         f"the RF's orbit is {scale:.3g} times the design's for its step: correct its unit "
@@ -504,10 +497,6 @@ def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
         return None
 
 
-MOST = 0.5
-"""Share of the names that may be unknown."""
-SHOWN = 8
-"""Names in a sentence at most."""
 MEANT = "did you mean"
 """Phrase in the message about a misspelt name."""
 
@@ -538,7 +527,7 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
         if not unknown:
             continue
         fix = _hint(find, unknown[0])
-        if len(unknown) > MOST * len(names):
+        if len(unknown) > HALF * len(names):
             raise UnknownNameError(
                 f"{len(unknown)} of {len(names)} {what} are not in the lattice: {fix}"
             )
@@ -546,7 +535,7 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
         typed = MEANT in fix and len(unknown) == 1
         messages.append(
             f"not in the lattice, and left out: {len(unknown)} of {len(names)} {what} "
-            f"({first_of(unknown, SHOWN)})" + (f"; {fix.partition('; ')[2]}" if typed else "")
+            f"({first_of(unknown)})" + (f"; {fix.partition('; ')[2]}" if typed else "")
         )
     return own, messages
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.recommended_actions import credible as credible_actions
@@ -16,13 +16,11 @@ from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.inference.alternatives import Alternative, Detection
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.newton import Outcome, fit
+from tmlattice.inference.newton import ITERATIONS, Outcome, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
 from tmlattice.inference.search import Explanation, Identified
 from tmlattice.lattice import Element, Ring
-
-Array = NDArray[np.float64]
 
 
 def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternative], Array]:
@@ -30,12 +28,12 @@ def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternati
     evidence = np.array([rival.fit.log_evidence for rival in rivals])
     probability = np.exp(evidence - evidence.max())
     probability /= probability.sum()
-    size = int(np.searchsorted(np.cumsum(probability), mass)) + 1
-    return list(rivals[:size]), probability
+    return list(rivals[: size_of(probability, mass)]), probability
 
 
-FINAL_STEPS = 60
-"""Iterations of the reported fit at most."""
+def size_of(probability: Array, mass: float) -> int:
+    """The size of the credible set of this mass, by falling probability."""
+    return int(np.searchsorted(np.cumsum(probability), mass)) + 1
 
 
 def finished(explanation: Explanation) -> Explanation:
@@ -43,7 +41,7 @@ def finished(explanation: Explanation) -> Explanation:
     last = explanation.fit
     if last.outcome is not Outcome.STEPS:
         return explanation
-    again = fit(explanation.problem, last.causes, last.nuisances, last.kicks, steps=FINAL_STEPS)
+    again = fit(explanation.problem, last.causes, last.nuisances, last.kicks, steps=ITERATIONS)
     return replace(explanation, fit=again) if again.good else explanation
 
 
@@ -62,7 +60,7 @@ def findings_of(
     sure = Detection(float("inf"), float("nan"), 0.0)  # the readings alone show the fault
     for m, amount in dead:
         cause = Cause("monitor_dead", ring.monitors[m].name, amount)
-        found.append(finding_of(ring, [cause], np.ones(1), [cause], 0.0, sure, judgement.mass))
+        found.append(finding_of(ring, [cause], np.ones(1), 0.0, sure, judgement.mass))
     return strongest_first(found)
 
 
@@ -84,17 +82,15 @@ def least_certain(found: Sequence[Finding], without: str) -> str:
 def _named(ring: Ring, explanation: Explanation, k: int, named: Identified, mass: float) -> Finding:
     cause = explanation.fit.causes[k]
     sigma = float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0)))
-    members, probability = credible(named.alternatives, mass)
+    probability = credible(named.alternatives, mass)[1]
     causes = [cause, *(m.cause for m in named.alternatives[1:])]
-    shown = [m.cause for m in members]
-    return finding_of(ring, causes, probability, shown, sigma, named.detection, mass)
+    return finding_of(ring, causes, probability, sigma, named.detection, mass)
 
 
 def finding_of(
     ring: Ring,
     causes: Sequence[Cause],
     probability: Array,
-    shown: Sequence[Cause],
     sigma: float,
     detection: Detection,
     mass: float,
@@ -105,12 +101,11 @@ def finding_of(
         ring: the design.
         causes: the cause, and its alternatives by falling probability.
         probability: of each.
-        shown: the first of them, which form the credible set.
         sigma: standard error of the amount.
         detection: how clearly it was seen.
         mass: of the credible set.
     """
-    cause = causes[0]
+    cause, shown = causes[0], causes[: size_of(probability, mass)]
     actions = recommended_actions(ring, causes, probability, sigma)
     positions = [s for m in shown for s in _positions(ring, (m.effect, m.element))]
     where, near = between(ring, positions) if positions else (None, ())
@@ -257,4 +252,4 @@ def swap_of(state: State, name: str, judgement: Judgement) -> Finding:
     statistic = float(np.sum(as_read / data.noise[at] ** 2))
     cause = Cause("monitor_swap", data.ring[name].name, 1.0)
     seen = Detection.among(statistic, 2 * len(data.at))
-    return finding_of(data.ring, [cause], np.ones(1), [cause], 0.0, seen, judgement.mass)
+    return finding_of(data.ring, [cause], np.ones(1), 0.0, seen, judgement.mass)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.model import Model
 from tmlattice.beam.rf import rf_of
@@ -40,15 +40,11 @@ from tmlattice.observe.response_problem import Response
 from tmlattice.observe.spectra import Lines
 from tmlattice.observe.split import split_columns
 from tmlattice.observe.stored import ModelCache, Stored
-from tmlattice.observe.tune_readings import tune_readings
+from tmlattice.observe.tune_readings import CHROMATICITY, TUNE, tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns
-
-Array = NDArray[np.float64]
 
 NOISE, TURN_NOISE = 2e-6, 2e-5
 """rms of an averaged reading of a stored beam, and of one of one turn, m."""
-TUNE, CHROMATICITY = 1e-4, 0.1
-"""rms of what is read of them."""
 TURNS, AMPLITUDE = 1000, 3e-4
 """Amplitude of a kicked beam, m, at the BPMs where it is largest."""
 KICK, ENERGY_ORBIT = 1e-4, 1.3e-3

@@ -16,16 +16,13 @@ from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.effects import Cause
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.alternatives import Alternative
-from tmlattice.inference.distributed import DistributedProblem, fit_distributed_errors
+from tmlattice.inference.distributed import MAX_ELEMENTS, DistributedProblem, fit_distributed_errors
 from tmlattice.inference.newton import fit_nuisances
 from tmlattice.inference.problem import Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 
 log = logging.getLogger(__name__)
-
-ROOM = 2**26
-"""Most signatures of distributed errors: with more, nothing is proposed."""
 
 
 def leading(
@@ -88,7 +85,7 @@ def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Pr
     if not isinstance(among, DistributedProblem):
         return problem
     rows = int(problem.valid.sum())
-    if rows * len(among.known.hypotheses) > ROOM:
+    if rows * len(among.known.hypotheses) > MAX_ELEMENTS:
         raise TmlatticeError("too many readings for the distributed errors")
     known = among.learnt(explanation.fit)
     causes = [c for c in first.fit.causes if problem.sees((c.effect, c.element))]

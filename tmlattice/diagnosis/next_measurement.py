@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
 from tmlattice.diagnosis.records import OPTIONAL, named, record_of
@@ -22,8 +22,6 @@ from tmlattice.lattice import Ring
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import one_turn_optics
-
-Array = NDArray[np.float64]
 
 PHASES = 12
 CHANGES = {
@@ -145,7 +143,7 @@ def separations(
         # another amount, given its prior, would explain a part of it
         row = projection.out(problem.slope(point, point.causes.index(own.cause)))
         row = row.reshape(parts, -1)
-        known = 1 / max(float(own.fit.covariance[-1, -1]), 1e-300)
+        known = 1 / max(float(own.fit.covariance[-1, -1]), TINY)
         square -= (row * clean).sum(axis=1) ** 2 / ((row**2).sum(axis=1) + known) / 2
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 

@@ -7,24 +7,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import AT_ONCE, Array, Flags
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
 from tmlattice.effects import LaunchEffect, expected_radiation, find, modelled, names, rare
 from tmlattice.errors import BeamLostError, EffectError, MeasurementError, first_of
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.newton import ITERATIONS, Fit, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import in_beam_order
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.data import Data, joined, of_measurement
-from tmlattice.observe.first_turns import STEPS, FirstTurns
+from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import estimate
-
-Array = NDArray[np.float64]
+from tmlattice.observe.sections import KEPT
 
 FLOOR = 2e-4
 """Lower limit of the noise, as a share of the orbit. Second-order maps leave 2e-5 of an orbit of a
@@ -39,8 +38,6 @@ along small trajectories; coupling of a thousandth of an orbit is detectable."""
 PASSED_ON = 0.05
 """Share of a signature's square that changes sign with the other plane's orbit above which an
 unknown orbit is part of the amount. It is 0.02 for a gradient with coupling of a tenth."""
-CHUNK = 256
-"""Hypotheses whose signatures are computed at a time."""
 COPIES = 16
 """Share of all tangents that is in memory at once: tangents, inverses, and those of every
 alternative."""
@@ -99,12 +96,12 @@ def prepare(
     problem = FirstTurns(
         model=model, data=rough, places=places, rare=rare(ring, chosen), judgement=judgement
     )
-    start = _on_its_way(fit(problem, (), problem.first, steps=STEPS), ring)
+    start = _on_its_way(fit(problem, (), problem.first, steps=ITERATIONS), ring)
     data, estimated = _with_noise(data, start)
     data, floor = _above_the_floor(data)
     messages = (*messages, *floor)
     problem = replace(problem, data=data, white=None)
-    before = _on_its_way(fit(problem, (), start.nuisances, steps=STEPS), ring)
+    before = _on_its_way(fit(problem, (), start.nuisances, steps=ITERATIONS), ring)
     hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data))
     return Prepared(problem, before, hypotheses, dead, estimated, messages)
 
@@ -157,8 +154,9 @@ def _determined(ring: Ring, hypotheses: Sequence[Hypothesis], data: Data) -> lis
     model = Model(ring, [{}] * len(launches))
     paths = model.paths(launches, ())
     found: list[Hypothesis] = []
-    for start in range(0, len(hypotheses), CHUNK):
-        some = hypotheses[start : start + CHUNK]
+    count = max(AT_ONCE // paths.readings.size, 1)
+    for start in range(0, len(hypotheses), count):
+        some = hypotheses[start : start + count]
         made = np.nan_to_num(model.signatures(paths, some, launches))
         seen = made[..., planes]
         read, other = (np.sum(own**2, axis=(1, 2, 3)) for own in (seen, made[..., ~planes]))
@@ -260,7 +258,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
-def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
+def same_monitors(other: Data, data: Data, dropped: Flags) -> Data:
     """Held-out readings of the BPMs that the fit kept.
 
     Args:
@@ -276,13 +274,7 @@ def same_monitors(other: Data, data: Data, dropped: NDArray[np.bool_]) -> Data:
     return other.without(outliers)
 
 
-_COLUMNS = (0, 1, 2, 3, 5)
-"""The five coordinates of a launch in a measurement."""
-
-
-def chosen_effects(
-    ring: Ring, effects: Sequence[str] | None, launch_sigma: NDArray[np.float64]
-) -> list[str]:
+def chosen_effects(ring: Ring, effects: Sequence[str] | None, launch_sigma: Array) -> list[str]:
     """The effects to be fitted; none where all that are requested show in the data alone.
 
     Args:
@@ -297,7 +289,7 @@ def chosen_effects(
     if not names(effects):
         raise EffectError("no effect is named; leave effects out to look for all of them")
     chosen = modelled(effects)
-    free = [six for six, sigma in zip(_COLUMNS, launch_sigma.T, strict=True) if (sigma > 0).any()]
+    free = [six for six, sigma in zip(KEPT, launch_sigma.T, strict=True) if (sigma > 0).any()]
     why = [
         f"{name} shows in turns of a stored beam alone"
         for name in names(effects) if find(name).of_turns

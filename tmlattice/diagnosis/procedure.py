@@ -28,7 +28,7 @@ from tmlattice.diagnosis.kinds import Measured, Part, PartOptions, kind_of, part
 from tmlattice.diagnosis.next_kind import leading, next_kind
 from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
-from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.result import MOST, Diagnosis, Finding
 from tmlattice.diagnosis.selection import freedom, select, select_changes
 from tmlattice.diagnosis.stages import (
     held_out,
@@ -421,10 +421,6 @@ def about_launches(part: Part, findings: Sequence[Finding]) -> list[str]:
     return notes
 
 
-SHOWN = 4
-"""Outliers that a warning names."""
-
-
 def about_rejected(outliers: Sequence[Mapping[str, Any]]) -> list[str]:
     """A message about outliers, if there are any."""
     if not outliers:
@@ -433,7 +429,7 @@ def about_rejected(outliers: Sequence[Mapping[str, Any]]) -> list[str]:
         f"{row['monitor']} {row['plane']}, "
         + ("the reference" if row["shot"] is None else f"shot {row['shot']}")
         + (f", turn {row['turn']}" if row["turn"] else "")
-        for row in outliers[:SHOWN]
+        for row in outliers[:MOST]
     )
-    more = f"; and {len(outliers) - SHOWN} more" if len(outliers) > SHOWN else ""
+    more = f"; and {len(outliers) - MOST} more" if len(outliers) > MOST else ""
     return [f"{len(outliers)} single readings are outliers and were rejected: {some}{more}"]

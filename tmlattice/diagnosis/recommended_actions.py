@@ -13,15 +13,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tmlattice.diagnosis.records import OPTIONAL, record_of
+from tmlattice.arrays import Array
+from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, of, record_of
 from tmlattice.diagnosis.support import share_of_fault
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
 from tmlattice.effects.effect import FamilyEffect, StrengthEffect
 from tmlattice.lattice import Element, Kind, Ring
-
-Array = NDArray[np.float64]
 
 STRENGTHS = {"k1": "1/m2", "k2": "1/m3"}
 """Strengths reported before and after, with their units."""
@@ -57,11 +55,11 @@ class RecommendedAction:
     effect: str
     element: str | None
     pieces: tuple[str, ...]
-    kind: Kind | None
+    kind: Kind | None = field(metadata=HIDDEN)
     amount: float
     amount_sigma: float | None
     probability: float
-    mechanisms: tuple[tuple[str, float], ...]
+    mechanisms: tuple[tuple[str, float], ...] = field(metadata=of("effect", "probability"))
     strength: Strength | None
     device: str | None = field(default=None, metadata=OPTIONAL)
 
@@ -77,16 +75,14 @@ class RecommendedAction:
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
-        effect, own = find(self.effect), record_of(self)
-        del own["kind"]
-        return own | {
+        effect = find(self.effect)
+        return record_of(self) | {
             "action": self.action,
             "check": effect.to_check,
             "quantity": effect.quantity or effect.words,
             "share_from_data": share_of_fault(self.effect, self.amount_sigma),
             "unit": effect.unit,
             "probability": min(self.probability, 1.0),  # a sum of shares
-            "mechanisms": [{"effect": e, "probability": p} for e, p in self.mechanisms],
         }
 
 

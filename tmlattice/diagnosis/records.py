@@ -1,7 +1,8 @@
 """Records of a diagnosis as the objects of its JSON file, and back.
 
 A field with the metadata `named(...)` has that name in the file, one with `OPTIONAL` is left out
-where it is None or empty.
+where it is None or empty, one with `HIDDEN` always. A tuple with `of(...)`, or each of several, is
+an object with these keys.
 """
 
 from collections.abc import Mapping
@@ -10,12 +11,17 @@ from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-OPTIONAL = {"optional": True}
+OPTIONAL, HIDDEN = {"optional": True}, {"hidden": True}
 
 
 def named(key: str) -> dict[str, str]:
     """Metadata of a field with another name in the file."""
     return {"key": key}
+
+
+def of(*keys: str) -> dict[str, tuple[str, ...]]:
+    """Metadata of a field of tuples that are objects in the file."""
+    return {"of": keys}
 
 
 def encoded(value: Any) -> Any:
@@ -31,13 +37,21 @@ def encoded(value: Any) -> Any:
 
 
 def record_of(record: Any) -> dict[str, Any]:
-    """The fields of a record as JSON has them, without optional ones that are empty."""
+    """The fields of a record as JSON has them, without hidden ones and empty optional ones."""
     own = ((field, getattr(record, field.name)) for field in fields(record))
     return {
-        _key(field): encoded(value)
+        _key(field): encoded(_object(value, field.metadata.get("of")))
         for field, value in own
-        if not field.metadata.get("optional") or value
+        if "hidden" not in field.metadata and ("optional" not in field.metadata or value)
     }
+
+
+def _object(value: Any, keys: tuple[str, ...] | None) -> Any:
+    if keys is None or value is None:
+        return value
+    if all(isinstance(own, tuple) for own in value):
+        return [_object(own, keys) for own in value]
+    return dict(zip(keys, value, strict=True))
 
 
 def _key(field: "Field[Any]") -> str:

@@ -7,14 +7,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
-from tmlattice.diagnosis.records import OPTIONAL, encoded, record_of
+from tmlattice.diagnosis.records import OPTIONAL, encoded, of, record_of
 from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
 from tmlattice.diagnosis.views import (
@@ -47,7 +47,7 @@ VERDICTS = ("identified", "ambiguous", "localised", "distributed", "none")
 
 
 MOST = 4
-"""Findings in the line of a diagnosis."""
+"""Findings in the line of a diagnosis, and outliers in a warning."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Finding(Speaks):
     unit: str | None = None
     probability: float = 1.0
     detection: Detection
-    where: tuple[float, float] | None
+    where: tuple[float, float] | None = field(metadata=of("s_from", "s_to"))
     near: tuple[str, ...]
     credible_set: tuple[Member, ...] = ()
     mass: float = 0.0
@@ -153,8 +153,6 @@ class Finding(Speaks):
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""
         own = record_of(self)
-        if self.where is not None:
-            own["where"] = {"s_from": self.where[0], "s_to": self.where[1]}
         if not self.words:
             del own["words"], own["to_check"], own["elements"]
         first, *others = own.pop("recommended_actions") or [None]
@@ -259,7 +257,7 @@ class Diagnosis(Speaks):
     correlations: tuple[Correlation, ...] = ()
     devices: Mapping[str, str] = field(default_factory=dict)
     supports: tuple[Support, ...] = ()
-    covariance: NDArray[np.float64] | None = field(default=None, repr=False)
+    covariance: Array | None = field(default=None, repr=False)
 
     report = Method("tmlattice.report.plain", "report_text", "The report as plain text.")
     save = Method(
@@ -533,7 +531,7 @@ class Diagnosis(Speaks):
                     "element": c.element,
                     "amount": c.amount,
                     "amount_sigma": s,
-                    **support.as_json(),
+                    **record_of(support),
                     **({"device": own} if (own := self.devices.get(c.element or "")) else {}),
                 }
                 for c, s, support in self.supported

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.records import encoded, named
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, first_of
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import AnyMeasurement, Measurement, TuneReading
@@ -17,16 +17,11 @@ from tmlattice.measurement.monitors import LARGEST_READING
 from tmlattice.measurement.shots import FEWEST as TURNS
 from tmlattice.observe.noise import SAME_PLACE
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-NAMED = 3
-"""Names of BPMs in a sentence at most."""
 CUT = FEWEST
 """Silent BPMs at the end of a shot from which on the beam counts as lost."""
-ALIKE = 0.5
-"""Share of constant signals from which on the data are no readings; and of the readings of a signal
-that repeat the one before, from which on it is frozen."""
+HALF = 0.5
+"""Share from which on all is wrong: of unknown names, of sections that follow no trajectory, of
+constant signals, and of the readings of a signal that repeat the one before."""
 SENSIBLE = LARGEST_READING / 100
 """m; typical reading below which the readings are in metres, and larger ones are none."""
 STRAY = 0.02
@@ -123,12 +118,6 @@ class Checkup:
         }
 
 
-def some(names: Sequence[str]) -> str:
-    """The first of several names."""
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
-
-
 def not_reached(silent: Flags) -> Flags:
     """Which BPMs [monitor] follow a lost beam: the last ones that are silent [reading, monitor] in
     all readings, where a run of the last ones is in most; in beam order."""
@@ -174,7 +163,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     checks = []
     large = too_large(values)
     if large.any():
-        own = some([names[m] for m in np.flatnonzero(large.any(axis=(0, 2))).tolist()])
+        own = first_of([names[m] for m in np.flatnonzero(large.any(axis=(0, 2))).tolist()])
         text = (
             f"{large.sum()} of {there.sum()} readings are above {LARGEST_READING} m, of {own}: no "
             "beam reads that; leave them out (NaN, or an empty field)"
@@ -192,7 +181,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
         text = f"{len(silent)} of {len(names)} BPMs have no reading; they are ignored"
         checks.append(note("silent BPMs", text))
     elif silent:
-        text = f"no reading of {some(silent)}"
+        text = f"no reading of {first_of(silent)}"
         checks.append(note("silent BPMs", text))
     else:
         checks.append(fine("silent BPMs", f"each of {len(names)} BPMs has a reading"))
@@ -200,27 +189,27 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     with np.errstate(invalid="ignore"):
         high = np.where(there, values, -np.inf).max(axis=0)
         low = np.where(there, values, np.inf).min(axis=0)
-    again = (values[1:] == values[:-1]).sum(axis=0) > ALIKE * (len(values) - 1)
+    again = (values[1:] == values[:-1]).sum(axis=0) > HALF * (len(values) - 1)
     stuck = many & ((high == low) | (again & (moved & (len(values) >= TURNS))))
     frozen = [
         n if both else f"{n} in {'x' if x else 'y'}"
         for n, (x, y), both in zip(names, stuck, stuck.all(axis=1), strict=True)
         if x or y
     ]
-    if moved and stuck.sum() > ALIKE * max(int(many.sum()), 1):
+    if moved and stuck.sum() > HALF * max(int(many.sum()), 1):
         text = (
             f"{len(frozen)} of {len(names)} BPMs read the same in every shot and turn: one "
             "reading was copied over the others; give what was read each time"
         )
         checks.append(wrong("frozen BPMs", text))
     elif frozen:
-        text = f"the same reading again and again: {some(frozen)}; leave the signal out"
+        text = f"the same reading again and again: {first_of(frozen)}; leave the signal out"
         checks.append(note("frozen BPMs", text))
     else:
         checks.append(fine("frozen BPMs", "no BPM is frozen"))
     copies = _copies(ring, names, values, stuck)
     if copies:
-        text = f"the same readings, to the last digit, of {some(copies)}; one of them is a copy"
+        text = f"the same readings, to the last digit, of {first_of(copies)}; one of them is a copy"
         checks.append(note("copied BPMs", text))
     else:
         checks.append(fine("copied BPMs", "no two BPMs read the same"))

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
@@ -22,15 +22,13 @@ from tmlattice.inference.distributed import (
     chain_factors,
     signatures_of,
 )
-from tmlattice.inference.newton import Fit, fit_nuisances
+from tmlattice.inference.judgement import SIGNIFICANT
+from tmlattice.inference.newton import STEP_SHARES, Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.search import Explanation
-from tmlattice.inference.validation import DETERMINED, Gap, Misfit, held_out_gap
+from tmlattice.inference.validation import Gap, Misfit, held_out_gap
 from tmlattice.inference.whitening import Blocks
 from tmlattice.observe.first_turns import FirstTurns, held_out_residuals
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -76,10 +74,6 @@ def stages_of(
     return [_settled(problem, *model, fitted, about) for model in models]
 
 
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0)
-"""The share of the step to the most probable distributed errors that stores a beam."""
-
-
 def _settled(
     problem: CombinedProblem,
     static: tuple[Cause, ...],
@@ -90,7 +84,7 @@ def _settled(
 ) -> Stage:
     """A model at its best nuisances; from those of the fit where from the others no beam comes to
     the last BPM that read one."""
-    for share in SHARES:
+    for share in (*STEP_SHARES, 0.0):
         some = tuple(
             replace(c, amount=start + share * (c.amount - start))
             for c in static for start in [about[c.effect, c.element]]
@@ -202,7 +196,7 @@ def held_out(
     readings = sum(int((judge.valid & own).sum()) for judge, own in zip(judges, among, strict=True))
     gap = Gap(tuple(misfits), np.zeros((0, 0, 0)), None, None, since, readings)
     before, after = (max(misfits[i].chi2_per_dof - 1, 0.0) for i in (since, -1))
-    if readings and before > DETERMINED * np.sqrt(2 / readings) and since < len(misfits) - 1:
+    if readings and before > SIGNIFICANT * np.sqrt(2 / readings) and since < len(misfits) - 1:
         return replace(gap, explained=1 - after / before)
     return gap
 
@@ -301,5 +295,5 @@ def seen_by(
     row = point.projection.out(problem.slope(point, own[0]))
     assert isinstance(point.projection, Blocks)
     squares = [float(mine @ mine) for mine in point.projection.split(row)][: len(parts)]
-    total = max(sum(squares), 1e-300)
+    total = max(sum(squares), TINY)
     return {part.label: square / total for part, square in zip(parts, squares, strict=True)}

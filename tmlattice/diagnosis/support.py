@@ -5,13 +5,14 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
+from tmlattice.diagnosis.records import of
 from tmlattice.effects import find
+from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.problem import Hypothesis
 
 DETERMINED = 0.5
@@ -30,22 +31,14 @@ class Support:
     """
 
     share_from_data: float
-    degenerate_with: tuple[tuple[str, str | None, float], ...] = ()
+    degenerate_with: tuple[tuple[str, str | None, float], ...] = field(
+        default=(), metadata=of("effect", "element", "correlation")
+    )
 
     @property
     def determined(self) -> bool:
         """Whether the data determine the number."""
         return self.share_from_data >= DETERMINED
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields of a number in the diagnosis."""
-        return {
-            "share_from_data": self.share_from_data,
-            "degenerate_with": [
-                {"effect": effect, "element": element, "correlation": correlation}
-                for effect, element, correlation in self.degenerate_with
-            ],
-        }
 
 
 def share_from_data(sigma: float, prior: float) -> float:
@@ -77,8 +70,6 @@ FREE = Support(1.0)
 STRONG = 0.9
 """Correlation from which on a pair is reported: the error of each is 2.3 times the one given the
 other."""
-MOST = 8
-"""Pairs that are reported."""
 
 
 @dataclass(frozen=True)
@@ -90,21 +81,12 @@ class Correlation:
         correlation: of their errors, between -1 and 1.
     """
 
-    first: Hypothesis
-    second: Hypothesis
+    first: Hypothesis = field(metadata=of("effect", "element"))
+    second: Hypothesis = field(metadata=of("effect", "element"))
     correlation: float
 
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        one, other = (
-            {"effect": effect, "element": element} for effect, element in (self.first, self.second)
-        )
-        return {"first": one, "second": other, "correlation": self.correlation}
 
-
-def correlations_of(
-    amounts: Sequence[Hypothesis], covariance: NDArray[np.float64]
-) -> tuple[Correlation, ...]:
+def correlations_of(amounts: Sequence[Hypothesis], covariance: Array) -> tuple[Correlation, ...]:
     """The pairs with the strongest correlations, from `STRONG` on.
 
     Args:
@@ -119,7 +101,7 @@ def correlations_of(
     order = np.argsort(-np.abs(matrix[rows, columns]), kind="stable")
     found: list[Correlation] = []
     for i, j in zip(known[rows[order]], known[columns[order]], strict=True):
-        if amounts[i] != amounts[j] and len(found) < MOST:
+        if amounts[i] != amounts[j] and len(found) < ENOUGH:
             value = float(covariance[i, j] / sigma[i] / sigma[j])
             found.append(Correlation(amounts[i], amounts[j], float(np.clip(value, -1, 1))))
     return tuple(found)

@@ -10,15 +10,16 @@ fit it is an amount that is an outlier of its family.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
+from tmlattice.arrays import TINY
 from tmlattice.diagnosis.places import between
-from tmlattice.diagnosis.records import OPTIONAL, record_of
+from tmlattice.diagnosis.records import OPTIONAL, of
 from tmlattice.effects import Cause
 from tmlattice.inference import chi2
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import ENOUGH, SIGNIFICANT, Judgement
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Element, Ring
@@ -27,13 +28,6 @@ MOST = 3
 """Suspects of each kind."""
 
 SuspectKind = Literal["monitor", "corrector", "magnet", "section"]
-
-OUTLIER = 5.0
-"""Distance from the family's median, in units of its robust scatter and of the amount's error,
-above which an amount is an outlier."""
-
-ENOUGH, SHOWN = 8, 8
-"""Amounts of a family that determine a scatter; outliers that are listed."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +43,7 @@ class Suspect:
         statistic: fall of chi-square by it; or, of an outlier of a family, its distance from the
             median in units of the family's scatter.
         threshold: of the whole scan; a larger one that is no finding is less probably a
-            fault than a large distributed error. Or `OUTLIER`.
+            fault than a large distributed error. Or `SIGNIFICANT`.
         measure: "chi2" or "scatter": of which the statistic is.
         elements: all that share the amount.
         amount, amount_sigma: in the effect's unit; None of a scan's.
@@ -59,7 +53,7 @@ class Suspect:
     kind: SuspectKind
     effect: str | None
     element: str
-    where: tuple[float, float]
+    where: tuple[float, float] = field(metadata=of("s_from", "s_to"))
     near: tuple[str, ...]
     statistic: float
     threshold: float
@@ -68,12 +62,6 @@ class Suspect:
     amount: float | None = None
     amount_sigma: float | None = None
     device: str | None = field(default=None, metadata=OPTIONAL)
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        where = {"s_from": self.where[0], "s_to": self.where[1]}
-        elements = list(self.elements or (self.element,))
-        return {**record_of(self), "where": where, "elements": elements}
 
 
 Candidate = tuple[str | None, str, float]
@@ -101,7 +89,9 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
         if kind == "magnet":
             kind, key = "section", where
         if (kind, key) not in found and sum(k == kind for k, _ in found) < MOST:
-            found[kind, key] = Suspect(kind, effect, name, where, near, statistic, threshold)
+            found[kind, key] = Suspect(
+                kind, effect, name, where, near, statistic, threshold, elements=(name,)
+            )
     return tuple(found.values())
 
 
@@ -130,19 +120,19 @@ def outliers(
             continue
         amounts = np.array([places[0].amount for places, _ in own])
         off = np.abs(amounts - np.median(amounts))
-        scatter = chi2.MAD * float(np.median(off))
+        scatter = float(chi2.typical(off))
         for (places, sigma), distance in zip(own, off, strict=True):
-            times = float(distance / max(scatter, sigma, 1e-30))
-            if times > OUTLIER and not any((c.effect, c.element) in known for c in places):
+            times = float(distance / max(scatter, sigma, TINY))
+            if times > SIGNIFICANT and not any((c.effect, c.element) in known for c in places):
                 elements = tuple(c.element for c in places if c.element is not None)
                 element = ring[elements[0]]
                 found.append(
                     Suspect(
                         _kind(element), effect, element.name, *between(ring, [element.s]), times,
-                        OUTLIER, "scatter", elements, places[0].amount, sigma,
+                        SIGNIFICANT, "scatter", elements, places[0].amount, sigma,
                     )
                 )  # fmt: skip
-    return tuple(sorted(found, key=lambda one: -one.statistic)[:SHOWN])
+    return tuple(sorted(found, key=lambda one: -one.statistic)[:ENOUGH])
 
 
 def numbers(amounts: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...], float]]:

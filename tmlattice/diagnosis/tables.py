@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.diagnosis.consequences import optics_with
+from tmlattice.diagnosis.records import record_of
 from tmlattice.effects import find
 from tmlattice.errors import MeasurementError, UnstableRingError, unknown_name
 
@@ -159,7 +160,7 @@ def _optics(diagnosis: Diagnosis) -> Any:
 
 def _steps(diagnosis: Diagnosis) -> Any:
     kept = [(step, True) for step in diagnosis.steps]
-    rows = [step.as_json() | {"kept": own} for step, own in
+    rows = [record_of(step) | {"kept": own} for step, own in
             [*kept, *((step, False) for step in diagnosis.rejected_steps)]]  # fmt: skip
     columns = [
         "effect", "parameters", "kept", "heldout_rms_in_plane", "heldout_rms_position",

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView, TrajectoryView
 from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors, DistributedProblem, posterior
+from tmlattice.inference.errors import KNOWN_MEMBERS
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
@@ -27,16 +28,11 @@ from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response
 
-Array = NDArray[np.float64]
-
 log = logging.getLogger(__name__)
 
 PRODUCTS = 2e12
 """Readings times errors squared up to which the covariance of all distributed errors of a response
 is computed: some six minutes of processor (`docs/together.md`)."""
-HARDLY = 0.3
-"""Relative error of a family's scale above which the usual scale is kept: a response is sensitive
-to kicks by the orbit in sextupoles alone, which is not linear."""
 
 ROUNDED = 1e-4
 """Of the products of directions: single precision rounds them by 1e-6."""
@@ -118,7 +114,10 @@ def _together(
     )
     start = np.array([fitted.get(h, 0.0) for h in everywhere])
     known = posterior(
-        problem, DistributedErrors.usual(everywhere, usual), unsure=HARDLY, linearised_at=start
+        problem,
+        DistributedErrors.usual(everywhere, usual),
+        unsure=(2 * KNOWN_MEMBERS) ** -0.5,
+        linearised_at=start,
     ).known
     inside = np.array([_in_ring(Cause(*h, 0.0)) for h in everywhere])  # the estimated ring has them
     return replace(

@@ -1,12 +1,11 @@
 """Parts of a measurement that a diagnosis keeps for plots and tables."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tmlattice.diagnosis.records import OPTIONAL, named, record_of
+from tmlattice.arrays import Array, Flags
+from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, named
 from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Misfit
@@ -70,9 +69,9 @@ class TrajectoryView:
 
     explanation: Explanation
     problem: FirstTurns
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
-    dropped: NDArray[np.bool_]
+    before: Array
+    after: Array
+    dropped: Flags
 
     @property
     def data(self) -> Data:
@@ -93,11 +92,11 @@ class ResponseView:
     """
 
     measured: OrbitResponse
-    data: NDArray[np.float64]
-    design: NDArray[np.float64]
-    model: NDArray[np.float64]
-    held: NDArray[np.bool_]
-    good: NDArray[np.bool_]
+    data: Array
+    design: Array
+    model: Array
+    held: Flags
+    good: Flags
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +118,9 @@ class PartView:
     readings: int
     before: Misfit
     after: Misfit
-    monitors: tuple[str, ...]
-    left: NDArray[np.float64] = field(repr=False)
+    monitors: tuple[str, ...] = field(metadata=HIDDEN)
+    left: Array = field(repr=False, metadata=HIDDEN)
     numbers: tuple[NumberRead, ...] = field(default=(), metadata=OPTIONAL)
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        own = record_of(self)
-        del own["monitors"], own["left"]
-        return own
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import INVISIBLE
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.errors import LatticeError, MeasurementError
 from tmlattice.fitting.weight_parts import (
@@ -42,7 +43,6 @@ from tmlattice.fitting.weight_parts import (
     split,
     stacked,
 )
-from tmlattice.inference.scan import MIN_VISIBLE
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
@@ -178,7 +178,7 @@ def read_network(
     M = seen.information[:, effects.layer]
     norm = np.einsum("shi,shij,shj->h", kicks, M, kicks)
     whole = np.einsum("shi,shij,shj->h", kicks, seen.whole[:, effects.layer], kicks)
-    visible = (norm > MIN_VISIBLE**2 * whole) & (norm > 0)
+    visible = (norm > INVISIBLE**2 * whole) & (norm > 0)
     own = seen.kicks(np.arange(len(ring.magnets)), change)[:, effects.layer]
     inner = np.einsum("shi,shij,shj->h", kicks, M, own)
     safe = np.where(visible, norm, 1.0)

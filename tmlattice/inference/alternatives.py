@@ -4,17 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference import chi2
 from tmlattice.inference.common_factors import MIN_CHI2
+from tmlattice.inference.judgement import BEYOND
 from tmlattice.inference.newton import Fit, Outcome, fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan
-
-Array = NDArray[np.float64]
-
 
 MIN_FALL = 1.0
 """Chi-square that a parameter takes from noise: a smaller fall explains nothing."""
@@ -131,7 +129,7 @@ def _first_guess(found: Scan, index: int) -> Cause | None:
         amount = float(np.sqrt(amount))
     elif effect.one_sign and amount <= 0:
         return None
-    limit = 1.5 * effect.largest
+    limit = BEYOND * effect.largest
     return Cause(name, place, float(np.clip(amount, -limit, limit)))
 
 

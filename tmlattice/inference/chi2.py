@@ -1,5 +1,6 @@
 """Tails of chi-square and Student's t, without scipy.stats, whose import takes half a second."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,18 @@ def isf(rate: ArrayLike, freedom: ArrayLike) -> Any:
 
 MAD = 1.4826
 """rms of a Gaussian over the median of its modulus."""
+
+
+def typical(values: ArrayLike, axis: int | None = None) -> Any:
+    """Robust rms about zero, by the median modulus, along an axis; NaN, without a warning, of none.
+
+    Args:
+        values: NaN where there is none.
+        axis: that is reduced; None: all.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # no values
+        return MAD * np.nanmedian(np.abs(values), axis=axis)
 
 
 def median_per_freedom(freedom: ArrayLike) -> Any:

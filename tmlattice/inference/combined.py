@@ -15,13 +15,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.effects import Cause
 from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.whitening import Blocks, Projection, Root
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +193,7 @@ class CombinedProblem(Problem):
         """Valid readings of all parts, flat."""
         return np.concatenate([part.valid.ravel() for part in self.parts])
 
-    def owner(self) -> NDArray[np.int64]:
+    def owner(self) -> Indices:
         """Monitor of each reading, an index of `names`."""
         at = {name: i for i, name in enumerate(self.names)}
         found = []

@@ -25,22 +25,15 @@ from heapq import heapify, heappop, heappush
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
 from scipy.special import logsumexp
 
-Array = NDArray[np.float64]
+from tmlattice.arrays import REDUNDANT, TINY, Array
+from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT
+from tmlattice.inference.newton import ROUNDS
 
-MIN_CHI2 = 25.0
-"""Chi-square of a selected factor, at least: five standard deviations."""
-SWEEPS = 5
-"""Rounds in which every factor is exchanged against its alternatives."""
-MIN_INFORMATION = 1e-6
-"""Share of a candidate's information that the selected factors must leave, at least."""
-MIN_SCALE_EVIDENCE = 2.0
-"""Log evidence that the common scale of unresolved factors must gain to be used."""
-MAX_BEHIND = 3.0
-"""Log evidence below the best at which an alternative is still reported: odds of 1 to 20."""
+MIN_CHI2 = SIGNIFICANT**2
+"""Chi-square of a selected factor, at least."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +124,8 @@ class FactorModel:
             sizes = [0.0, *rms] if others else [0.0]
             made = [self.given(others, one) if one else self for one in sizes]
             logs = np.array([own.background + own.log_evidence(chosen) for own in made])
-            best = int(np.argmax(logs - MIN_SCALE_EVIDENCE * (np.array(sizes) > 0)))
-            stay = made[best]._pruned(list(chosen), MIN_CHI2)
+            best = int(np.argmax(logs - DEFAULT.behind * (np.array(sizes) > 0)))
+            stay = made[best]._pruned(list(chosen))
             if len(stay) == len(chosen):
                 logs[1:] -= np.log(max(len(rms), 1))
                 chance = np.exp(logs - logsumexp(logs)).tolist()
@@ -162,7 +155,7 @@ class FactorModel:
         variance = np.diag(covariance)
         known = 1 / variance - self.slab[np.array(chosen, dtype=int)] ** -2.0
         known = np.maximum(known, 0)
-        return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, 1e-300), 0.0)
+        return np.where(known > 0, (amounts / variance) ** 2 / np.maximum(known, TINY), 0.0)
 
     def _given(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
         """Score and information of each candidate given some, and the change of the amounts of
@@ -178,48 +171,46 @@ class FactorModel:
         score, own, _ = self._given(chosen)
         spread = own + self.slab**-2.0
         gain = 0.5 * score**2 / spread - 0.5 * np.log(spread * self.slab**2)
-        square = np.where(own > 0, score**2 / np.maximum(own, 1e-300), 0.0)
-        seen = own > MIN_INFORMATION * np.diag(self.information)  # else redundant
+        square = np.where(own > 0, score**2 / np.maximum(own, TINY), 0.0)
+        seen = own > REDUNDANT * np.diag(self.information)  # else redundant
         gain = np.where(seen, gain, 0.0) - self.cost
         gain[list(chosen)] = -np.inf
         return gain, np.where(seen, square, 0.0)
 
-    def choose(
-        self, most: int, clear: float = MIN_CHI2, without: Collection[int] = ()
-    ) -> list[int]:
+    def choose(self, most: int, without: Collection[int] = ()) -> list[int]:
         """Select factors, except some."""
         chosen: list[int] = []
         while len(chosen) < most:
             gain, square = self.gains(chosen)
             gain[list(without)] = -np.inf
-            gain[square < clear] = -np.inf
+            gain[square < MIN_CHI2] = -np.inf
             best = int(np.argmax(gain))
             if not gain[best] > 0:
                 break
-            chosen = self._pruned([*chosen, best], clear)
+            chosen = self._pruned([*chosen, best])
             if best not in chosen:
                 break
-        for _ in range(SWEEPS):
+        for _ in range(ROUNDS):
             before = list(chosen)
             for own in before:
                 others = [c for c in chosen if c != own]
                 gain, square = self.gains(others)
                 gain[list(without)] = -np.inf
-                best = int(np.argmax(np.where(square < clear, -np.inf, gain)))
+                best = int(np.argmax(np.where(square < MIN_CHI2, -np.inf, gain)))
                 if gain[best] > gain[own] + 1e-9:
                     chosen = [*others, best]
-            chosen = self._pruned(chosen, clear)
+            chosen = self._pruned(chosen)
             if set(chosen) == set(before):
                 break
         return chosen
 
-    def _pruned(self, chosen: list[int], clear: float) -> list[int]:
+    def _pruned(self, chosen: list[int]) -> list[int]:
         """Remove redundant factors, the weakest first."""
         while chosen:
             worth = []
             for own in chosen:
                 gain, square = self.gains([c for c in chosen if c != own])
-                worth.append(gain[own] if square[own] >= clear else -np.inf)
+                worth.append(gain[own] if square[own] >= MIN_CHI2 else -np.inf)
             least = int(np.argmin(worth))
             if worth[least] > 0:
                 break
@@ -234,7 +225,7 @@ class FactorModel:
         spread = own + self.slab**-2.0
         moved = -lessened * (score / spread)
         gain = self.gains(chosen)[0]
-        gain[own <= MIN_INFORMATION * np.diag(self.information)] = -np.inf  # redundant
+        gain[own <= REDUNDANT * np.diag(self.information)] = -np.inf  # redundant
         there = np.exp(gain - np.logaddexp(0.0, logsumexp(gain)))
         more = moved @ there
         wider = np.diag(covariance) + (moved**2 + lessened**2 / spread) @ there
@@ -263,9 +254,10 @@ class FactorModel:
         found = []
         for i, own in enumerate(chosen):
             gain, square = self.gains([c for c in chosen if c != own])
-            linearise = [int(c) for c in np.flatnonzero(gain > gain[own] - MAX_BEHIND) if c != own]
-            odds = np.exp(gain[[own, *linearise]] - gain[own])
-            ranked = sorted(zip([own, *linearise], odds / odds.sum(), strict=True),
+            near = np.flatnonzero(gain > gain[own] - DEFAULT.behind).tolist()
+            others = [c for c in near if c != own]
+            odds = np.exp(gain[[own, *others]] - gain[own])
+            ranked = sorted(zip([own, *others], odds / odds.sum(), strict=True),
                           key=lambda row: (row[0] != own, -row[1]))  # fmt: skip
             found.append(
                 CommonFactor(
@@ -293,12 +285,12 @@ class GivenOthers:
     over: tuple[tuple[FactorModel, float], ...]
 
 
+MAX_CHOSEN = 40
+"""Selected factors at most: many supplies may be changed on purpose."""
 MAX_EXCLUDED = 2
 """Selected factors that are excluded together for another start."""
 MAX_EXPANDED = 300
 """Sets that are expanded at most. ESRF-EBS with 857 candidates needs 150."""
-NEGLIGIBLE = 6.0
-"""Log probability below the best at which a set is ignored: odds of 1 to 400."""
 
 
 @dataclass(frozen=True)
@@ -327,22 +319,21 @@ class LikelySet:
         return float(self.covariance[at, at])
 
 
-def likely_sets(levels: FactorModel, most: int, clear: float = MIN_CHI2) -> list[LikelySet]:
+def likely_sets(levels: FactorModel, most: int) -> list[LikelySet]:
     """Sets in which every factor is significant given the others, the most probable first.
 
     Args:
         levels: the candidates.
         most: candidates in a set at most.
-        clear: smallest chi-square of a factor.
 
     Returns:
         At least one set.
     """
     rests = _rests(levels.candidates)
     chances: dict[frozenset[int], float] = {}
-    for one in _likely(levels, _starts(levels, most, clear), most, clear):
+    for one in _likely(levels, _starts(levels, most), most):
         parts = _in_parts(rests, one)
-        reported = parts if (levels.squares(sorted(parts)) >= clear).all() else one
+        reported = parts if (levels.squares(sorted(parts)) >= MIN_CHI2).all() else one
         chance = levels.log_evidence(sorted(one))
         chances[reported] = max(chance, chances.get(reported, -np.inf))
     sets = list(chances)
@@ -375,7 +366,7 @@ def over_sets(levels: FactorModel, sets: Sequence[LikelySet]) -> list[tuple[Comm
         alternatives = [(c, first.probability)]
         for one in sets[1:]:
             (*more,) = frozenset(one.chosen) - others
-            likely = one.probability > np.exp(-MAX_BEHIND) * first.probability
+            likely = one.probability > (1 - DEFAULT.mass) * first.probability
             if likely and len(one.chosen) == len(first.chosen) and len(more) == 1:
                 alternatives.append((more[0], one.probability))
         total = sum(chance for _, chance in alternatives)
@@ -386,7 +377,7 @@ def over_sets(levels: FactorModel, sets: Sequence[LikelySet]) -> list[tuple[Comm
     return found
 
 
-def _starts(levels: FactorModel, most: int, clear: float) -> list[frozenset[int]]:
+def _starts(levels: FactorModel, most: int) -> list[frozenset[int]]:
     """Ends of stepwise selection with all candidates, and without each selected one, in turn from
     each likely end; the most probable first."""
     ends = {frozenset[int](): 0.0}
@@ -394,19 +385,19 @@ def _starts(levels: FactorModel, most: int, clear: float) -> list[frozenset[int]
     tried = set(waiting)
     while waiting:
         without = waiting.pop(0)
-        end = frozenset(levels.choose(most, clear, without))
+        end = frozenset(levels.choose(most, without))
         ends[end] = levels.log_evidence(sorted(end))
-        if len(without) < MAX_EXCLUDED and ends[end] > max(ends.values()) - NEGLIGIBLE:
+        if len(without) < MAX_EXCLUDED and ends[end] > max(ends.values()) - DEFAULT.log_odds:
             more = [without | {own} for own in sorted(end)]
             waiting += [one for one in more if one not in tried]
             tried.update(more)
     best = max(ends.values())
-    likely = [one for one, value in ends.items() if value > best - NEGLIGIBLE]
+    likely = [one for one, value in ends.items() if value > best - DEFAULT.log_odds]
     return sorted(likely, key=lambda one: (-ends[one], sorted(one)))
 
 
 def _likely(
-    levels: FactorModel, starts: Sequence[frozenset[int]], most: int, clear: float
+    levels: FactorModel, starts: Sequence[frozenset[int]], most: int
 ) -> list[frozenset[int]]:
     """Likely sets that are reached from the starts over significant ones, by one candidate more,
     less or exchanged; the most probable are expanded first, `MAX_EXPANDED` of them."""
@@ -417,13 +408,13 @@ def _likely(
     found: list[frozenset[int]] = []
 
     def meet(one: frozenset[int], value: float) -> None:
-        if value > best - NEGLIGIBLE and one not in met:
+        if value > best - DEFAULT.log_odds and one not in met:
             met[one] = value
             heappush(waiting, (-value, sorted(one)))
 
-    while waiting and len(found) < MAX_EXPANDED and -waiting[0][0] > best - NEGLIGIBLE:
+    while waiting and len(found) < MAX_EXPANDED and -waiting[0][0] > best - DEFAULT.log_odds:
         negative, here = heappop(waiting)
-        if not (levels.squares(here) >= clear).all():
+        if not (levels.squares(here) >= MIN_CHI2).all():
             continue
         found.append(frozenset(here))
         best = max(best, -negative)
@@ -433,10 +424,10 @@ def _likely(
             gain, square = levels.gains(others)
             left = -negative if own is None else -negative - float(gain[own])
             meet(frozenset(others), left)
-            values = np.where(square >= clear, left + gain, -np.inf)
-            for candidate in np.flatnonzero(values > best - NEGLIGIBLE).tolist():
+            values = np.where(square >= MIN_CHI2, left + gain, -np.inf)
+            for candidate in np.flatnonzero(values > best - DEFAULT.log_odds).tolist():
                 meet(frozenset([*others, candidate]), float(values[candidate]))
-    return [one for one in found if met[one] > best - NEGLIGIBLE]
+    return [one for one in found if met[one] > best - DEFAULT.log_odds]
 
 
 def _rests(candidates: Array) -> dict[tuple[int, int], int]:

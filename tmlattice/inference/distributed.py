@@ -18,23 +18,16 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 
+from tmlattice.arrays import AT_ONCE, TINY, Array, Flags, Indices
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric
-from tmlattice.inference.newton import Fit, fit, fit_nuisances
+from tmlattice.inference.newton import ROUNDS, STEP_SHARES, Fit, fit, fit_nuisances
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.variance_components import VarianceComponents, fit_variance_components
 from tmlattice.inference.whitening import Projection, Root, inverse_root
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-LINEARISATIONS = 8
-"""At the design, and at the most probable errors until the model is linear up to these: at most.
-Two are usual, five where orbits are millimetres off in strong sextupoles."""
 
 LINEAR = 0.1
 """Of chi-square, to which the linear model has to predict that of the full one."""
@@ -42,8 +35,6 @@ LINEAR = 0.1
 ROWS = 1000
 """Rows for variance components: 17 of them to some per cent; the time goes as the cube."""
 
-MAX_HALVINGS = 4
-"""Halvings, at most, of a step to the most probable errors where no beam is stored."""
 
 MAX_SHARE = 0.9999
 """Largest share of a variance that data may remove: linearisation leaves a hundredth of the rms."""
@@ -53,9 +44,6 @@ MIN_SHARE = 0.02
 
 MAX_ELEMENTS = 10**8
 """Rows times distributed errors: 0.8 GB each array, 8 GB for all of them."""
-
-AT_ONCE = 2**24
-"""Numbers of signature rows in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -272,7 +260,7 @@ class DistributedProblem(MarginalProblem):
 
     known: DistributedErrors = field(repr=False)
     linearised_at: Array = field(repr=False)
-    open: tuple[NDArray[np.int64], Array] | None = field(default=None, repr=False)
+    open: tuple[Indices, Array] | None = field(default=None, repr=False)
 
     def certainty(self, point: Point, hypothesis: Hypothesis) -> float:
         """Degrees of freedom of the variance along a hypothesis, from the scales' covariance."""
@@ -281,7 +269,7 @@ class DistributedProblem(MarginalProblem):
         family, covariance = self.open
         row = point.projection.out(self.metric(point).rows([hypothesis]))[0]
         squares = (self.rows @ self._root.back(row)) ** 2
-        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), 1e-300)
+        slope = -2 * np.bincount(family, squares, len(covariance)) / max(float(row @ row), TINY)
         return 2 / max(float(slope @ covariance @ slope), 1e-9)
 
     def coordinates(self, clean: Array) -> Array:
@@ -301,8 +289,6 @@ class DistributedProblem(MarginalProblem):
 
 
 class _MarginalMetric(Metric):
-    chunk = 256
-
     def __init__(self, problem: MarginalProblem, point: Point) -> None:
         assert point.projection is not None
         super().__init__(point.projection)
@@ -379,7 +365,7 @@ def fit_distributed_errors(
     amounts = known.amounts if linearised_at is None else linearised_at
     stored = amounts if stored is None else stored
     expected = np.inf
-    for step in range(LINEARISATIONS):
+    for step in range(ROUNDS):
         inner, there, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
         if step > 1 and abs(there.chi2 - expected) < LINEAR:
             break
@@ -505,7 +491,7 @@ def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesi
     return out
 
 
-def families_of(known: DistributedErrors) -> tuple[list[str], NDArray[np.int64]]:
+def families_of(known: DistributedErrors) -> tuple[list[str], Indices]:
     """Effects in `known`, and the index of each error's effect, [error]."""
     names = list(dict.fromkeys(name for name, _ in known.hypotheses))
     return names, np.array([names.index(name) for name, _ in known.hypotheses])
@@ -533,7 +519,7 @@ def linearise(
         UnstableRingError: no amounts between the two store a beam.
     """
     first = amounts is stored
-    for turn in range(MAX_HALVINGS):
+    for turn in range(len(STEP_SHARES)):
         own = zip(known.hypotheses, amounts.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
         inner = replace(problem, fixed=(*problem.fixed, *there))
@@ -543,7 +529,7 @@ def linearise(
         if first:
             break
         # beyond the linear range
-        amounts = stored if turn == MAX_HALVINGS - 2 else (amounts + stored) / 2
+        amounts = stored if turn == len(STEP_SHARES) - 2 else (amounts + stored) / 2
     raise UnstableRingError(f"{alone.lost} with the most probable distributed errors")
 
 
@@ -553,7 +539,7 @@ def chain_factors(known: DistributedErrors, amounts: Array) -> Array:
     return np.array([find(name).chain(amount) for (name, _), amount in own])
 
 
-def sampled_rows(count: int) -> NDArray[np.int64]:
+def sampled_rows(count: int) -> Indices:
     """Return rows for variance components: a fixed random sample, as rows alternate in kind."""
     if count <= ROWS:
         return np.arange(count)
@@ -564,7 +550,7 @@ def components_of_rows(
     residual: Array,
     directions: Array,
     rows: Array,
-    belongs: NDArray[np.int64],
+    belongs: Indices,
     noise: Sequence[Flags] = (),
 ) -> VarianceComponents:
     """Return the variance components from a sample of rows.
@@ -601,7 +587,7 @@ class Posterior:
 
     before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
-    visible: NDArray[np.int64] = field(repr=False)
+    visible: Indices = field(repr=False)
     spread: Array = field(repr=False)
     errors: Mapping[str, float]
 
@@ -658,7 +644,7 @@ def posterior(
     """
     amounts = stored = known.amounts if linearised_at is None else linearised_at
     nuisances, expected = problem.first, np.inf
-    for step in range(LINEARISATIONS):
+    for step in range(ROUNDS):
         inner, there, amounts = linearise(problem, known, amounts, stored, (), nuisances)
         if step > (linearised_at is None) and abs(there.chi2 - expected) < LINEAR:
             break
@@ -704,7 +690,7 @@ def sums_at(
     point: Point,
     known: DistributedErrors,
     amounts: Array,
-    keep: NDArray[np.int64],
+    keep: Indices,
 ) -> Sums:
     """Return the sums at a point.
 

@@ -28,14 +28,12 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from tmlattice.inference.normal import ROUNDING, Normal, Slopes, shared_by, times_precision
+from tmlattice.arrays import ROUNDING, TINY, Array, Flags, Indices
+from tmlattice.inference.newton import ITERATIONS, SETTLED
+from tmlattice.inference.normal import Normal, Slopes, shared_by, times_precision
 from tmlattice.inference.priors import Group
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MAX_LEVERAGE = 0.75
 """Leverage of a cluster above which the other readings know too little to test it. The mean
@@ -43,9 +41,6 @@ mismatch of the others is then used in its place."""
 
 MAX_CLUSTERS = 64
 """Columns, and monitors, that are taken out at most, drawn at random."""
-
-MIN_SHARE = 1e-11
-"""Smallest share of the information that the other readings have of a quantity."""
 
 
 class Rows(NamedTuple):
@@ -117,7 +112,7 @@ def cluster_robust_errors(
     more = np.zeros_like(noise_variance)
     for clusters in (_of_columns, _of_monitors):
         shares, mismatch = _mismatches(clusters(rows, weight, residual, taken), found)
-        size = np.maximum(shares.sum(axis=0), 1e-300)
+        size = np.maximum(shares.sum(axis=0), TINY)
         more += np.maximum((shares * mismatch).sum(axis=0) / size - 1, 0)
     return np.asarray(np.sqrt(np.maximum(found.variance + noise_variance * more, 0)))
 
@@ -202,36 +197,32 @@ def _mismatches(clusters: Iterable[_Cluster], found: LinearFit) -> tuple[Array, 
         inside = cluster.times(along.T)
         solved = _apart((inside + inside.T) / 2, np.column_stack([Y, cluster.left]))
         moved = Y.T @ solved[:, -1]
-        grown = np.maximum((Y * solved[:, :-1]).sum(axis=0), 1e-300)  # of the variance without it
+        grown = np.maximum((Y * solved[:, :-1]).sum(axis=0), TINY)  # of the variance without it
         whole = np.where(known, found.variance + grown, 1.0)
         share = np.where(known, grown / whole, 0.0)
         own = moved**2 / grown
         leverage = np.where(share < MAX_LEVERAGE, share, 0.0)
-        elsewhere = float(leverage @ own) / max(float(leverage.sum()), 1e-300)
+        elsewhere = float(leverage @ own) / max(float(leverage.sum()), TINY)
         shares.append(share)
         mismatch.append(np.where(share < MAX_LEVERAGE, own, elsewhere))
     return np.array(shares), np.array(mismatch)
 
 
 def _apart(inside: Array, right: Array) -> Array:
-    """(1 - inside)^-1 right, with eigenvalues of at least `MIN_SHARE`."""
-    matrix = (1 + MIN_SHARE) * np.eye(len(inside)) - inside
+    """(1 - inside)^-1 right, with eigenvalues of at least `ROUNDING`."""
+    matrix = (1 + ROUNDING) * np.eye(len(inside)) - inside
     try:
         return np.asarray(cho_solve(cho_factor(matrix), right))
     except np.linalg.LinAlgError:  # by rounding: readings far above their noise
         size, vectors = np.linalg.eigh(matrix)
-        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, MIN_SHARE)[:, None]))
+        return np.asarray(vectors @ ((vectors.T @ right) / np.maximum(size, ROUNDING)[:, None]))
 
 
-SWEEPS = 100
-"""Sweeps at most."""
 DAMPING, LARGEST = 0.3, 0.5
 """Share of each update that is applied, and the largest change of a log precision: all members are
 updated at once, and two that compensate each other would oscillate."""
 DATA_ALONE = 1e3
 """Information over that of the narrowest prior component above which the prior is ignored."""
-CONVERGED = 1e-2
-"""Largest change in a sweep, of a mean in standard deviations or of a log variance, at the end."""
 
 
 class Moments(NamedTuple):
@@ -258,7 +249,7 @@ class _Mixtures:
             self.square[begin:end, : len(chances)] = scales**2
         self.variance = np.sum(np.exp(self.log_chance) * self.square, axis=1)
 
-    def some(self, members: NDArray[np.bool_]) -> "_Mixtures":
+    def some(self, members: Flags) -> "_Mixtures":
         """Return the priors of some members."""
         made = copy(self)
         made.log_chance, made.square = self.log_chance[members], self.square[members]
@@ -311,7 +302,7 @@ def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
 def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
     """Precisions and shifts of the Gaussians in place of the priors."""
     precision, pull = np.ones(len(A)), np.zeros(len(A))
-    for _ in range(SWEEPS):
+    for _ in range(ITERATIONS):
         mean, covariance = _gaussian(A, b, precision, pull)
         variance = np.diag(covariance)
         rest = np.maximum(1 / variance - precision, 0.0)
@@ -323,7 +314,7 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
             np.abs((center - mean) / np.sqrt(variance)).max(),
             np.abs(np.log((wanted + rest) * variance)).max(),
         )
-        if changed < CONVERGED:
+        if changed < SETTLED:
             break
         step = DAMPING * np.log(wanted / precision)
         precision = precision * np.exp(np.clip(step, -LARGEST, LARGEST))
@@ -407,7 +398,7 @@ class _Scales:
 
     def __init__(
         self, information: Array, score: Array, group: Indices, groups: Sequence[Group],
-        absent: NDArray[np.bool_],
+        absent: Flags,
     ) -> None:  # fmt: skip
         self.information, self.score, self.group = information, score, group
         self.known: dict[bytes, float] = {}

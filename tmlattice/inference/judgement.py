@@ -9,6 +9,22 @@ from dataclasses import dataclass, field
 
 from tmlattice.inference.chi2 import MAD
 
+SIGNIFICANT = 5.0
+"""Standard deviations above which one amount, reading or channel is significant wherever it was
+found: Gaussian noise exceeds them once in two million. Its square is a chi-square."""
+GROSS = 20.0
+"""The same above which no error of a ring has the effect, whatever the scatter of the others."""
+FEW, ENOUGH = 4, 8
+"""Values without which nothing is compared with a typical one, and whose median is known to half of
+their scatter."""
+OUTLIERS, WRONG = 0.1, 0.25
+"""Shares of the readings that may be outliers, and of the channels or steps that may be wrong: of
+more of them the model is."""
+MISSTATED = 3.0
+"""Ratio of a stated to a measured size, or its inverse, above which the stated one is wrong."""
+BEYOND = 1.5
+"""Ratio to the largest fault above which an amount is implausible."""
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -59,6 +75,11 @@ class Judgement:
         (Markov's inequality).
         """
         return -math.log(self.false_alarm)
+
+    @property
+    def behind(self) -> float:
+        """Log evidence behind the best by which an alternative is in no credible set."""
+        return -math.log(1 - self.mass)
 
     def outlier_prior(self, readings: int) -> float:
         """Log probability that one of these readings is an outlier: one in a data set at the rate

@@ -8,12 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import AT_ONCE, Array, Indices
 from tmlattice.inference.whitening import Projection
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Hypothesis = tuple[str, str | None]
 """An effect and its place."""
 
@@ -52,10 +50,9 @@ class Metric:
         chunk: hypotheses at a time, which bounds the memory of a scan.
     """
 
-    chunk = 512
-
     def __init__(self, projection: Projection) -> None:
         self.projection = projection
+        self.chunk = max(AT_ONCE // max(projection.rows, 1), 1)
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
         """Whitened signatures, d rows / d amount ** power, [hypothesis, row]; of a discrete effect
@@ -93,7 +90,7 @@ class Metric:
             rows = np.concatenate(some)
             yield np.arange(rows.shape[1]), rows
 
-    def free_kicks(self, places: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
+    def free_kicks(self, places: Indices, clean: Array) -> tuple[Array, Array]:
         """Information of free kicks at places, and their product with data.
 
         Returns:

@@ -9,15 +9,18 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.scan import free_scan
 from tmlattice.inference.whitening import Projection
 
-Array = NDArray[np.float64]
-
+AGAIN, ROUNDS, ITERATIONS = 3, 8, 100
+"""Largest number of repetitions of what settles in two (selections that are linearised again), of
+Newton steps and linearisations, and of iterations that converge slowly."""
+SETTLED = 1e-2
+"""Change, in standard deviations or of a log variance, below which iterations end."""
 STEP_SHARES = (1.0, 0.5, 0.25, 0.0625)
 """Shares of a step, tried in turn until the cost falls."""
 
@@ -125,7 +128,7 @@ def fit(
     nuisances: Array,
     kicks: Kicks = NO_KICKS,
     *,
-    steps: int = 8,
+    steps: int = ROUNDS,
     tolerance: float = 0.02,
     hopeless: float = -np.inf,
     slopes: Slopes = NO_SLOPES,
@@ -171,10 +174,6 @@ def fit(
     return _finished(problem, point, slopes, rows, outcome)
 
 
-NUISANCE_STEPS = 3
-"""Newton steps for nuisances alone: they are nearly linear."""
-
-
 def fit_nuisances(problem: Problem, causes: Sequence[Cause], nuisances: Array) -> Point:
     """Return the point of fixed causes at the best nuisances.
 
@@ -184,7 +183,7 @@ def fit_nuisances(problem: Problem, causes: Sequence[Cause], nuisances: Array) -
         nuisances: first guess.
     """
     point = problem.at(causes, nuisances)
-    for _ in range(NUISANCE_STEPS):
+    for _ in range(AGAIN):  # nearly linear
         if point.projection is None:
             break
         change = point.projection.coordinates(point.residual)
@@ -295,7 +294,7 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
         full = gram + np.diag(_prior_terms(problem, point, len(rows))[0])
         if (np.diagonal(full)[: len(named)] < MIN_INFORMATION).any():
             return Fit(point, covariance, -np.inf, Outcome.SINGULAR, slopes)
-        size = np.sqrt(np.maximum(np.diagonal(full), 1e-300))
+        size = np.sqrt(np.maximum(np.diagonal(full), TINY))
         scaled = full / size[:, None] / size + 1e-10 * np.eye(len(full))
         inverse = np.linalg.inv(scaled) / size[:, None] / size
         covariance[np.ix_(named, named)] = inverse[: len(named), : len(named)]

@@ -17,21 +17,14 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 from scipy.linalg.blas import dsyrk, dtrmm
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 from scipy.sparse import csr_array
 
+from tmlattice.arrays import ROUNDING, Array, Indices
 from tmlattice.compiled import jit_sums
 from tmlattice.inference.priors import Group
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
-
-ROUNDING = 1e-11
-
 
 AT_ONCE = 2048
 """Readings weighed at a time: enough for matrix products, within the cache."""
@@ -326,6 +319,11 @@ class Posterior:
         """Covariance of the groups' parameters, in units of their priors, [p, p]."""
         lower = dpotri(self.factor, lower=1)[0]
         return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+
+    @property
+    def whole(self) -> Array:
+        """Covariance of the base parameters, [parameter, parameter]."""
+        return np.asarray(self.spread @ self.covariance @ self.spread.T)
 
     @property
     def sigma(self) -> Array:

@@ -10,13 +10,12 @@ the log-uniform limit, in which the cost of an amount is that of its relative er
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import gammaln
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference import chi2
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

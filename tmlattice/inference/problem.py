@@ -11,16 +11,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.effects import Cause
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.metric import Metric
 from tmlattice.inference.priors import LOG_UNIFORM, AmountPrior
 from tmlattice.inference.whitening import Projection, Root
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Hypothesis = tuple[str, str | None]
 """An effect and its place."""
 
@@ -185,7 +183,7 @@ class Problem(ABC):
         """Valid readings, of the kind's own shape."""
 
     @abstractmethod
-    def owner(self) -> NDArray[np.int64]:
+    def owner(self) -> Indices:
         """Monitor of each reading, of the shape of `valid`."""
 
     @abstractmethod

@@ -10,20 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from tmlattice.arrays import INVISIBLE, TINY, Array, Indices
 from tmlattice.effects import find
 from tmlattice.inference import chi2
 from tmlattice.inference.metric import Hypothesis, Metric
 
-Array = NDArray[np.float64]
-
 DRAWS = 64
 """Simulations of pure noise for the threshold: the effective number is known to 12 %."""
 
-MIN_VISIBLE = 1e-9
-"""Share of a signature's square that launches must leave, at least."""
 
 MAX_FAULTS = 100.0
 """Largest faults that a hypothesis must need for one standard deviation, at most."""
@@ -115,7 +111,7 @@ def scan(
     reach = np.array(
         [MAX_FAULTS * find(name).largest ** find(name).power for name, _ in hypotheses]
     )
-    seen = (norm > MIN_VISIBLE * sums.whole) & (norm * reach**2 > 1.0)
+    seen = (norm > INVISIBLE * sums.whole) & (norm * reach**2 > 1.0)
     safe = np.where(seen, norm, 1.0)
     squares = np.where(seen[:, None], sums.inner**2 / safe[:, None], 0.0)
     if effective is None:
@@ -141,10 +137,10 @@ class FreeScan:
         amounts: best values, [place, parameter], zero where there is none.
     """
 
-    places: NDArray[np.int64]
+    places: Indices
     gain: Array
     statistic: Array
-    freedom: NDArray[np.int64]
+    freedom: Indices
     amounts: Array
 
 
@@ -171,7 +167,7 @@ def evidence_of_scale(values: Array, information: Array) -> Array:
     return np.asarray(logsumexp(gains, axis=0) - np.log(len(_RATIOS)))
 
 
-def free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan:
+def free_scan(places: Indices, gram: Array, inner: Array) -> FreeScan:
     """Statistics of groups of parameters.
 
     Args:
@@ -180,7 +176,7 @@ def free_scan(places: NDArray[np.int64], gram: Array, inner: Array) -> FreeScan:
         inner: signatures times residual, [place, block, p].
     """
     values, vectors = np.linalg.eigh(gram)
-    top = np.maximum(values.max(axis=(1, 2), keepdims=True), 1e-300)
+    top = np.maximum(values.max(axis=(1, 2), keepdims=True), TINY)
     seen = values > 1e-10 * top
     along = np.einsum("kbpq,kbp->kbq", vectors, inner)
     safe = np.where(seen, values, 1.0)

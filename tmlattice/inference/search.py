@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Flags
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Alternative, Detection, alternatives, linear_evidence
-from tmlattice.inference.newton import Fit, Outcome, fit
+from tmlattice.inference.newton import AGAIN, Fit, Outcome, fit
 from tmlattice.inference.problem import Hypothesis, Point, Problem
 from tmlattice.inference.scan import (
     NO_SCAN,
@@ -32,8 +32,6 @@ from tmlattice.inference.scan import (
 )
 
 log = logging.getLogger(__name__)
-
-Flags = NDArray[np.bool_]
 
 
 READINGS_PER_OUTLIER = 10
@@ -422,7 +420,7 @@ def revised(search: Search, state: AnyState, quick: bool = False) -> AnyState:
         quick: once, and only causes that are not the leader of a scan, and kicks against three
             alternatives: all of eight after each choice would take most of the time.
     """
-    for _ in range(1 if quick else 3):
+    for _ in range(1 if quick else AGAIN):
         names = state.names
         for monitor in list(state.monitors):
             state = _monitor_revised(search, state, monitor)

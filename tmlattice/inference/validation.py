@@ -8,15 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import TINY, Array
 from tmlattice.inference import chi2
-
-Array = NDArray[np.float64]
-
-DETERMINED = 5.0
-"""Standard errors of a gap from which on the share that is explained is determined, to a fifth."""
+from tmlattice.inference.judgement import SIGNIFICANT
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,7 @@ def cross_predicted(
     # weighted by the noise alone: nuisances also absorb model errors near these readings
     weighed = fitted.slopes / fitted.sigma[:, None] ** 2
     information = fitted.slopes.T @ weighed + np.diag(known)
-    size = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    size = np.sqrt(np.maximum(np.diagonal(information), TINY))
     inverse = np.linalg.pinv(information / size[:, None] / size) / size[:, None] / size
     gain = inverse @ weighed.T  # nuisance per reading
     moved = gain @ fitted.left + inverse @ (known * offset)
@@ -184,7 +180,7 @@ def _explained(
     spread_bottom = 2 * twice + 4 * max(float(one.residual @ moved_one) - twice, 0.0)
     spread_top = 2 * twice + 4 * max(float(other.residual @ moved_other) - twice, 0.0)
     shared = 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
-    if bottom < DETERMINED * np.sqrt(spread_bottom):
+    if bottom < SIGNIFICANT * np.sqrt(spread_bottom):
         return None, None
     left = max(top, 0.0) / bottom
     variance = (spread_top + left**2 * spread_bottom - 2 * left * shared) / bottom**2

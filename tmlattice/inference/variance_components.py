@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 
-Array = NDArray[np.float64]
+from tmlattice.arrays import TINY, Array, Flags
+from tmlattice.inference.newton import ITERATIONS
+from tmlattice.inference.priors import MAX_STEP, SCALE_SPREAD
 
 COMMON_SPREAD = 1.5
 """rms of the common log scale: machines differ by factors of five."""
@@ -23,11 +24,7 @@ COMMON_SPREAD = 1.5
 FAMILY_SPREAD = 0.7
 """rms of one family's log scale relative to the others: by factors of two."""
 
-NOISE_SPREAD = 2.0
-"""rms of the log scale of a noise that is a first guess."""
 
-STEPS = 20
-LARGEST = 1.5  # of a step, in the logarithm
 MIN_GAIN = 0.5
 """Gain of log likelihood below which the iteration ends: steps converge quadratically."""
 
@@ -57,7 +54,7 @@ class VarianceComponents:
 
 
 def fit_variance_components(
-    rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[NDArray[np.bool_]] = ()
+    rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[Flags] = ()
 ) -> VarianceComponents:
     """Return the most probable scales of families of distributed errors.
 
@@ -81,9 +78,9 @@ def fit_variance_components(
     size = np.zeros(len(parts))
     now = _state(clean, base, parts, size, precision)
     damping = 1e-3
-    for _ in range(STEPS):
+    for _ in range(ITERATIONS):
         step = np.linalg.solve(now.information + damping * np.eye(len(size)), now.slope)
-        step *= min(1.0, LARGEST / np.abs(step).max(initial=1e-300))
+        step *= min(1.0, MAX_STEP / np.abs(step).max(initial=TINY))
         trial = _state(clean, base, parts, size + step, precision)
         if trial.value <= now.value + 1e-9:
             if damping > 1e3 or np.abs(step).max(initial=0.0) < 0.02:
@@ -120,7 +117,7 @@ def _prior(families: int, noise: int) -> Array:
     )
     precision = np.zeros((families + noise,) * 2)
     precision[:families, :families] = np.linalg.inv(covariance)
-    precision[families:, families:] = np.eye(noise) / NOISE_SPREAD**2
+    precision[families:, families:] = np.eye(noise) / SCALE_SPREAD**2
     return precision
 
 

@@ -22,20 +22,15 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, eigh
 
+from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.inference.normal import inverse_of_lower, lower_factor
-
-Array = NDArray[np.float64]
 
 EXACT = 1e-12
 """m, rad or relative: rms of a launch coordinate that is known exactly."""
-
 ROUNDING = 1e-13
 """Share of a direction below which it is rounding, given the directions before it."""
-
-
 SMALLEST_SHARE = 1e-12
 """Share of the largest variance below which a variance is rounding."""
 
@@ -131,7 +126,7 @@ def directions_of(spread: Array) -> tuple[Array, Array]:
         values, vectors = eigh(spread.T @ spread, overwrite_a=True, check_finite=False)
         return np.maximum(values, 0.0), vectors.T
     values, vectors = eigh(spread @ spread.T, overwrite_a=True, check_finite=False)
-    kept = values > SMALLEST_SHARE * values.max(initial=1e-300)
+    kept = values > SMALLEST_SHARE * values.max(initial=TINY)
     values = values[kept]
     return values, (vectors[:, kept] / np.sqrt(values)).T @ spread
 
@@ -140,7 +135,7 @@ class Readings(Protocol):
     """Data of a whitening, see `observe.data.Data`."""
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Flags:
         """Valid readings, [shot, reading, 2]."""
 
     @property
@@ -161,14 +156,13 @@ class Whitening:
 
     Args:
         data: readings and their noise, launches and their priors.
-        background: tau_h s_h of every distributed error, [error, shot, reading, 2], m, or None.
 
     Attributes:
         columns: free coordinates of the launch.
         rows: length of a whitened vector.
     """
 
-    def __init__(self, data: Readings, background: Array | None = None) -> None:
+    def __init__(self, data: Readings) -> None:
         self.weight = np.where(data.valid, 1.0 / data.sigma, 0.0)
         self.shots = len(data.valid)
         sigma = np.maximum(data.launch_sigma, EXACT)
@@ -178,10 +172,6 @@ class Whitening:
         self._nominal = data.launches
         self.rows = self.shots * (self.weight[0].size + 5)
         self._inverse: Array | None = None  # of the Cholesky factor: faster than solving
-        if background is not None and len(background):
-            B = (self.weight * background).reshape(len(background), -1)
-            # without rows of zeros
-            self._inverse = inverse_root(B[B.any(axis=1)]).matrix
 
     def correlated(self, root: Array) -> "Whitening":
         """Return the whitening of readings that distributed errors correlate.
@@ -288,19 +278,12 @@ class Projection:
             kept = s > ROUNDING * max(directions.shape[1:])
             self.Q = U * kept[:, None]
             R = (s * kept)[..., None] * V * scale
-            seen = np.where(kept, s, 1.0) * scale[:, 0]
         self._blocks = list(zip(self.Q, R, strict=True))
-        self._log_seen = float(np.log(np.maximum(seen, 1e-300)).sum())
 
     @property
     def rows(self) -> int:
         """Number of rows."""
         return sum(len(Q) for Q, _ in self._blocks)
-
-    @property
-    def log_volume(self) -> float:
-        """Log root of the determinant of the launches' covariance, without invisible directions."""
-        return -self._log_seen
 
     def _split(self, rows: Array) -> Iterator[tuple[Array, Array, slice]]:
         """Rows [data, row] of each block with directions, these, and where they are."""
@@ -348,7 +331,6 @@ class Blocks(Projection):
 
     def __init__(self, parts: Sequence[Projection]) -> None:
         self._blocks = [block for part in parts for block in part._blocks]
-        self._log_seen = sum(part._log_seen for part in parts)
         self.sizes = [part.rows for part in parts]
 
     def split(self, rows: Array) -> list[Array]:

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import CORRECTORS, Columns, ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.effects import CATALOGUE, Cause, apply, check, find, monitors_with
@@ -13,11 +13,8 @@ from tmlattice.errors import EffectError, MeasurementError, TmlatticeError
 from tmlattice.files import output_file, write_json
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import located, read_document
+from tmlattice.observe.orbit_response import DELTA
 
-Array = NDArray[np.float64]
-
-ENERGY = 1e-3
-"""Energy step of the differences for an energy spread."""
 FORMAT = "tmlattice-calibration"
 CALIBRATES = tuple(name for name, effect in CATALOGUE.items() if effect.calibrates)
 """Effects in a calibration file."""
@@ -248,8 +245,8 @@ def _of_centroid(
     square = sum(cause.amount**2 for cause in causes if cause.effect == "energy_spread")
     if not square:
         return one
-    up, down = (response(model.at_energy(side * ENERGY)) for side in (1, -1))
-    return np.asarray(one + square / ENERGY**2 * ((up + down) / 2 - one))
+    up, down = (response(model.at_energy(side * DELTA)) for side in (1, -1))
+    return np.asarray(one + square / DELTA**2 * ((up + down) / 2 - one))
 
 
 def _check(causes: Iterable[Cause]) -> None:

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, ComplexArray
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import modelled
 from tmlattice.errors import MeasurementError
@@ -26,16 +27,16 @@ from tmlattice.measurement.assume import assume, read_of
 from tmlattice.measurement.shots import FEWEST
 from tmlattice.observe.global_errors import Names, Search, Verdict
 from tmlattice.observe.orbits import closed_orbits, dispersion
+from tmlattice.observe.response_data import NO_RF
 from tmlattice.observe.response_data import read as read_rf
 from tmlattice.observe.sections import mean_pass
 from tmlattice.observe.steady import NOTHING
 from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
 from tmlattice.optics import ring_tunes
 
-Array = NDArray[np.float64]
-
-USUAL = 0.01
-"""Mean square misfit of a column by usual errors, relative to the column: a tenth squared."""
+USUAL = 0.1
+"""Relative misfit of a column by usual errors; distance of a tune from the design's that counts as
+a misfit of 1, of which usual errors leave a third."""
 GAIN = 2.5
 """Mean fall of the log misfit that the changed columns need."""
 OF_RF = 1.4
@@ -52,10 +53,6 @@ SHARE = 0.8
 """Share of the changed columns that an assumption must improve."""
 ANOTHER = 1.0
 """Misfit of the typical column above which the data are of another ring."""
-TUNE = 0.1
-"""Distance of a tune from the design's that counts as a misfit of 1; usual errors leave a third."""
-TINY = 1e-6
-"""Relative RF step used in place of a step of 1."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +101,7 @@ class Compared(Search):
         found = []
         for names in self.candidates():
             other, of_rf = self.misfit(names), names[0].startswith("rf")
-            change = np.log((other + USUAL) / (stated + USUAL))
+            change = np.log((other + USUAL**2) / (stated + USUAL**2))
             moved = np.abs(np.nan_to_num(change)) > np.log(2.0)
             few = moved.sum() < (1 if of_rf else self.least)
             if few or (change[moved] < 0).mean() < SHARE:
@@ -181,7 +178,7 @@ class OfResponse(OfColumns):
                 )
         order = {name: i for i, name in enumerate(model.monitors)}
         at = [order[self.ring[name].name] for name in data.monitors]
-        of_rf = model.rf_change(TINY)[at] / TINY if self.stepped else np.zeros((len(at), 2))
+        of_rf = model.rf_change(NO_RF)[at] / NO_RF if self.stepped else np.zeros((len(at), 2))
         return np.asarray(model.response(data.correctors))[:, at], of_rf
 
     def pairs(self, data: OrbitResponse) -> tuple[Any, Any, Any]:
@@ -320,7 +317,7 @@ class OfLines(Compared):
         return np.where(size > 0, 2 * left, np.nan).ravel()
 
     @staticmethod
-    def _size(lines: NDArray[np.complex128]) -> Array:
+    def _size(lines: ComplexArray) -> Array:
         return np.asarray((np.abs(lines) ** 2).sum(axis=(2, 3)))
 
     def _changed(self, names: Names) -> NDArray[np.intp]:
@@ -355,7 +352,7 @@ class OfTunes(Compared):
 
     def shown(self, misfit: float) -> str:
         """A misfit for a sentence."""
-        return f"{TUNE * np.sqrt(misfit):.4f}"
+        return f"{USUAL * np.sqrt(misfit):.4f}"
 
     @property
     def tunes(self) -> Sequence[str]:
@@ -364,10 +361,10 @@ class OfTunes(Compared):
         return [f"Qx = {x:.4f}, Qy = {y:.4f}; '{self.ring.name}' has {qx:.4f} and {qy:.4f}"]
 
     def misfit(self, names: Names = ()) -> Array:
-        """Square of the larger distance from the design's, in units of `TUNE`, [1]."""
+        """Square of the larger distance from the design's, in units of `USUAL`, [1]."""
         read = np.nanmedian(self.assumed(names).tune % 1, axis=0)
         apart = np.abs((read - self.design + 0.5) % 1 - 0.5)
-        return np.array([np.nanmax(apart) ** 2 / TUNE**2])
+        return np.array([np.nanmax(apart) ** 2 / USUAL**2])
 
 
 def compared(ring: Ring, data: Any, lines: ManyTurns | None = None) -> Compared:

@@ -11,30 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
+from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.metric import Hypothesis
-from tmlattice.inference.newton import fit
+from tmlattice.inference.newton import ITERATIONS, fit
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.validation import Half, HeldOut, cross_predicted
 from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-COORDINATES = 2
-"""Coordinates of a launch in one plane."""
-MIN_FIXED = 10
-"""Number of fixed causes above which they are built into the model."""
-MIN_READINGS = 20
-"""Readings of a median, at least."""
-STEPS = 24
-"""Steps of a fit of launches, at most: without readings in a plane they act by their squares."""
+from tmlattice.observe.sections import TWO
+from tmlattice.observe.stored import MAX_CHANGES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +77,7 @@ class FirstTurns(Problem):
         for cause in causes:
             of_model = isinstance(find(cause.effect), RingEffect | ReadingEffect)
             (built if of_model else rest).append(cause)
-        if len(built) < MIN_FIXED and self.alone:
+        if len(built) < MAX_CHANGES and self.alone:
             return super().with_fixed(causes)
         return replace(self, model=self.model.knowing(built), fixed=(*self.fixed, *rest))
 
@@ -213,7 +204,7 @@ class FirstTurns(Problem):
         """[shot, reading, 2]."""
         return self.data.valid
 
-    def owner(self) -> NDArray[np.int64]:
+    def owner(self) -> Indices:
         """Monitor of each reading."""
         one = np.tile(np.arange(len(self.monitors)), self.data.turns)
         return np.broadcast_to(one[None, :, None], self.valid.shape)
@@ -244,7 +235,7 @@ class FirstTurns(Problem):
         """Median misfit of each reading with the prediction from the two monitors before it."""
         left = local_misfit(self.data, point.view) / self.data.sigma
         left = np.abs(left[np.isfinite(left)])
-        return float(np.median(left)) if len(left) > MIN_READINGS else 0.0
+        return float(np.median(left)) if len(left) > ENOUGH else 0.0
 
     def left(self, point: Point) -> tuple[Array, Array]:
         """Residuals and their variances, reduced by the fitted launch."""
@@ -281,7 +272,7 @@ def held_out_residuals(problem: FirstTurns, unknown: Array | None = None) -> Hel
     data = problem.data
     odd = problem.owner() % 2 == 1
     fitted = problem.without(odd)
-    point = fit(fitted, (), fitted.first, steps=STEPS).point
+    point = fit(fitted, (), fitted.first, steps=ITERATIONS).point
     residuals = np.full(data.valid.shape, np.nan)
     if point.projection is None:
         return HeldOut(residuals, ())
@@ -319,7 +310,7 @@ def _bounded(data: Data, model: Model) -> Data:
     plane.
     """
     count = data.valid.sum(axis=1)  # [shot, plane]
-    few = np.repeat(count < COORDINATES, 2, axis=1)
+    few = np.repeat(count < TWO, 2, axis=1)
     if not (few & ~np.isfinite(data.launch_sigma[:, :4])).any():
         return data
     square = np.where(data.valid, data.readings**2, 0.0).sum(axis=(1, 2))

@@ -21,24 +21,24 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices
 from tmlattice.effects import Cause, Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.observe.sections import (
     DIVERGED_SIGMA,
-    Flags,
     Passes,
     SectionFits,
     Sections,
     distance,
     log_uncertainty,
     mean_pass,
+    scaled,
 )
-
-Array = NDArray[np.float64]
 
 SHOTS, TURNS = 8, 3
 """Shots and turns that are used: a global error is in each."""
@@ -51,8 +51,6 @@ NOISE_WIDTH = np.log(3.0)
 """Uncertainty of a stated noise: a factor of three, one standard deviation."""
 ORBIT, ORBIT_WIDTH = 1e-3, np.log(10.0)
 """m; usual orbit of first turns, to a factor of ten, one standard deviation."""
-ALIKE = 3.0
-"""Log evidence below which two assumptions are equivalent."""
 _LAST = ("noise-from-data", "launches-unknown", "readings-doubled", "readings-halved")
 """Not tried: other assumptions include the first two, and distributed errors mimic a factor of two.
 """
@@ -69,8 +67,6 @@ measurement of `benchmarks/data_checks.py` gains as much."""
 ERRORS = 4.0
 """Independent numbers by which a fault changes what is read in a section, or at a joint, whatever
 the number of shots: a kick and a gradient in each plane."""
-SINGULAR = 1e-9
-"""Smallest relative variance of mismatches by noise."""
 KICKS = np.append(0.0, 10.0 ** np.arange(0, 11))
 """Variances of distributed kicks that are tried: of a section's typical reading, over its noise's.
 """
@@ -118,7 +114,7 @@ class Split:
     @classmethod
     def of(
         cls, miss: Array, spread: Array, kicked: Array, there: Flags,
-        freedom: Array | NDArray[np.int64], errors: float = ERRORS,
+        freedom: Array | Indices, errors: float = ERRORS,
     ) -> "Split":  # fmt: skip
         """Split mismatches.
 
@@ -150,10 +146,9 @@ class Split:
             square: variance of the noise, in units of the stated one.
             kicks: variances of the kicks, in units of the noise's variance.
         """
-        size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("tii->ti", self.spread)), 1e-60))
-        even = np.nan_to_num(self.spread / size[..., None] / size[:, None], posinf=0, neginf=0)
+        size, even = scaled(self.spread)
         width, axes = np.linalg.eigh(even)
-        back = np.swapaxes(axes / np.sqrt(np.maximum(width, SINGULAR))[:, None], 1, 2)
+        back = np.swapaxes(axes / np.sqrt(np.maximum(width, INVISIBLE))[:, None], 1, 2)
         kicked = back @ np.nan_to_num(self.kicked / size[..., None], posinf=0, neginf=0)
         by_kicks, axes = np.linalg.eigh(kicked @ np.swapaxes(kicked, 1, 2))
         limit = DIVERGED_SIGMA
@@ -258,7 +253,7 @@ class Search:
             return None
         order = list(ASSUMPTIONS)
         best = max(own.worth for own in found)
-        alike = [own for own in found if own.worth > best - ALIKE]
+        alike = [own for own in found if own.worth > best - DEFAULT.behind]
         first = min(alike, key=lambda own: [order.index(name) for name in own.names])
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
 
@@ -404,7 +399,7 @@ class OfTurns(Search):
         if data.noise is not None:
             ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
         noise = np.log(ratio * np.sqrt(square)) / NOISE_WIDTH if data.noise is not None else 0.0
-        orbit = np.log(max(_size(data), 1e-30) / ORBIT) / ORBIT_WIDTH
+        orbit = np.log(max(_size(data), TINY) / ORBIT) / ORBIT_WIDTH
         moved = (sections.kicked**2).sum(axis=2)  # none where nothing was read
         kicks = KICKS / np.median(moved[moved > 0]) if moved.any() else KICKS[:1]
         parts = [own.cost(square, kicks) for own in (sections, *joints)]

@@ -12,14 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dct, idct
 
+from tmlattice.arrays import REDUNDANT, TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.harmonics import frequency as strongest
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
 
 WIDEST = 0.05
 """Largest half width of a line, in tune: the envelope of a beam that decoheres in 10 turns."""
@@ -29,9 +25,6 @@ ROUNDS = 4
 """Rounds of the alternation: it starts within the noise of its end, and three reach it."""
 QUIETEST = 0.1
 """Smallest noise of a signal over the typical one, so that none dominates."""
-TINY = 1e-30
-_SMALL = 1e-6
-"""Smallest eigenvalue: one monitor cannot separate the quadratures of a turn; the band does."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +51,7 @@ class LineFit:
 
 
 def fit_lines(
-    data: Array, there: Mask, frequencies: Sequence[float], noise: Array, *,
+    data: Array, there: Flags, frequencies: Sequence[float], noise: Array, *,
     broad: int, span: int, rounds: int = ROUNDS,
 ) -> LineFit:  # fmt: skip
     """Fit lines near given frequencies to all signals at once.
@@ -118,7 +111,7 @@ def fit_lines(
 def least_squares(
     basis: Array,
     data: Array,
-    there: Mask,
+    there: Flags,
     weights: Array | None = None,
     prior: float = 0.0,
 ) -> tuple[Array, Array]:
@@ -153,7 +146,8 @@ def least_squares(
 
 
 def _inverse(normal: Array) -> Array:
-    return np.asarray(np.linalg.pinv(normal, rcond=_SMALL, hermitian=True))
+    # one monitor cannot separate the quadratures of a turn; the band does
+    return np.asarray(np.linalg.pinv(normal, rcond=REDUNDANT, hermitian=True))
 
 
 def _quadratures(values: ComplexArray) -> Array:
@@ -172,7 +166,7 @@ def _widths(lines: Array, broad: int) -> Array:
     return np.asarray(np.minimum(most, 0.45 * np.minimum(next_one, mirror)))
 
 
-def _cosines(width: Array | float, turns: int) -> NDArray[np.int64]:
+def _cosines(width: Array | float, turns: int) -> Indices:
     """Number of cosines of the turns within a width."""
     return np.maximum(1, np.round(2 * np.asarray(width) * turns)).astype(np.int64)
 
@@ -236,9 +230,9 @@ def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
 
     def statistical(power: Array) -> float:
         own = turn[: len(power)]
-        middle = (power * own).sum() / max(power.sum(), 1e-300)
+        middle = (power * own).sum() / max(power.sum(), TINY)
         lever = (power * (own - middle) ** 2).sum()
-        return float(variance / max(lever, 1e-300) / (2 * np.pi) ** 2)
+        return float(variance / max(lever, TINY) / (2 * np.pi) ** 2)
 
     middle = int(np.searchsorted(np.cumsum(power), power.sum() / 2))
     halves = [slice(0, middle), slice(middle, len(power))]  # of the power
@@ -247,29 +241,29 @@ def _shift(envelope: ComplexArray, variance: float) -> tuple[float, float]:
     drift = max((peaks[0] - peaks[1]) ** 2 - 9 * expected, 0.0) / 4
     peak, mean = _peak(np.abs(envelope) * envelope), growth(envelope).imag / (2 * np.pi)
     noise = (np.abs(np.gradient(envelope)) ** 2).sum() + power[0] + power[-1]
-    noise *= variance / max(2 * np.pi * power.sum(), 1e-300) ** 2
+    noise *= variance / max(2 * np.pi * power.sum(), TINY) ** 2
     if (peak - mean) ** 2 > 9 * noise:
         return mean, float(np.sqrt(noise + drift))
     return peak, float(np.sqrt(statistical(power) + drift))
 
 
-MIN_TURNS = 64
-"""Turns of which half determine a change."""
+LONG = 64
+"""Turns of which half determine a change, and that resolve the floor between lines."""
 
 
 def floor(fit: LineFit) -> Array:
     """Noise over the rms of the residual, [signal]: 1 unless lines remain, as sextupoles make them
     of a large oscillation. Lines fill few frequencies: the spectrum's median shows the noise."""
     turns = fit.residual.shape[1]
-    if turns < 2 * MIN_TURNS:
+    if turns < 2 * LONG:
         return np.ones(len(fit.residual))
     window = np.hanning(turns + 2)[1:-1]
     power = np.abs(np.fft.rfft(fit.residual * window)[:, 1:]) ** 2
-    mean = np.maximum(power.mean(axis=1), 1e-300)
+    mean = np.maximum(power.mean(axis=1), TINY)
     return np.asarray(np.sqrt(np.median(power, axis=1) / np.log(2) / mean))
 
 
-def noise_at(fit: LineFit, line: int, quiet: Array, planes: NDArray[np.int64]) -> Array:
+def noise_at(fit: LineFit, line: int, quiet: Array, planes: Indices) -> Array:
     """Noise at a line over that at all frequencies and turns, at least 1; of the typical signal of
     each plane, [signal]. Lines near this one may be in one plane alone.
 
@@ -284,7 +278,7 @@ def noise_at(fit: LineFit, line: int, quiet: Array, planes: NDArray[np.int64]) -
     turns = fit.envelope.shape[1]
     envelope = np.abs(fit.envelope[line])
     power = np.abs(np.fft.rfft(fit.residual * envelope)) ** 2
-    power /= np.maximum(quiet**2 * (envelope**2).sum(), 1e-300)[:, None]
+    power /= np.maximum(quiet**2 * (envelope**2).sum(), TINY)[:, None]
     wide = round(2 * turns * (envelope**4).sum() / (envelope**2).sum() ** 2)
     away = np.abs(np.arange(power.shape[1]) - round(fit.frequency[line] * turns))
     away[0] = turns  # the offset
@@ -318,7 +312,7 @@ def without(fit: LineFit, changes: ComplexArray) -> LineFit:
     return replace(fit, residual=residual)
 
 
-def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
+def change(fit: LineFit, line: int, planes: Indices) -> Array:
     """Change of amplitudes between the first and the last half of a line's power, [signal].
 
     Where amplitude and energy shape the optics, the particles that decohere last have other ratios
@@ -328,7 +322,7 @@ def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
     """
     turns = fit.envelope.shape[1]
     found = np.zeros(len(planes))
-    if turns < MIN_TURNS:
+    if turns < LONG:
         return found
     envelope = fit.envelope[line]
     moving = envelope * np.exp(2j * np.pi * fit.frequency[line] * np.arange(turns))
@@ -359,4 +353,4 @@ def change(fit: LineFit, line: int, planes: NDArray[np.int64]) -> Array:
 def growth(envelope: ComplexArray) -> complex:
     """Growth of an envelope per turn, averaged over the line's power."""
     power = (np.abs(envelope) ** 2).sum()
-    return complex(np.vdot(envelope, np.gradient(envelope)) / max(power, 1e-300))
+    return complex(np.vdot(envelope, np.gradient(envelope)) / max(power, TINY))

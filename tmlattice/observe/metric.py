@@ -10,19 +10,12 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model, Paths
 from tmlattice.effects import ReadingEffect, find
-from tmlattice.inference.metric import Hypothesis, Indices, Metric, Products
+from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.whitening import Projection, Whitening
-
-Array = NDArray[np.float64]
-
-MAX_NUMBERS = 20_000_000
-"""Numbers of signatures in memory: with many shots, fewer hypotheses at a time."""
-KICKS = 128
-"""Layers at a time, of free kicks."""
 
 
 def behind(values: Array) -> Array:
@@ -47,7 +40,7 @@ class TurnMetric(Metric):
         launches: Array,
         whitening: Whitening,
         projection: Projection,
-        active: NDArray[np.bool_],
+        active: Flags,
     ) -> None:
         super().__init__(projection)
         self.model, self.paths, self.launches = model, paths, launches
@@ -55,7 +48,6 @@ class TurnMetric(Metric):
         self.active = active
         self.shots = np.flatnonzero(active)
         self.weight = whitening.weight * active[:, None, None]
-        self.chunk = int(np.clip(MAX_NUMBERS // self.weight.size, 1, Metric.chunk))
 
     # --- named hypotheses -----------------------------------------------------------------------
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
@@ -93,7 +85,7 @@ class TurnMetric(Metric):
         return np.asarray(np.nan_to_num(self.model.reading_signatures(self.paths, name)))
 
     # --- what has no name -----------------------------------------------------------------------
-    def free_kicks(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
+    def free_kicks(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """Information of a kick (px, py) in every active shot in the middle of layers' magnets, and
         its product with data.
 
@@ -102,14 +94,14 @@ class TurnMetric(Metric):
             independent.
         """
         grams, inners = [], []
-        count = min(self.chunk, KICKS)
+        count = max(self.chunk // len(self.shots), 1)
         for start in range(0, len(layers), count):
             rows, parts = self._free_rows(layers[start : start + count], clean)
             grams.append(np.einsum("kbpr,kbqr->kbpq", rows, rows, optimize=True))
             inners.append(np.einsum("kbpr,br->kbp", rows, parts, optimize=True))
         return np.concatenate(grams), np.concatenate(inners)
 
-    def _free_rows(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
+    def _free_rows(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """Whitened signatures of free kicks [layer, block, p, row], and data [block, row]."""
         kicked = self.model.kick_signatures(self.paths, layers)
         alone = np.zeros((len(kicked), len(self.shots), *kicked.shape[1:]))
@@ -189,7 +181,7 @@ class IndependentMetric(TurnMetric):
             done.append(which)
         return np.concatenate(done)
 
-    def _free_rows(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
+    def _free_rows(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """Rows of free kicks; each shot is a block, as a kick acts in its own shot."""
         kicked = self.model.kick_signatures(self.paths, layers)
         rows = self.projection.out(self.whitening.signature(kicked))
@@ -287,7 +279,7 @@ class DenseMetric(TurnMetric):
             done.append(which)
         return np.concatenate(done)
 
-    def free_kicks(self, layers: NDArray[np.int64], clean: Array) -> tuple[Array, Array]:
+    def free_kicks(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """One block for all shots: the background correlates them."""
         first, launch_kick = self.model.free_kicks(self.paths, layers)  # [layer, 2, shot, n]
         sums = behind(np.einsum("smpi,smp->smi", self._slopes, self._data(clean[None])[0]))

@@ -10,15 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array
 from tmlattice.beam.model import Paths
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
+from tmlattice.inference.judgement import ENOUGH, MISSTATED, OUTLIERS
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.data import Data
 from tmlattice.observe.sections import Passes, SectionFits
-
-Array = NDArray[np.float64]
 
 SAME_PLACE = 1e-6
 """m; monitors within this distance are at one place."""
@@ -61,13 +61,14 @@ def estimate(data: Data, paths: Paths) -> Array:
     """rms noise of one reading in x and y, m, [2]; NaN for a plane with too few readings."""
     misfit = local_misfit(data, paths)
     planes = [misfit[:, :, plane][np.isfinite(misfit[:, :, plane])] for plane in (0, 1)]
-    return np.array([chi2.MAD * np.median(np.abs(p)) if len(p) > 20 else np.nan for p in planes])
+    return np.array([chi2.typical(p) if len(p) > ENOUGH else np.nan for p in planes])
 
 
-LEAST_FREEDOM = 2
-"""Shots beyond those absorbed by errors between neighbours, for an estimate."""
-LEAST_READINGS = 8
-"""Readings of the median, at least: with two further shots it is known to a fifth."""
+SCATTER = 2
+"""Passes beyond those absorbed by errors of monitors and magnets: a constant, and a part linear in
+the trajectory in its plane (or in both, with enough passes)."""
+PASSES = 5 + SCATTER
+"""Passes from which errors of both planes are subtracted."""
 
 
 def scatter(data: Data, paths: Paths) -> Array:
@@ -87,28 +88,27 @@ def scatter(data: Data, paths: Paths) -> Array:
         for i in range(1, misfit.shape[1]):
             there = np.isfinite(misfit[:, i, plane])
             count = int(there.sum())
-            both = count >= 5 + LEAST_FREEDOM  # the other plane too, with enough shots
+            both = count >= PASSES  # the other plane too, with enough shots
             columns = 4 if both else 2
             freedom = count - columns - 1
-            if freedom < LEAST_FREEDOM:
+            if freedom < SCATTER:
                 continue
             linear = orbit[there, i - 1 : i + 1][:, :, slice(None) if both else plane]
-            fixed = np.column_stack([np.ones(count), linear.reshape(count, columns)])
-            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), 1e-30)
-            left = misfit[there, i, plane]
-            left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
+            square = _scattered(misfit[there, i, plane], linear.reshape(count, columns))
             usual = float(chi2.median_per_freedom(freedom))
-            variances[plane].append(float(np.sum(left**2)) / freedom / usual)
+            variances[plane].append(square / freedom / usual)
     return np.array([
-        np.sqrt(np.median(own)) if len(own) >= LEAST_READINGS else np.nan for own in variances
+        np.sqrt(np.median(own)) if len(own) >= ENOUGH else np.nan for own in variances
     ])  # fmt: skip
 
 
-SCATTER = 3
-"""Passes beyond those absorbed by errors of monitors and magnets: a constant, and a part linear in
-the trajectory in its plane (or in both, with enough passes)."""
-PASSES = 5 + SCATTER
-"""Passes from which errors of both planes are subtracted."""
+def _scattered(left: Array, linear: Array) -> float:
+    """Sum of squares beyond a constant and a part that is linear in columns, [row, column]."""
+    fixed = np.column_stack([np.ones(len(left)), linear])
+    fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), TINY)
+    return float(np.sum((left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]) ** 2))
+
+
 IN_PROPORTION = 0.015
 """Share of the orbit that unknown errors leave in proportion to what is not subtracted."""
 
@@ -122,7 +122,7 @@ def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
     """
     count = len(found.left)
     both = count >= PASSES
-    if count < 3 + SCATTER - 1:
+    if count < 3 + SCATTER:
         return None
     ratios = []
     for w in range(found.left.shape[1]):
@@ -130,13 +130,11 @@ def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
             if not found.there[:, w, reading].all() or (found.freedom[:, w] < 2).any():
                 continue
             plane = slice(0, 4) if both else slice(2 * (reading % 2), 2 * (reading % 2) + 2)
-            fixed = np.column_stack([np.ones(count), found.start[:, w, plane]])
-            fixed = fixed / np.maximum(np.abs(fixed).max(axis=0), 1e-30)
-            left = found.left[:, w, reading]
-            left = left - fixed @ np.linalg.lstsq(fixed, left, rcond=None)[0]
+            linear = found.start[:, w, plane]
             share = found.freedom[:, w].mean() / found.there[:, w].sum(axis=1).mean()
-            ratios.append(float(np.sum(left**2) / (count - fixed.shape[1]) / share))
-    if len(ratios) < 8:
+            square = _scattered(found.left[:, w, reading], linear)
+            ratios.append(float(square / (count - 1 - linear.shape[1]) / share))
+    if len(ratios) < ENOUGH:
         return None
     random = float(np.sqrt(np.median(ratios)))
     orbit = float(np.sqrt(np.nanmean(passes.readings**2)))
@@ -147,12 +145,6 @@ def noise_scatter(passes: Passes, found: SectionFits) -> float | None:
 
 NEIGHBOURS = 4
 """Neighbours of a monitor: two for the orbit, one for the energy, one more."""
-SPARE = 2
-"""Columns over neighbours, at least, for a fit."""
-WRONG = 0.1
-"""Share of the columns that may be outliers."""
-OVERSTATED = 3.0
-"""Ratio to the estimate above which stated noise is too large, or includes beam jitter."""
 
 
 class Places(NamedTuple):
@@ -239,7 +231,7 @@ def overstated(ring: Ring, measured: OrbitResponse) -> bool:
     """Whether the noise stated in one plane is far above the estimate from neighbours: it includes
     beam jitter, which neighbours share, or is wrong."""
     both = stated_and_estimated(ring, measured)
-    return both is not None and bool((both[0] > OVERSTATED * both[1]).any())
+    return both is not None and bool((both[0] > MISSTATED * both[1]).any())
 
 
 def _residual_noise(read: Array, s: Array, kicked: Array, length: float) -> float:
@@ -256,14 +248,14 @@ def _residual_noise(read: Array, s: Array, kicked: Array, length: float) -> floa
         at = (m + np.arange(-(NEIGHBOURS // 2), NEIGHBOURS // 2 + 1)) % len(s)
         among = (kicked - s[at[0]]) % length <= (s[at[-1]] - s[at[0]]) % length
         rows = ~among & np.isfinite(read[:, at]).all(axis=1)
-        if rows.sum() < SPARE * NEIGHBOURS:
+        if rows.sum() < ENOUGH:
             continue
         others, own = read[rows][:, np.delete(at, NEIGHBOURS // 2)], read[rows, m]
         kept = np.ones(len(own), dtype=bool)
         for _ in range(3):
             rule = np.linalg.lstsq(others[kept], own[kept], rcond=None)[0]
             miss = np.abs(own - others @ rule)
-            kept = miss <= np.quantile(miss, 1 - WRONG)
+            kept = miss <= np.quantile(miss, 1 - OUTLIERS)
         freedom = (kept.sum() - NEIGHBOURS) / kept.sum()
-        left.append(np.median(miss) * chi2.MAD / np.sqrt(freedom * (1 + rule @ rule)))
+        left.append(chi2.typical(miss) / np.sqrt(freedom * (1 + rule @ rule)))
     return float(np.median(left)) if left else float("nan")

@@ -12,17 +12,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
 from tmlattice.errors import EffectError, UnstableRingError
 from tmlattice.observe.response_data import ResponseData
+from tmlattice.observe.stored import SMALL
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Hypothesis = tuple[str, str | None]
 
 DELTA = 1e-3
@@ -30,8 +29,6 @@ DELTA = 1e-3
 spread."""
 TURN = 0.1
 """Roll with which a corrector's kick in the other plane is computed, rad."""
-SMALL = 1e-3
-"""Step of the differences, as a share of a monitor's largest error."""
 MIN_KICK = 0.1
 """Kick over the set one below which a corrector's plane is undetermined."""
 

@@ -10,16 +10,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.stored import Moved
 from tmlattice.effects import Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion
 from tmlattice.observe.stored import Stored, rf_of, stacked
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,19 +11,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError, UnstableRingError
+from tmlattice.inference.judgement import FEW
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
-
-MIN_SHARED = 3
-"""Common monitors, and correctors, at least."""
 
 
 def alike(
@@ -42,7 +38,7 @@ def alike(
     for what, own, all_of in (
         ("correctors", columns, after.correctors), ("BPMs", monitors, after.monitors),
     ):  # fmt: skip
-        if len(own) < max(MIN_SHARED, len(all_of) // 4):
+        if len(own) < max(FEW, len(all_of) // 4):
             raise MeasurementError(
                 f"the reference shares {len(own)} of {len(all_of)} {what}: it is not of this "
                 "machine; give one with the same names"

@@ -15,16 +15,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import INVISIBLE, Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference.judgement import ENOUGH
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.noise import completed
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 NO_RF = 1e-6
 """Relative RF step for a measurement without one: its orbit is missing."""
@@ -145,15 +143,11 @@ def _computed(data: ResponseData) -> bool:
     return of_design(data.orbits[-1], design, data.noise)
 
 
-SAME = 1e-9
-"""Share of the largest reading within which two numbers are the same computed one."""
 MAX_DISTINCT, MIN_DISTINCT = 0.5, 0.75
 """Share of distinct numbers: at most, in a computed orbit; at least, in the correctors' orbits,
 which have the same number of digits."""
 MAX_MISFIT = 0.05
 """rms misfit over noise that no measured orbit reaches."""
-MIN_MONITORS = 6
-"""Monitors for a decision, at least."""
 
 
 def read(measured: OrbitResponse) -> bool:
@@ -172,7 +166,7 @@ def computed(orbit: Array, response: Array) -> bool:
         response: of the correctors that kick in x, m, [column, monitor].
     """
     columns = [_differ(own) for own in response]
-    if np.isfinite(orbit).sum() < MIN_MONITORS or not columns:
+    if np.isfinite(orbit).sum() < ENOUGH or not columns:
         return False
     return _differ(orbit) <= MAX_DISTINCT and bool(np.median(columns) >= MIN_DISTINCT)
 
@@ -187,7 +181,7 @@ def of_design(orbit: Array, design: Array, noise: Array) -> bool:
     """
     apart = (orbit - design)[:, 0] / noise[:, 0]
     apart = apart[np.isfinite(apart)]
-    return len(apart) >= MIN_MONITORS and bool(np.sqrt(np.mean(apart**2)) < MAX_MISFIT)
+    return len(apart) >= ENOUGH and bool(np.sqrt(np.mean(apart**2)) < MAX_MISFIT)
 
 
 def _differ(read: Array) -> float:
@@ -195,5 +189,5 @@ def _differ(read: Array) -> float:
     there = np.sort(read[np.isfinite(read)])
     if not len(there):
         return 0.0
-    apart = np.diff(there) > SAME * np.abs(there).max()
+    apart = np.diff(there) > INVISIBLE * np.abs(there).max()
     return float(1 + apart.sum()) / len(there)

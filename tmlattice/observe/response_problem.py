@@ -19,16 +19,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import AT_ONCE, Array, Flags, Indices
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
 from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
-from tmlattice.inference.metric import Hypothesis, Indices, Metric, Products
+from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.problem import Point
 from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.steady import MAX_NUMBERS, Steady, SteadyMetric
-
-Array = NDArray[np.float64]
+from tmlattice.observe.steady import Steady, SteadyMetric
 
 
 def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> list[Hypothesis]:
@@ -106,13 +105,9 @@ class Response(Steady):
         """Monitors of the measurement."""
         return self.base.data.measured.monitors
 
-    def owner(self) -> NDArray[np.int64]:
+    def owner(self) -> Indices:
         """Monitor of each reading."""
         return np.broadcast_to(np.arange(self.used.shape[1])[:, None], self.used.shape)
-
-
-AT_ONCE = 128
-"""Errors whose factors are in memory: 17 MB for 330 correctors and 246 monitors."""
 
 
 class ResponseMetric(SteadyMetric):
@@ -141,7 +136,7 @@ class ResponseMetric(SteadyMetric):
         places = np.array([self.point.view.monitor(hypotheses[int(i)][1]) for i in of_monitors])
         used, row = self.problem.used, self._numbered()
         measured = np.flatnonzero(used.any(axis=(0, 2)))
-        count = max(MAX_NUMBERS // max(len(hypotheses) * used[:, 0].size, 1), 1)
+        count = max(AT_ONCE // max(len(hypotheses) * used[:, 0].size, 1), 1)
         for start in range(0, len(measured), count):
             group = measured[start : start + count]
             out = []
@@ -172,8 +167,8 @@ class ResponseMetric(SteadyMetric):
         here = _Here(self.point.view, self.problem.used, self.problem.sigma)
         sums = here.sums(data)
         factors = here.slopes.factors([hypotheses[i] for i in which])
-        for start in range(0, len(which), AT_ONCE):
-            part = which[start : start + AT_ONCE]
+        for start in range(0, len(which), self.chunk):
+            part = which[start : start + self.chunk]
             some = here.read([next(factors) for _ in part])
             found.put(part, here.squares(some), 0.0, some.products(sums))
 
@@ -224,7 +219,7 @@ class _Here:
     """
 
     view: Predicted
-    used: NDArray[np.bool_]
+    used: Flags
     sigma: Array
 
     @property
@@ -263,9 +258,10 @@ class _Here:
     def read_all(self, hypotheses: Sequence[Hypothesis]) -> _Stack:
         """Return the factors of ring errors, formed some at a time."""
         factors = self.slopes.factors(hypotheses)
+        count = max(AT_ONCE // self.used.size, 1)
         parts = [
-            self.read([next(factors) for _ in hypotheses[start : start + AT_ONCE]])
-            for start in range(0, len(hypotheses), AT_ONCE)
+            self.read([next(factors) for _ in hypotheses[start : start + count]])
+            for start in range(0, len(hypotheses), count)
         ]
         return _Stack(*(np.concatenate([getattr(part, name) for part in parts])
                         for name in ("seen", "before", "behind")))  # fmt: skip

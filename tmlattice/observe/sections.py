@@ -18,28 +18,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, Settings
 from tmlattice.inference import chi2
+from tmlattice.inference.newton import ROUNDS, SETTLED
 from tmlattice.lattice import Ring
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
 
-_KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates, without tau
+KEPT = np.array([0, 1, 2, 3, 5])  # of six coordinates, without tau
 WEAK = 1e-8
 """Weight of unmeasured directions of a trajectory, over the strongest direction's."""
-STEPS = 8
-"""Newton steps at most: the maps are nearly linear."""
 TWO = 2
 """Coordinates of a trajectory in a plane, and so readings that determine it."""
 DIVERGED_SIGMA = 1e15
 """Residual in sigma of a trajectory that diverges."""
-SETTLED = 1e-2
-"""Change of the typical reading, in units of its noise or residual, below which no further step is
-made."""
 ENERGY = 5e-3
 """Relative; prior rms of a pass's energy deviation."""
 MOST = 8
@@ -90,8 +85,8 @@ def _five(weights: Sequence[Array]) -> Maps:
     T[..., rows, columns] = W2 / 2
     T = T + np.swapaxes(T, -1, -2)
     if W0.shape[-1] == n:
-        W0, W1, T = W0[..., _KEPT], W1[..., _KEPT, :], T[..., _KEPT, :, :]
-    return Maps(W0, W1[..., _KEPT], T[..., _KEPT, :][..., _KEPT])
+        W0, W1, T = W0[..., KEPT], W1[..., KEPT, :], T[..., KEPT, :, :]
+    return Maps(W0, W1[..., KEPT], T[..., KEPT, :][..., KEPT])
 
 
 def _stacked(several: Sequence[Maps]) -> Maps:
@@ -142,10 +137,10 @@ class SectionFits:
     """
 
     left: Array
-    owner: NDArray[np.int64]
+    owner: Indices
     there: Flags
     free: Array
-    freedom: NDArray[np.int64]
+    freedom: Indices
     misfit: Array
     delta: Array
     start: Array
@@ -172,7 +167,7 @@ class SectionFits:
         if enough.sum() < 3:
             return float("nan")
         part, whole = self._squares(passes)
-        shares = np.sqrt(part / np.maximum(whole, 1e-60))[:, enough]
+        shares = np.sqrt(part / np.maximum(whole, TINY))[:, enough]
         return float(np.median(shares, axis=1).min())
 
     def shares(self, passes: Passes) -> Array:
@@ -180,8 +175,8 @@ class SectionFits:
         [1 + pass, section]; NaN if undetermined."""
         enough = self.freedom > 3
         part, whole = (np.where(enough, own, 0.0) for own in self._squares(passes))
-        together = (part.sum(axis=1) / np.maximum(whole.sum(axis=1), 1e-60)).min(axis=0)
-        each = part.min(axis=0) / np.maximum(whole[0], 1e-60)
+        together = (part.sum(axis=1) / np.maximum(whole.sum(axis=1), TINY)).min(axis=0)
+        each = part.min(axis=0) / np.maximum(whole[0], TINY)
         own = np.sqrt(np.vstack([together, each]))
         return np.where(np.vstack([enough.any(axis=0), enough]), own, np.nan)
 
@@ -209,12 +204,18 @@ def mean_pass(values: Array, there: Flags) -> Array:
     return np.asarray(total / np.maximum(there.sum(axis=0), 1))
 
 
+def scaled(covariance: Array) -> tuple[Array, Array]:
+    """Standard deviations [..., n], and the correlations of covariances [..., n, n]."""
+    size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), TINY))
+    even = covariance / size[..., None] / size[..., None, :]
+    return size, np.nan_to_num(even, posinf=0, neginf=0)
+
+
 def distance(miss: Array, covariance: Array) -> Array:
     """Mean square of a mismatch in units of its covariance, [...]."""
-    size = np.sqrt(np.maximum(np.nan_to_num(np.einsum("...ii->...i", covariance)), 1e-60))
-    even = np.nan_to_num(covariance / size[..., None] / size[..., None, :], posinf=0, neginf=0)
+    size, even = scaled(covariance)
     miss = np.clip(np.nan_to_num(miss / size, nan=DIVERGED_SIGMA), -DIVERGED_SIGMA, DIVERGED_SIGMA)
-    solved = np.linalg.solve(even + 1e-9 * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
+    solved = np.linalg.solve(even + INVISIBLE * np.eye(miss.shape[-1]), miss[..., None])[..., 0]
     return np.asarray(np.einsum("...i,...i->...", miss, solved) / miss.shape[-1])
 
 
@@ -222,7 +223,7 @@ def log_uncertainty(covariance: Array) -> float:
     """Sum of the log root determinants of covariances [..., n, n]."""
     covariance = np.nan_to_num(covariance, nan=1e30, posinf=1e30, neginf=-1e30)
     sign, log = np.linalg.slogdet(covariance)
-    diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), 1e-60)).sum(axis=-1)
+    diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), TINY)).sum(axis=-1)
     return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: use the diagonal
 
 
@@ -328,12 +329,12 @@ class Sections:
         x[..., 4] = passes.delta[:, None]
         moved, by_energy = np.inf, np.zeros((P, W, 4))
         with np.errstate(all="ignore"):
-            for step in range(STEPS):
+            for step in range(ROUNDS):
                 image, slope = maps(x[:, :, None])
                 left = np.where(there, (data - image) / sigma, 0.0).reshape(P, W, -1)
                 A = (slope[..., :4] / sigma[..., None]).reshape(P, W, -1, 4)
                 curvature = _regularised(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
-                if step == STEPS - 1 or not moved > SETTLED:
+                if step == ROUNDS - 1 or not moved > SETTLED:
                     break
                 own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
                 back: Array = np.linalg.solve(curvature, np.swapaxes(A, -1, -2)).astype(float)
@@ -399,7 +400,7 @@ EnergyTerms = tuple[Array, Array, Array]
 """Terms [pass, term] of the energy's equation: their misfit, right side and left side."""
 
 
-def _energy_terms(left: Array, slope: Array, freedom: NDArray[np.int64]) -> EnergyTerms:
+def _energy_terms(left: Array, slope: Array, freedom: Indices) -> EnergyTerms:
     """Terms of readings, projected off the trajectories of their sections."""
     misfit = np.where(freedom > 0, (left**2).sum(axis=2) / np.maximum(freedom, 1), np.inf)
     return misfit, (left * slope).sum(axis=2), (slope**2).sum(axis=2)
@@ -416,9 +417,9 @@ def _joints(
     slope = np.nan_to_num(drift[:, 1:] - pushed[:, :-1])
     carried = J @ covariance @ np.swapaxes(J, -1, -2)
     spread = np.nan_to_num(covariance[:, 1:] + carried[:, :-1])
-    size = np.sqrt(np.maximum(np.einsum("...ii->...i", spread), 1e-60))
-    even = spread / size[..., None] / size[..., None, :] + 1e-9 * np.eye(4)
-    both = np.linalg.solve(even, np.stack([miss / size, slope / size], axis=-1))
+    size, even = scaled(spread)
+    right = np.stack([miss / size, slope / size], axis=-1)
+    both = np.linalg.solve(even + INVISIBLE * np.eye(4), right)
     misfit = (both[..., 0] * miss / size).sum(axis=-1) / 4
     return (
         misfit,
@@ -453,9 +454,7 @@ def _common_energy(
     return np.full(count, asked.sum() / known.sum()), np.full(count, known.sum())
 
 
-def _prior_precision(
-    passes: Passes, slopes: Array, members: Flags, count: NDArray[np.int64]
-) -> Array:
+def _prior_precision(passes: Passes, slopes: Array, members: Flags, count: Indices) -> Array:
     """Prior precision of each coordinate, [pass, section, 4]; 0 in a plane with readings.
 
     With fewer than two readings in a plane the prior is as large as the turn's readings. Without it
@@ -471,7 +470,7 @@ def _prior_precision(
     own = np.stack([slopes[..., 0, 0:2], slopes[..., 1, 2:4]], axis=-2)  # [..., plane, coordinate]
     square = np.where(members[..., None, None], own**2, 0.0).sum(axis=2)
     square = square / members.sum(axis=1)[:, None, None]
-    precision = square / np.maximum(size, 1e-30) ** 2
+    precision = square / np.maximum(size, TINY) ** 2
     unread = (count < TWO) & (count.max(axis=2, keepdims=True) >= TWO)
     return np.where(unread[..., None], precision, 0.0).reshape(*count.shape[:2], 4)
 
@@ -484,7 +483,7 @@ def _regularised(curvature: Array) -> Array:
     """Normal equations [..., 4, 4] regularised in every direction."""
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", curvature), 0.0))
     scale = np.where(np.isfinite(scale), scale, 0.0)
-    largest = np.maximum(scale.max(axis=-1, keepdims=True), 1e-30)
+    largest = np.maximum(scale.max(axis=-1, keepdims=True), TINY)
     scale = np.maximum(scale, 1e-2 * largest)
     held = np.nan_to_num(curvature, posinf=0.0, neginf=0.0)
     return np.asarray(held + WEAK * scale[..., None] ** 2 * np.eye(4))

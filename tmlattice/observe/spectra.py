@@ -18,15 +18,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import betaincinv
 
+from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.errors import TooFewTurnsError, first_of
 from tmlattice.harmonics import MIN_TURNS
 from tmlattice.inference import chi2
+from tmlattice.inference.judgement import DEFAULT
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.lost_beam import beam_lost
 from tmlattice.observe.line_fit import (
+    LONG,
     NARROW,
     WIDEST,
     LineFit,
@@ -38,10 +40,6 @@ from tmlattice.observe.line_fit import (
     without,
 )
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
-Planes = NDArray[np.int64]
 Near = Sequence[float] | Array | None
 Modes = tuple[int | None, int | None]
 """Lines of the modes nearer to x and to y; None without a line."""
@@ -62,7 +60,7 @@ OUTLIER = 8.0
 class Lines:
     """Betatron lines of the turns of a stored beam.
 
-    Modes are (1, 2): the one nearer to x, and to y. Planes are (x, y). Missing values are NaN.
+    Modes are (1, 2): the one nearer to x, and to y. Indices are (x, y). Missing values are NaN.
 
     Attributes:
         monitors: names.
@@ -87,7 +85,7 @@ class Lines:
     amplitude: ComplexArray
     error: Array
     noise: Array
-    turns: NDArray[np.int64]
+    turns: Indices
     envelope: ComplexArray
     warnings: tuple[str, ...]
 
@@ -202,7 +200,7 @@ def _shots(ids: Sequence[int]) -> str:
 
 def _shot(
     signals: Array, near: Near, warn: Callable[[str], None]
-) -> tuple[LineFit, Mask, Modes] | None:
+) -> tuple[LineFit, Flags, Modes] | None:
     """Lines of one shot [signal, turn], the signals that have any, and the line of each mode."""
     there = np.isfinite(signals)
     with_beam = there.sum(axis=0) >= 0.5 * there.sum(axis=0).max()
@@ -239,24 +237,20 @@ def _shot(
     return fit, usable, modes
 
 
-def _moves(signals: Array, there: Mask) -> Mask:
+def _moves(signals: Array, there: Flags) -> Flags:
     """Signals whose readings are not all the same."""
     high = np.where(there, signals, -np.inf).max(axis=1)
     low = np.where(there, signals, np.inf).min(axis=1)
     return np.asarray(high > low)
 
 
-def _robust(residual: Array, there: Mask) -> Array:
-    """Robust rms of the residual of each signal, from its median."""
-    size = np.abs(residual)
-    middle = np.median(size, axis=1)
-    for i in np.flatnonzero(~there.all(axis=1)):
-        middle[i] = np.median(size[i, there[i]])
-    return np.asarray(chi2.MAD * middle)
+def _robust(residual: Array, there: Flags) -> Array:
+    """Robust rms of the residual of each signal."""
+    return np.asarray(chi2.typical(np.where(there, residual, np.nan), axis=1))
 
 
 # --- reported doubts ------------------------------------------------------------------------------
-def _doubts(fit: LineFit, planes: Planes, modes: Modes, warn: Callable[[str], None]) -> None:
+def _doubts(fit: LineFit, planes: Indices, modes: Modes, warn: Callable[[str], None]) -> None:
     turns = fit.envelope.shape[1]
     there = [line for line in modes if line is not None]
     for plane in (0, 1):
@@ -314,11 +308,9 @@ SHORTEST = 32
 """Fewest turns of a longer measurement in which a line is sought."""
 MAX_OTHERS = 3
 """Largest number of other lines that are fitted."""
-CHANCE = 1e-6
-"""Probability that noise alone makes a line somewhere in the spectrum."""
 
 
-def betatron_lines(data: Array, there: Mask, planes: Planes, near: Near) -> LineFit:
+def betatron_lines(data: Array, there: Flags, planes: Indices, near: Near) -> LineFit:
     """Fit up to two betatron lines, the first two, and other significant lines.
 
     The strongest line is the first. The second is the strongest remaining line in the plane in
@@ -341,8 +333,8 @@ def betatron_lines(data: Array, there: Mask, planes: Planes, near: Near) -> Line
 
 def _strongest(
     data: Array,
-    there: Mask,
-    groups: Sequence[Mask],
+    there: Flags,
+    groups: Sequence[Flags],
     near: Near,
     away_from: float | None = None,
 ) -> tuple[float, int]:
@@ -367,7 +359,7 @@ def _strongest(
     return found, span
 
 
-def _power(data: Array, there: Mask) -> tuple[Array, Array]:
+def _power(data: Array, there: Flags) -> tuple[Array, Array]:
     """Frequencies, and each signal's spectrum in units of its own floor, [signal, frequency].
 
     The floor is that of the lowest quarter of the spectrum, which has no lines.
@@ -378,10 +370,10 @@ def _power(data: Array, there: Mask) -> tuple[Array, Array]:
     power = np.abs(np.fft.rfft((data - mean * there) * window)[:, 1:]) ** 2
     quarter = power.shape[1] // 4
     floor = np.partition(power, quarter, axis=1)[:, quarter, None] / -np.log(0.75)
-    return np.arange(1, turns // 2 + 1) / turns, power / np.maximum(floor, 1e-300)
+    return np.arange(1, turns // 2 + 1) / turns, power / np.maximum(floor, TINY)
 
 
-def _allowed(frequency: Array, near: Near) -> Mask:
+def _allowed(frequency: Array, near: Near) -> Flags:
     """Frequencies at which a betatron line may be."""
     if near is None:
         return (frequency > SLOWEST) & (frequency < 0.5)
@@ -400,15 +392,15 @@ def _typical(power: Array) -> Array:
 
 def _seen(signals: int, trials: int) -> float:
     """Level that `_typical` of noise signals exceeds in some of the trials with probability
-    CHANCE."""
+    DEFAULT.noise[1]."""
     above = signals - signals // 2
-    return float(-np.log(betaincinv(above, signals - above + 1, CHANCE / trials)))
+    return float(-np.log(betaincinv(above, signals - above + 1, DEFAULT.noise[1] / trials)))
 
 
-def _other_lines(fit: LineFit, there: Mask, planes: Planes) -> list[float]:
+def _other_lines(fit: LineFit, there: Flags, planes: Indices) -> list[float]:
     """Frequencies of up to three significant lines other than the betatron lines."""
     turns = there.shape[1]
-    if turns < 64:  # the floor between the lines is not resolved
+    if turns < LONG:  # the floor between the lines is not resolved
         return []
     frequency, power = _power(fit.residual, there)
     seen = [power[planes == plane] for plane in (0, 1)]
@@ -423,14 +415,14 @@ def _other_lines(fit: LineFit, there: Mask, planes: Planes) -> list[float]:
     return found
 
 
-def share(fit: LineFit, planes: Planes, line: int) -> float:
+def share(fit: LineFit, planes: Indices, line: int) -> float:
     """Share of a line's power, less the noise's, that is in x, 0 to 1."""
     power = np.abs(fit.amplitude[:, line]) ** 2 - 2 * fit.variance[:, line] * fit.noise**2
     x, y = (max(float(_typical(power[planes == p, None])[0]), 0.0) for p in (0, 1))
     return x / (x + y) if x + y > 0 else 0.5
 
 
-def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
+def which(fit: LineFit, planes: Indices, near: Near) -> Modes:
     """Lines of the modes nearer to x and to y; None without a significant line.
 
     If one plane was measured the second line is none of these: the tune alone identifies the mode.
@@ -454,7 +446,7 @@ def which(fit: LineFit, planes: Planes, near: Near) -> Modes:
     return kept[0], kept[1]
 
 
-def _significant(fit: LineFit, planes: Planes, line: int) -> bool:
+def _significant(fit: LineFit, planes: Indices, line: int) -> bool:
     """Whether a line exceeds what an envelope makes of noise, in the plane where it is larger.
 
     Its envelope has picked the largest of as many directions of noise as it has cosines: the
@@ -464,6 +456,6 @@ def _significant(fit: LineFit, planes: Planes, line: int) -> bool:
     plane = 0 if share(fit, planes, line) >= 0.5 else 1
     own = planes == plane
     size = np.abs(fit.amplitude[own, line]) ** 2
-    over = size / (2 * fit.variance[own, line] * fit.noise[own] ** 2 + 1e-300)
+    over = size / (2 * fit.variance[own, line] * fit.noise[own] ** 2 + TINY)
     picked = (1 + np.sqrt(2 * WIDEST * turns / own.sum())) ** 2
     return bool(_typical(over[:, None])[0] > picked * _seen(int(own.sum()), turns))

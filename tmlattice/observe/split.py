@@ -7,12 +7,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Flags
 from tmlattice.errors import MeasurementError
 from tmlattice.observe.response_data import ResponseData
-
-Flags = NDArray[np.bool_]
 
 INNER = 0.2
 """Share of the fitted correctors, and of the RF's fitted monitors, that select families."""

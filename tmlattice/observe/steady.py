@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.effects import Cause, find
 from tmlattice.effects.effect import MIN_STRENGTH
 from tmlattice.errors import UnstableRingError
@@ -19,14 +19,8 @@ from tmlattice.inference.metric import Hypothesis, Metric
 from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.whitening import Projection
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
 NOTHING = np.zeros(0)
 """Nuisances of a kind without any."""
-
-MAX_NUMBERS = 2**24
-"""Numbers of signatures in memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +142,6 @@ class SteadyMetric(Metric):
         assert point.projection is not None
         super().__init__(point.projection)
         self.problem, self.point = problem, point
-        self.chunk = int(np.clip(MAX_NUMBERS // max(problem.used.size, 1), 1, 512))
 
     def rows(self, hypotheses: Sequence[Hypothesis]) -> Array:
         """See `Metric.rows`."""

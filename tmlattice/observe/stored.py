@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.rf import NO_RF, Cavities, cavities
 from tmlattice.beam.rf import rf_of as rf_in
@@ -33,8 +33,6 @@ from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.steady import Steady
-
-Array = NDArray[np.float64]
 
 SMALL = 1e-3
 """Step of the differences, as a share of a monitor's largest error."""
@@ -149,7 +147,7 @@ class Stored(Steady):
 
     ring: Ring = field(repr=False)
     states: tuple[tuple[Settings, float], ...]
-    read_by: NDArray[np.int64] = field(repr=False)
+    read_by: Indices = field(repr=False)
     cache: ModelCache = field(default_factory=ModelCache, repr=False, compare=False)
 
     @abstractmethod
@@ -170,7 +168,7 @@ class Stored(Steady):
         """All monitors of the ring."""
         return [monitor.name for monitor in self.ring.monitors]
 
-    def owner(self) -> NDArray[np.int64]:
+    def owner(self) -> Indices:
         """Monitor of each reading; -1: of no single monitor."""
         return self.read_by
 

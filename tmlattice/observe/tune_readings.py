@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import Settings, apply
@@ -14,8 +14,6 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import TuneReading
 from tmlattice.observe.stored import Stored, rf_of, stacked
 from tmlattice.optics import ring_tunes
-
-Array = NDArray[np.float64]
 
 DELTA = 5e-4
 """Energy deviation dE / p0 c on both sides of the nominal one, for the chromaticity."""

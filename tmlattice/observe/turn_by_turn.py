@@ -30,11 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from tmlattice.arrays import Indices
 from tmlattice.beam.nonlinear import nonlinear_turn, track
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.inference.metric import Indices, Metric, Products
+from tmlattice.inference.metric import Metric, Products
 from tmlattice.inference.problem import Hypothesis, Point
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn

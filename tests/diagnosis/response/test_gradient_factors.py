@@ -8,9 +8,13 @@ from shared import small_steps
 
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CorrectorCalibration, MonitorGain
-from tmlattice.diagnosis.response.common_factors import explain_gradients, weighed
+from tmlattice.diagnosis.response.common_factors import (
+    Candidates,
+    candidates,
+    explain_gradients,
+    weighed,
+)
 from tmlattice.diagnosis.response.rounds import settle
-from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
 from tmlattice.lattice.alike import families

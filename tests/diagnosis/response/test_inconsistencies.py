@@ -7,8 +7,8 @@ import pytest
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.dispersion import USUAL, HorizontalKicks
-from tmlattice.diagnosis.response.inconsistencies import CLEAR
 from tmlattice.effects import Cause, apply
+from tmlattice.inference.judgement import SIGNIFICANT
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
@@ -61,7 +61,7 @@ def test_kicks_pull_gradients_apart_whether_they_are_in_the_fit_or_not(small_rin
     assert "are inconsistent" in diagnosis.report()
     assert found["pulls"] or not more  # where kicks are missing, gradients have made up for them
     for own in found["pulls"]:
-        assert abs(own["pull"]) >= CLEAR
+        assert abs(own["pull"]) >= SIGNIFICANT
         assert np.sign(own["with_rf"] - own["correctors"]) == np.sign(own["pull"])
         assert own["with_rf_sigma"] < own["correctors_sigma"]
     if more:

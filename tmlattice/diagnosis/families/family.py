@@ -1,17 +1,17 @@
 """The interface of a family of errors of a hierarchical fit; see `families`."""
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, find
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
-Array = NDArray[np.float64]
 StatedCause = tuple[Cause, float]
 """A cause and the posterior rms of its amount."""
 
@@ -74,11 +74,15 @@ class Family(ABC):
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The errors with these values."""
 
-    @abstractmethod
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
     ) -> list[StatedCause]:
-        """The values as causes, with errors."""
+        """The values as causes, with errors; here by `moves`."""
+        return [
+            (Cause(*cause, share * float(value)), abs(share) * float(error))
+            for moves, value, error in zip(self.moves(data), values, sigma, strict=True)
+            for cause, share in moves.items()
+        ]
 
     @abstractmethod
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
@@ -95,3 +99,35 @@ class Family(ABC):
     def doubt(self, values: Array, data: ResponseData) -> str | None:
         """The reason why fitted values are implausible for the family; None: they are plausible."""
         return None
+
+
+class RingFamily(Family):
+    """Causes in the ring: each number is the amount of one, or of several in fixed shares."""
+
+    per = "ring"
+
+    def size(self, data: ResponseData) -> int:
+        """The number of causes, or of sets of them."""
+        return len(self.moves(data))
+
+    def units(self, values: Array) -> Array:
+        """Derivative of each number's causes by the number, over their shares."""
+        return np.ones(len(values))
+
+    def rows(self, at: Predicted, values: Array) -> Array:
+        """Derivatives of the response, with gains."""
+        each = self.moves(at.data)
+        gain = at.gain(self.block)
+        slopes = at.slopes_of(self.block, [cause for moves in each for cause in moves])
+        out = np.empty((len(each), *at.data.shape))
+        for own, moves, unit in zip(out, each, self.units(values), strict=True):
+            first, *others = moves.values()
+            np.multiply(next(slopes), first * unit * gain, out=own)
+            for share in others:
+                np.add(own, next(slopes) * (share * unit * gain), out=own)
+        return out
+
+    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
+        """The errors with these causes in the ring."""
+        causes = (own for own, _ in self.causes_of(errors, values, np.zeros(len(values)), data))
+        return replace(errors, ring=(*errors.ring, *(own for own in causes if own.amount)))

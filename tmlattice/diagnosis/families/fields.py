@@ -5,31 +5,29 @@ All pieces of a magnet share one number.
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
-from tmlattice.effects import Cause
+from tmlattice.arrays import Array
+from tmlattice.diagnosis.families.family import TAILS, RingFamily
 from tmlattice.inference.priors import Group
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
 from tmlattice.lattice.supplies import magnets, supplied_alike
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.observe.orbit_response import Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 
-Array = NDArray[np.float64]
-
+USUAL, REPRODUCED = 1e-2, 1e-4
+"""Prior rms of a change, or of an error that magnets share, relative or in 1/m; and the relative
+reproducibility of a magnet, twice that of a supply, below which changes are ignored."""
 LARGEST_GRADIENT = 0.02
 """Largest prior rms of one magnet, relative: larger errors are faults."""
 FURTHEST = 0.05
 """Largest prior rms of the displacement of a corrector's field, m: beyond is another corrector."""
 
 
-class _Magnets(Family):
-    per = "ring"
+class _Magnets(RingFamily):
     effect: ClassVar[str]
 
     @abstractmethod
@@ -39,44 +37,6 @@ class _Magnets(Family):
     def places(self, data: ResponseData) -> list[str]:
         """The first piece of each magnet."""
         return [next(iter(pieces)) for pieces in self.shares(data)]
-
-    def size(self, data: ResponseData) -> int:
-        return len(self.shares(data))
-
-    def rows(self, at: Predicted, values: Array) -> Array:
-        shares = self.shares(at.data)
-        pairs = [(self.effect, place) for pieces in shares for place in pieces]
-        gain, slopes = at.gain(self.block), at.slopes_of(self.block, pairs)
-        out = np.empty((len(shares), *at.data.shape))
-        for own, pieces, unit in zip(out, shares, self.units(values), strict=True):
-            first, *others = pieces.values()
-            np.multiply(next(slopes), first * unit * gain, out=own)
-            for share in others:
-                np.add(own, next(slopes) * (share * unit * gain), out=own)
-        return out
-
-    def units(self, values: Array) -> Array:
-        """Derivative of each gradient error by its number."""
-        return np.ones(len(values))
-
-    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        causes = tuple(
-            Cause(self.effect, place, share * float(value))
-            for pieces, value in zip(self.shares(data), values, strict=True)
-            for place, share in pieces.items()
-            if value
-        )
-        return replace(errors, ring=(*errors.ring, *causes))
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """The amount of every piece."""
-        return [
-            (Cause(self.effect, place, share * float(value)), abs(share) * float(error))
-            for pieces, value, error in zip(self.shares(data), values, sigma, strict=True)
-            for place, share in pieces.items()
-        ]
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """The cause of every piece."""

@@ -12,8 +12,8 @@ from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.dispersion import (
     HorizontalKicks,
     HorizontalOrbit,
@@ -37,9 +37,6 @@ from tmlattice.inference.priors import Group
 from tmlattice.lattice.alike import families
 from tmlattice.observe.orbit_response import DELTA, Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
-
 
 USUAL_OFFSET = 1e-3
 """Prior rms: an orbit of a millimetre where the dispersion is a metre."""
@@ -83,12 +80,6 @@ class EnergyOffset(_OfBeam):
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The errors with this energy."""
         return replace(errors, energy=float(values[0]))
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """The energy offset as a cause."""
-        return [(Cause(self.name, None, float(values[0])), float(sigma[0]))]
 
     def doubt(self, values: Array, data: ResponseData) -> str | None:
         """The message that so large an offset is implausible; None where it is plausible."""
@@ -199,10 +190,6 @@ class MonitorGain(_Monitors):
         return [{(effect, name): 1.0} for name in data.measured.monitors for effect in self.effects]
 
 
-LEAST_GAIN = 1e-3
-"""Least gain in the errors of rolls."""
-
-
 class MonitorRoll(_Monitors):
     """The cross-talk of a BPM's planes: roll and coupling."""
 
@@ -220,7 +207,7 @@ class MonitorRoll(_Monitors):
     ) -> list[StatedCause]:
         """Causes: for small values x reads (coupling + roll) y, and y reads (coupling - roll) x."""
         monitors = Monitors.of(errors.monitors)
-        own = np.maximum(np.abs(1 + monitors.gain), LEAST_GAIN)
+        own = np.maximum(np.abs(1 + monitors.gain), LEAST_KICK)
         spread = np.hypot(*(sigma.reshape(-1, 2) / own).T) / 2
         return [
             (Cause(effect, name, float(amount[i])), float(spread[i]))

@@ -5,12 +5,10 @@
 
 import numpy as np
 
+from tmlattice.inference.judgement import MISSTATED
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.noise import OVERSTATED, stated_and_estimated
+from tmlattice.observe.noise import stated_and_estimated
 from tmlattice.observe.response_data import ResponseData
-
-UNDERSTATED = 2.0
-"""Ratio of measured to stated noise above which a message reports it."""
 
 
 def assumed_of(measured: OrbitResponse, data: ResponseData) -> list[str]:
@@ -66,8 +64,8 @@ def _misstated(data: ResponseData) -> list[str]:
             f"the noise in {plane} is stated as {1e6 * own:.2g} µm, but the residuals "
             f"between neighbouring BPMs are {1e6 * seen:.2g} µm"
         )
-        if seen > UNDERSTATED * own:
+        if seen > MISSTATED * own:
             messages.append(f"{but}: chi-square is as much too large")
-        elif own > OVERSTATED * seen:
+        elif own > MISSTATED * seen:
             messages.append(f"{but}: the stated noise is too large, or includes beam jitter")
     return messages

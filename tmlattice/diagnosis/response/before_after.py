@@ -19,38 +19,43 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
 from tmlattice.diagnosis.families.family import StatedCause
-from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.families.fields import REPRODUCED, FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, EnergyOffset, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
+    finding_of,
     least_certain,
     strongest_first,
     with_consequences,
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.changed_supplies import MOST, REPRODUCED, changed_supplies
-from tmlattice.diagnosis.response.drifts import drifts, is_drift, outstanding
+from tmlattice.diagnosis.response.changed_supplies import changed_supplies
+from tmlattice.diagnosis.response.fitted_causes import with_support
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
+from tmlattice.diagnosis.response.stated import unwidened
 from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.validation import Step, score
-from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.diagnosis.support import FREE
-from tmlattice.effects import CATALOGUE, RingEffect, find, modelled
+from tmlattice.diagnosis.response.weights import LEAST
+from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.support import FREE, Support
+from tmlattice.effects import CATALOGUE, Cause, RingEffect, find, modelled
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.judgement import DEFAULT, Judgement
-from tmlattice.inference.normal import solve
+from tmlattice.inference import chi2
+from tmlattice.inference.alternatives import Detection
+from tmlattice.inference.common_factors import MAX_CHOSEN
+from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -58,16 +63,12 @@ from tmlattice.observe.response_change import alike, response_change
 from tmlattice.observe.response_data import ResponseData, response_data
 from tmlattice.observe.split import Split, split_columns
 
-Array = NDArray[np.float64]
-
+DRIFT, OUTSTANDING = 0.03, 8.0
+"""Least change of a BPM or corrector that is a finding, and its least ratio to the typical one."""
 ANY = 6.0
 """rms of the logarithm of a change's scale about its first guess: most families did not change."""
 EVERYWHERE = 5e-4
 """Relative scatter of magnets above which it is reported without a single detected change."""
-SEEN = 3.0
-"""Standard deviations above which an energy offset of the reference is reported."""
-LEAST_NOISE = 0.2
-"""Least noise of the difference of two measurements, as a share of the stated noise."""
 
 
 def diagnose_change(
@@ -77,7 +78,7 @@ def diagnose_change(
     *,
     holdout: float = 0.2,
     effects: Sequence[str] | None = None,
-    max_effects: int = MOST,
+    max_effects: int = MAX_CHOSEN,
     false_alarm: float = DEFAULT.false_alarm,
     assume: Sequence[str] = (),
     seed: int = 0,
@@ -235,8 +236,8 @@ def _of_the_ring(fitted: State) -> Iterator[str]:
     energy, where = fitted.at.errors.energy, EnergyOffset.variable
     if energy:
         there = linear(fitted, EnergyOffset.block)
-        sigma = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where[where]]
-        if abs(energy) > SEEN * sigma[0]:
+        sigma = there.posterior.sigma[there.where[where]]
+        if abs(energy) > SIGNIFICANT * sigma[0]:
             yield (
                 f"its beam differs from the nominal energy by {energy:.2e} ± {sigma[0]:.0e} "
                 "(relative), "
@@ -292,8 +293,8 @@ def _learnt_noise(state: State) -> State:
         left = (data.pick(state.at.left, block) / data.noise_of(block))[:-1]
         left = left[state.fitted[:-1]][:, state.good]
         left = left[np.isfinite(left)]
-        scales.append(float(np.median(np.abs(left))) / 0.6745 if len(left) else 1.0)
-    lower = float(np.clip(max(scales), LEAST_NOISE, 1.0))
+        scales.append(float(chi2.typical(left)) if len(left) else 1.0)
+    lower = float(np.clip(max(scales), LEAST, 1.0))
     return _with_noise(state, lower * data.noise)
 
 
@@ -306,6 +307,46 @@ def _with_noise(state: State, noise: Array) -> State:
 def _all_columns(state: State) -> State:
     """The fit with held-out correctors included."""
     return replace(state, split=_not_validated(state.split))
+
+
+# --- drifts of BPMs and correctors, whose outliers are findings ----
+def drifts(state: State) -> list[tuple[StatedCause, Support]]:
+    """Return the changes of BPMs and correctors since the reference, with errors and support."""
+    found: list[tuple[StatedCause, Support]] = []
+    for block in (0, 1):
+        own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
+        if not own:
+            continue
+        there = linear(state, block)
+        posterior = there.posterior
+        found += with_support(state, own.values(), there, unwidened(posterior))
+    return found
+
+
+def outstanding(state: State, judgement: Judgement) -> list[Finding]:
+    """Return the findings: BPMs and correctors whose change is an outlier of the usual drift."""
+    changes = [row for row, _ in drifts(state)]
+    found = []
+    for effect in dict.fromkeys(cause.effect for cause, _ in changes):
+        rows = [row for row in changes if row[0].effect == effect]
+        usual = float(chi2.typical([cause.amount for cause, _ in rows]))
+        for cause, sigma in rows:
+            size = abs(cause.amount)
+            if size > max(DRIFT, OUTSTANDING * usual) and size > SIGNIFICANT * sigma:
+                square = (size / max(sigma, 1e-12)) ** 2
+                seen = Detection.among(square, len(rows))
+                found.append(
+                    finding_of(state.data.ring, [cause], np.ones(1), sigma, seen,
+                               judgement.mass)
+                )  # fmt: skip
+    return found
+
+
+def is_drift(cause: Cause) -> bool:
+    """Return whether a change of a BPM or a corrector is within the usual drift from day to day."""
+    of_each = {name for trial in CHANGES for family in trial.families if family.per != "ring"
+               for name in family.effects}  # fmt: skip
+    return cause.effect in of_each and abs(cause.amount) <= DRIFT
 
 
 # --- messages ---------------------------------------------------------------------------------
@@ -322,7 +363,7 @@ def _sparse_or_all(
     """The sparse solution of a change, or the fit of all possible changes."""
     asked = changes() if effects is None else effects
     sparse = sparse_fit(
-        data, split, asked, MOST, judgement, seed, progress, and_orbits(data.ring, open_)
+        data, split, asked, MAX_CHOSEN, judgement, seed, progress, and_orbits(data.ring, open_)
     )
     if sparse is not None and all(is_drift(cause) for cause, _ in sparse.fitted_causes):
         sparse = None
@@ -342,7 +383,7 @@ def _messages(
 ) -> list[str]:
     """Messages on the agreement of two measurements, and the scatter of magnets and supplies."""
     left = data.pick(state.at.left)[:-1][:, state.good]
-    agree = 1e6 * float(np.nanmedian(np.abs(left))) / 0.6745
+    agree = 1e6 * float(chi2.typical(left))
     stated = 1e6 * float(np.median(data.noise))
     messages = [
         f"given the changes, the two measurements agree to {agree:.2g} µm (by their stated noise "

@@ -11,11 +11,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.family import Family
-from tmlattice.diagnosis.families.fields import FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.families.fields import (
+    REPRODUCED,
+    USUAL,
+    FamilyGradient,
+    QuadrupoleGradient,
+)
 from tmlattice.diagnosis.findings import cause_of, finding_of
 from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
 from tmlattice.diagnosis.response.state import State
@@ -24,28 +29,18 @@ from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Detection
-from tmlattice.inference.common_factors import CommonFactor, FactorModel, GivenOthers
+from tmlattice.inference.common_factors import MAX_CHOSEN, CommonFactor, FactorModel, GivenOthers
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.normal import solve
+from tmlattice.inference.newton import AGAIN
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import supplied_alike
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_problem import Response
 
-Array = NDArray[np.float64]
-
-MOST = 40
-"""Most changes of a plane: many supplies may be changed on purpose."""
-REPRODUCED = 1e-4
-"""Relative reproducibility of a magnet, and twice that of a supply; smaller changes are ignored."""
 STRAY = 3e-5
 """Reproducibility of a gradient outside quadrupoles, 1/m: the orbit in a sextupole moves."""
-USUAL = 1e-2
-"""Prior rms of a change: relative, or of integrated gradients in 1/m."""
 ALONE = 2.0
 """Log odds of a changed supply against one of its magnets alone, or a field elsewhere."""
-AGAIN = 3
-"""Repetitions of the selection, with undetermined errors of the ring linearised at the findings."""
 FINER = 0.5
 """Factor between the smaller scatters that are tried."""
 OTHERS = tuple(float(own) for own in np.geomspace(1e-4, 1e-2, 9))
@@ -150,7 +145,7 @@ def _by_evidence(
             np.full(len(odds), USUAL), np.array(odds),
         )  # fmt: skip
         supplies = [i for i, (name, _) in enumerate(among.causes) if name == FamilyGradient.name]
-        there = levels.given_others(levels.choose(MOST), supplies, OTHERS)
+        there = levels.given_others(levels.choose(MAX_CHOSEN), supplies, OTHERS)
         evidence = there.levels.background + there.levels.log_evidence(there.chosen)
         return _Weighed(among, there, evidence)
 
@@ -195,7 +190,7 @@ def _candidates(
 
 def _widened(state: State, block: int, there: Linear) -> float:
     """Factor on the errors, because the noise was learnt from fitted readings."""
-    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    posterior = there.posterior
     fitted = float(np.sum(1 - np.diag(posterior.covariance)))
     count = int(np.isfinite(state.data.pick(state.at.left, block)[:, state.good]).sum())
     return float(np.sqrt(count / max(count - fitted, count / 4)))
@@ -206,6 +201,5 @@ def _finding(
 ) -> Finding:
     chance = np.array([p for _, p in own.alternatives])
     causes = [Cause(*names[c], own.amount) for c, _ in own.alternatives]
-    shown = causes[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
     seen = Detection.among(own.statistic, len(names))
-    return finding_of(ring, causes, chance, shown, own.sigma, seen, judgement.mass)
+    return finding_of(ring, causes, chance, own.sigma, seen, judgement.mass)

@@ -11,50 +11,39 @@ scatter of single magnets is in every error. Outlier magnets are reported, with 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.records import named
+from tmlattice.arrays import TINY, Array, Flags, Indices
+from tmlattice.diagnosis.families.fields import (
+    LARGEST_GRADIENT,
+    REPRODUCED,
+    USUAL,
+    QuadrupoleGradient,
+)
+from tmlattice.diagnosis.records import named, of
+from tmlattice.diagnosis.response.fitted_causes import AGAINST, SHOWN
 from tmlattice.diagnosis.response.linear import linear, marginal
-from tmlattice.diagnosis.response.sharing import Candidates, candidates
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes
 from tmlattice.diagnosis.support import share_from_data
 from tmlattice.inference.common_factors import (
+    MAX_CHOSEN,
     MIN_CHI2,
     FactorModel,
     LikelySet,
     likely_sets,
     over_sets,
 )
-from tmlattice.inference.normal import solve
-from tmlattice.lattice.supplies import magnets
+from tmlattice.inference.judgement import DEFAULT, FEW
+from tmlattice.lattice import Element, Ring
+from tmlattice.lattice.supplies import magnets, supplied_alike
 
-Array = NDArray[np.float64]
-
-USUAL = 1e-2
-"""Prior rms of a shared error, relative."""
-LEAST_SCATTER = 1e-4
-"""Least scatter of single magnets, relative."""
-TOLERANCE = 0.02
-"""Largest distance of a healthy magnet from its family, relative."""
+GAP = 2.5
+"""Ratio to the typical distance of two bends above which a straight is between them."""
 BETWEEN = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
 """Scatters of families, relative rms, that are tried."""
-MORE = 3.0
-"""Log evidence required for a scatter of families."""
-FEWEST = 3
-"""Fewest families for their scatter."""
-MOST = 20
-"""Most common factors."""
-SETS, LIKELY = 3, 0.05
-"""Most alternative sets that are reported, and their least probability."""
-AGAINST = 0.4
-"""Correlation above which neighbours of an outlier are named."""
-SHOWN = 3
-"""Most neighbours that are named."""
 COST = {"all": 0.0, "focusing": 1.0, "region": 1.0, "type": 1.0, "family": 1.0, "magnet": 3.0}
 """Log prior odds against a common factor of each kind."""
 MAKES = {
@@ -97,13 +86,8 @@ class Reason:
     probability: float
     statistic: float
     makes: str
-    rivals: tuple[tuple[str, float], ...]
+    rivals: tuple[tuple[str, float], ...] = field(metadata=of("name", "probability"))
     share_from_data: float = 1.0
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        rivals = [{"name": name, "probability": p} for name, p in self.rivals]
-        return {**vars(self), "members": list(self.members), "rivals": rivals}
 
 
 @dataclass(frozen=True)
@@ -116,12 +100,9 @@ class Instead:
     """
 
     probability: float
-    amounts: tuple[tuple[str, float, float], ...] = field(metadata=named("common_factors"))
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        common_factors = [{"name": n, "amount": a, "amount_sigma": e} for n, a, e in self.amounts]
-        return {"probability": self.probability, "common_factors": common_factors}
+    amounts: tuple[tuple[str, float, float], ...] = field(
+        metadata=named("common_factors") | of("name", "amount", "amount_sigma")
+    )
 
 
 @dataclass(frozen=True)
@@ -138,13 +119,10 @@ class Outlier:
     element: str
     amount: float
     amount_sigma: float
-    against: tuple[tuple[str, float, float], ...]
+    against: tuple[tuple[str, float, float], ...] = field(
+        metadata=of("element", "amount", "correlation")
+    )
     share_from_data: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        against = [{"element": n, "amount": a, "correlation": c} for n, a, c in self.against]
-        return {**vars(self), "against": against}
 
 
 @dataclass(frozen=True)
@@ -180,19 +158,19 @@ def explain_gradients(state: State) -> CommonFactors | None:
     among = candidates(state.data.ring, own)
     kinds, names, members, _ = among
     known = state.groups.get(family.name)
-    scatter = max(LEAST_SCATTER if known is None else known.rms, LEAST_SCATTER)
-    posterior = solve(there.normal, there.groups, there.start, rounds=0)
+    scatter = max(REPRODUCED if known is None else known.rms, REPRODUCED)
+    posterior = there.posterior
     rows = there.where[family.variable]
     spread = posterior.spread[rows]
     covariance = spread @ posterior.covariance @ spread.T
     # the excess of stated errors over posterior ones is in every error, but is no scatter
-    plain = np.maximum(np.diag(covariance), 1e-24)
+    plain = np.maximum(np.diag(covariance), TINY)
     wider = of_readings(state, 0, there, posterior)[rows] / np.sqrt(plain)
     sizes = of_sizes(state, 0, there)[rows]
     more = np.sqrt(np.maximum(wider**2 - 1, 0))
     single = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
     covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-24))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), TINY))
     between, levels, sets = weighed(information, pull, among, single)
     found = [
         (one, chance)
@@ -221,7 +199,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
             for c, square in zip(one.chosen, levels.squares(one.chosen), strict=True)
             if square >= MIN_CHI2
         ))
-        for one in sets[1 : SETS + 1] if one.probability > LIKELY
+        for one in sets[1 : SHOWN + 1] if one.probability > 1 - DEFAULT.mass
     )  # fmt: skip
     return CommonFactors(
         common_factors,
@@ -238,6 +216,21 @@ def explain_gradients(state: State) -> CommonFactors | None:
         float(np.sqrt(np.mean(left**2))),
         between,
     )
+
+
+class Candidates(NamedTuple):
+    """All candidates for a common factor.
+
+    Attributes:
+        kinds, names: see `MAKES`.
+        members: 1 for each magnet that shares it, [magnet, candidate].
+        families: whether it is a family of several magnets, whatever its kind.
+    """
+
+    kinds: tuple[str, ...]
+    names: tuple[str, ...]
+    members: Array
+    families: Flags
 
 
 def weighed(
@@ -264,26 +257,29 @@ def weighed(
     families, others = np.flatnonzero(among.families), np.flatnonzero(~among.families)
     alone = np.diag(1.0 - np.minimum(among.members[:, families].sum(axis=1), 1.0))
 
-    def levels(at: NDArray[np.int64], between: float) -> FactorModel:
+    def levels(at: Indices, between: float) -> FactorModel:
         share = among.members[:, families] * between
         scatter = single + share @ share.T + between**2 * alone
         slab = np.full(len(at), max(USUAL, between))
         return FactorModel(information, pull, among.members[:, at], scatter, slab, cost[at])
 
     alike = levels(np.arange(len(cost)), 0.0)
-    best, known = 0.0, alike.background + alike.log_evidence(alike.choose(MOST)) + MORE
-    for between in BETWEEN if len(families) >= FEWEST else ():
+    best, known = (
+        0.0,
+        alike.background + alike.log_evidence(alike.choose(MAX_CHOSEN)) + DEFAULT.behind,
+    )
+    for between in BETWEEN if len(families) >= FEW else ():
         tried = levels(others, between)
-        evidence = tried.background + tried.log_evidence(tried.choose(MOST))
+        evidence = tried.background + tried.log_evidence(tried.choose(MAX_CHOSEN))
         if evidence > known:
             best, known = between, evidence
     if not best:
-        return 0.0, alike, likely_sets(alike, MOST)
+        return 0.0, alike, likely_sets(alike, MAX_CHOSEN)
     slab = np.full(len(cost), max(USUAL, best))
     slab[families] = best
     whole = FactorModel(information, pull, among.members, single + best**2 * alone, slab, cost)
     sets = []
-    for one in likely_sets(levels(others, best), MOST):
+    for one in likely_sets(levels(others, best), MAX_CHOSEN):
         chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())
         sets.append(LikelySet(chosen, one.probability, *whole.fitted(chosen)))
     return best, whole, sets
@@ -298,7 +294,7 @@ def _outliers(
     prior: Array,
 ) -> tuple[Outlier, ...]:
     found = []
-    for i in np.flatnonzero(np.abs(left) - sigma > TOLERANCE).tolist():
+    for i in np.flatnonzero(np.abs(left) - sigma > LARGEST_GRADIENT).tolist():
         other = np.argsort(-np.abs(correlation[i]))
         pulls = [int(j) for j in other if j != i and abs(correlation[i, j]) > AGAINST][:SHOWN]
         against = tuple((places[j], float(values[j]), float(correlation[i, j])) for j in pulls)
@@ -312,3 +308,78 @@ def _outliers(
             )
         )
     return tuple(sorted(found, key=lambda one: -abs(one.amount)))
+
+
+# --- candidates -----------------------------------------------------------------------------------
+def candidates(ring: Ring, own: Sequence[tuple[Element, ...]]) -> Candidates:
+    """Return all groups of a ring's magnets that may share an error; each group has one name.
+
+    Args:
+        ring: with the magnets.
+        own: the magnets, each with its pieces.
+    """
+    kinds: list[str] = []
+    names: list[str] = []
+    columns: list[Array] = []
+    families: list[bool] = []
+
+    def add(kind: str, name: str, members: Array) -> None:
+        if members.sum() < (1 if kind == "magnet" else 2):
+            return
+        same = [i for i, column in enumerate(columns) if (members == column).all()]
+        if same:
+            families[same[0]] |= kind == "family"
+            return
+        kinds.append(kind)
+        names.append(name)
+        columns.append(members)
+        families.append(kind == "family")
+
+    focusing = np.array([float(pieces[0].k1 > 0) for pieces in own])
+    add("all", "all quadrupoles", np.ones(len(own)))
+    add("focusing", "all focusing quadrupoles", focusing)
+    add("focusing", "all defocusing quadrupoles", 1 - focusing)
+    stems, by_stem = supplied_alike(ring)
+    for name, members in zip(stems, by_stem.T, strict=True):
+        add("family", name, members)
+    groups = [pieces[0].family.casefold() for pieces in own]
+    for name in dict.fromkeys(groups):
+        add("family", name, np.array([float(group == name) for group in groups]))
+    for name, members in _regions(ring, own):
+        add("region", name, members)
+        add("region", f"{name}, focusing", members * focusing)
+        add("region", f"{name}, defocusing", members * (1 - focusing))
+    for length in sorted({_length(pieces) for pieces in own}):
+        alike = np.array([float(_length(pieces) == length) for pieces in own])
+        add("type", f"quadrupoles of {length:g} m", alike)
+    for i, pieces in enumerate(own):
+        add("magnet", pieces[0].name, np.eye(len(own))[i])
+    return Candidates(tuple(kinds), tuple(names), np.array(columns).T, np.array(families))
+
+
+def _length(pieces: Sequence[Element]) -> float:
+    return round(sum(e.length for e in pieces), 3)
+
+
+def _regions(ring: Ring, own: Sequence[tuple[Element, ...]]) -> list[tuple[str, Array]]:
+    """Arcs and straights, all of them and single ones."""
+    bends = np.array([e.s for e in ring.elements if e.kind == "bend"])
+    if len(bends) < 3:
+        return []
+    ways = np.diff(np.append(bends, bends[0] + ring.length))
+    long = np.flatnonzero(ways > GAP * np.median(ways))
+    if not 0 < len(long) < len(ways) / 2:
+        return []
+    s = np.array([pieces[0].s for pieces in own])
+    low, high = bends[long], bends[long] + ways[long]
+    within = [((s > a) & (s < b)) | (s + ring.length < b) for a, b in zip(low, high, strict=True)]
+    straight = np.any(within, axis=0)
+    found = [("arcs", np.where(straight, 0.0, 1.0)), ("straights", straight.astype(float))]
+    for inside, a, b in zip(within, low, high, strict=True):
+        found.append((f"straight at s = {((a + b) / 2) % ring.length:.0f} m", inside.astype(float)))
+    for start, end in zip(high, np.append(low[1:], low[0] + ring.length), strict=True):
+        inside = ((s > start) & (s < end)) | (s + ring.length < end) & (s + ring.length > start)
+        inside &= ~straight
+        middle = ((start + end) / 2) % ring.length
+        found.append((f"arc at s = {middle:.0f} m", inside.astype(float)))
+    return found

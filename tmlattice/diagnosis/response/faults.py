@@ -3,19 +3,17 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.common_factors import MIN_CHI2
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import SIGNIFICANT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.observe.orbit_response import Errors
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +39,8 @@ class Fault:
         """The fault as a hypothesis of the report."""
         chance = np.exp(self.evidence - self.evidence.max())
         chance /= chance.sum()
-        shown = self.rivals[: int(np.searchsorted(np.cumsum(chance), judgement.mass)) + 1]
         seen = Detection(self.statistic, MIN_CHI2, self.p_value)
-        return finding_of(ring, self.rivals, chance, shown, self.sigma, seen, judgement.mass)
-
-
-CLEARLY = 5.0
-"""Standard errors of a corrector's kick in the other plane above which it is significant."""
+        return finding_of(ring, self.rivals, chance, self.sigma, seen, judgement.mass)
 
 
 def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:
@@ -59,7 +52,7 @@ def as_turned(fault: Fault, errors: Errors, data: ResponseData) -> Fault:
     ring, name = data.ring, fault.cause.element
     columns = [ring[own].name for own in data.measured.correctors]
     column = columns.index(ring[name or ""].name)
-    if not errors.turned[column] or abs(errors.roll[column]) < CLEARLY * fault.sigma:
+    if not errors.turned[column] or abs(errors.roll[column]) < SIGNIFICANT * fault.sigma:
         return fault
     roll = Cause("corrector_roll", name, float(errors.angle[column]))
     others = [i for i, own in enumerate(fault.rivals)

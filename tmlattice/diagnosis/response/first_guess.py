@@ -12,8 +12,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import Trial
 from tmlattice.diagnosis.response.state import State, allow, begin
@@ -21,8 +21,6 @@ from tmlattice.errors import UnstableRingError
 from tmlattice.lattice.supplies import magnets
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +105,7 @@ def strange(state: State, least: int = 1) -> float:
     seen = np.isfinite(orbits) & state.fitted[:-1, None] & state.good
     u, d = np.where(seen, read, 0.0), np.where(seen, orbits, 0.0)
     size = (d**2).sum(axis=1)
-    kick = np.maximum((u * d).sum(axis=1) / np.maximum((u**2).sum(axis=1), 1e-300), 0.0)
+    kick = np.maximum((u * d).sum(axis=1) / np.maximum((u**2).sum(axis=1), TINY), 0.0)
     left = ((d - kick[:, None] * u) ** 2).sum(axis=1)
     shares = [
         np.median(left[rows] / size[rows])

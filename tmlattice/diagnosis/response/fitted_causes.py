@@ -4,18 +4,16 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import TINY, Array
 from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import Stated, stated
 from tmlattice.diagnosis.support import Correlation, Support, correlations_of, share_from_data
-from tmlattice.inference.normal import Posterior, solve
+from tmlattice.inference.normal import Posterior
 from tmlattice.inference.problem import Hypothesis
-
-Array = NDArray[np.float64]
 
 AGAINST, SHOWN = 0.4, 3
 """Posterior correlation above which numbers are degenerate, and how many of them are named."""
@@ -37,7 +35,7 @@ def fitted_causes(
         if not families:
             continue
         there = linear(state, block)
-        posterior = solve(there.normal, there.groups, there.start, rounds=0)
+        posterior = there.posterior
         known = stated(state, block, there, posterior)
         own: list[StatedCause] = []
         for row, support in with_support(state, families.values(), there, known):
@@ -61,7 +59,7 @@ def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: 
             if hypothesis in place:
                 slopes[place[hypothesis], number] = amount
     both = slopes @ covariance @ slopes.T
-    width = np.sqrt(np.maximum(np.diag(both), 1e-300))
+    width = np.sqrt(np.maximum(np.diag(both), TINY))
     correlation = both / width[:, None] / width
     np.fill_diagonal(correlation, 1.0)
     sigma = np.array([own for _, own in rows])
@@ -128,7 +126,7 @@ def _support(
         return support
     here = (cause.effect, cause.element)
     mine = [i for i in range(own.start, own.stop) if here in numbers.get(i, {})]
-    width = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    width = np.sqrt(np.maximum(np.diag(covariance), TINY))
     near: dict[int, float] = {}
     for i in mine:
         correlation = covariance[i] / (width[i] * width)

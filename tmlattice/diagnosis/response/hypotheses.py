@@ -8,16 +8,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, between
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
 from tmlattice.lattice.alike import families
 from tmlattice.observe.orbit_response import DELTA
-
-Array = NDArray[np.float64]
 
 BEND_GRADIENT = 1e-4
 """Step of finite differences, 1/m2."""

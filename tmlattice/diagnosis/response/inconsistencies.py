@@ -11,27 +11,19 @@ with its weights and without the kicks.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.rf_by_others import rf_fitted
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
-from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT
 from tmlattice.inference.normal import Normal, solve
 from tmlattice.lattice.supplies import magnets, supplied_alike
-
-Array = NDArray[np.float64]
-
-CLEAR = 5.0
-"""Standard deviations above which gradients are reported."""
-ROUNDING = 1e-6
-"""Share of a variance below which a difference of two is a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +61,6 @@ class Inconsistency:
     chi2: float
     readings: int
     pulls: tuple[Pull, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {**vars(self), "pulls": [dict(vars(own)) for own in self.pulls]}
 
 
 def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> Inconsistency | None:
@@ -124,7 +112,7 @@ def _pulls(
     names: list[str], alone: Array, wide: Array, both: Array, narrow: Array, families: int
 ) -> tuple[Pull, ...]:
     """Inconsistent families, then single magnets."""
-    more = np.maximum(wide - narrow, ROUNDING * wide)  # the information of the RF's orbit
+    more = np.maximum(wide - narrow, REDUNDANT * wide)  # the information of the RF's orbit
     pulls = np.where(more > 0, (both - alone) / np.sqrt(np.where(more > 0, more, 1.0)), 0.0)
     order = sorted(range(len(names)), key=lambda i: (i >= families, -abs(pulls[i])))
     return tuple(
@@ -133,5 +121,5 @@ def _pulls(
             float(np.sqrt(narrow[i])), float(pulls[i]),
         )
         for i in order
-        if abs(pulls[i]) >= CLEAR
+        if abs(pulls[i]) >= SIGNIFICANT
     )  # fmt: skip

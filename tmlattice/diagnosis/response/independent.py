@@ -11,14 +11,12 @@ sum s = C M and E sum s^2 = C M (C + M + 1).)
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from tmlattice.arrays import TINY, Array
+from tmlattice.inference.judgement import FEW
 
 CLIPPED = 3.0
 """Limit of a residual, in units of the typical one: an outlier is no common pattern."""
-LEAST = 4
-"""Fewest columns and BPMs; with fewer, all readings count as independent."""
 
 
 def independent(left: Array, noise: Array) -> float:
@@ -33,13 +31,13 @@ def independent(left: Array, noise: Array) -> float:
     rows, columns = seen.any(axis=1), seen.any(axis=0)
     left, noise, seen = (own[rows][:, columns] for own in (left, noise, seen))
     C, M = left.shape
-    if min(C, M) < LEAST or not left.any():
+    if min(C, M) < FEW or not left.any():
         return 1.0
     lacking = max(1 - float(np.sum(noise**2) / np.sum(left**2)), 0.0)
     # a column or BPM with large residuals is no common pattern either
     for axis in (1, 0, 1):
         typical = np.sum(left**2, axis=axis, keepdims=True) / seen.sum(axis=axis, keepdims=True)
-        left = left / np.sqrt(np.maximum(typical, 1e-300))
+        left = left / np.sqrt(np.maximum(typical, TINY))
     squares = np.linalg.svd(np.clip(left, -CLIPPED, CLIPPED), compute_uv=False) ** 2
     white = C * M / (C + M + 1)
     share = min(float(squares.sum() ** 2 / np.sum(squares**2)) / white, 1.0)

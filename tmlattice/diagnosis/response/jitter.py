@@ -19,37 +19,29 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.beam.kicks import orbits_of_kicks
 from tmlattice.diagnosis.response.independent import independent
+from tmlattice.diagnosis.response.missing_effects import FREE
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
 from tmlattice.diagnosis.response.weights import weight
+from tmlattice.inference.judgement import DEFAULT, ENOUGH
+from tmlattice.inference.newton import AGAIN
 from tmlattice.inference.normal import amounts, common, times_precision
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
 MOST = 3
 """Most sources of a plane: two span all betatron phases, a third is for deviations from that."""
-LEAST = 5.0
-"""Log evidence required for a source, beyond the logarithm of the number of candidates."""
 SHARE = 0.25
 """Least share of the typical column's mean square residual, given its own roll, that jitter must
 explain: less is not worth a covariance."""
 SIZES = np.geomspace(0.01, 3.0, 30)
 """Prior rms of the amplitudes that are tried, in units of the typical column's rms residual."""
-PASSES = 3
-"""Repetitions of the search: the weights depend on the residual given the sources."""
-FREE = 30.0
-"""Prior rms of a corrector's own roll, in units of its column's residual: practically free."""
 ROUNDS = 30
 """Iterations of EM for the prior rms of all sources together."""
-ENOUGH = 12
-"""Fewest readings of a column for a search."""
 
 
 @dataclass(frozen=True)
@@ -124,16 +116,16 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
         return nothing
     weights, left = weights[read], np.where(weights > 0, data.pick(at.left, 1), 0.0)[read]
     rolls = data.pick(at.seen(at.across), 1)[read]
-    rolls *= FREE * _rms(left) / np.maximum(_rms(rolls), 1e-300)
+    rolls *= FREE * _rms(left) / np.maximum(_rms(rolls), TINY)
     without = rest = _rest(weights, left, _patterns(rolls, nothing.orbits))
     exits, rows = model.maps.at[data.at], model.reading_slopes[data.at, plane]
     layers = np.arange(len(model.maps.layers))
     orbits = orbits_of_kicks(model, layers, exits, rows, plane).T
     orbits *= at.errors.monitors[:, plane, plane]
-    orbits *= np.median(_rms(without)) / np.maximum(_rms(orbits), 1e-300)
+    orbits *= np.median(_rms(without)) / np.maximum(_rms(orbits), TINY)
     least = (NOISE_LEFT * data.noise_of(1)[read]) ** 2
     count = 1.0  # jitter itself would reduce the effective sample size
-    for _ in range(PASSES):
+    for _ in range(AGAIN):
         weights = count * _weights(weights > 0, rest, least)
         found, which = _places(weights, left, rolls, orbits)
         rest = _rest(weights, left, _patterns(rolls, found))
@@ -160,7 +152,7 @@ def _places(weights: Array, left: Array, rolls: Array, orbits: Array) -> tuple[A
     while len(which) < MOST:
         gained, sizes = _gains(weights, left, _patterns(rolls, found), orbits)
         best = int(np.argmax(gained))
-        if gained[best] < LEAST + np.log(len(orbits)):
+        if gained[best] < DEFAULT.log_odds + np.log(len(orbits)):
             break
         found = np.concatenate([found, sizes[best] * orbits[[best]]])
         found = _sized(weights, left, rolls, found)

@@ -15,22 +15,19 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.diagnosis.findings import located
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.result import Finding
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection
-from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.judgement import DEFAULT, FEW, WRONG
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import split_columns
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SHARE = 0.25
 """Largest ratio of the mean square residuals with and without a label."""
@@ -38,12 +35,8 @@ NEAR = 0.25
 """Share of the ring within which two elements are one range."""
 UNEXPLAINED, RATIO = 0.5, 9.0
 """Least unexplained share of a rejected channel's mean square; its least ratio to the typical."""
-ENOUGH = 4
-"""Fewest readings for a test."""
 SILENT = 0.3
 """Share of the model's response below which a channel is weak, not rejected."""
-MOST = 0.25
-"""Largest share of rejected BPMs or correctors of a plane: more of them mean another lattice."""
 
 MESSAGES = {
     **{
@@ -128,16 +121,15 @@ def label_messages(labels: Iterable[Label]) -> list[str]:
 
 
 # --- swaps ----------------------------------------------------------------------------------------
-def swaps(state: State, rejected: Collection[Label], among: Collection[str] = ()) -> list[Label]:
+def swaps(state: State, rejected: Collection[Label]) -> list[Label]:
     """Return the swapped correctors of a state; if there are none, the swapped BPMs.
 
     Args:
         state: with the model's readings.
         rejected: channels; if the phase advance is wrong, other BPMs look shifted by one cell.
-        among: correctors, besides rejected ones, that may be swapped with any other of these.
     """
     gone = {label.elements[0] for label in rejected}
-    return swapped_correctors(state, gone.union(among)) or swapped_monitors(state, gone)
+    return swapped_correctors(state, gone) or swapped_monitors(state, gone)
 
 
 def swapped_correctors(state: State, among: Collection[str]) -> list[Label]:
@@ -188,7 +180,7 @@ def _as_others(read: Array, model: Array) -> Array:
     there = np.isfinite(read)
     d = np.where(there, read, 0.0)
     both, size = np.maximum(d @ model.T, 0.0), there.astype(float) @ model.T**2
-    return np.asarray((d**2).sum(axis=1)[:, None] - both**2 / np.maximum(size, 1e-300))
+    return np.asarray((d**2).sum(axis=1)[:, None] - both**2 / np.maximum(size, TINY))
 
 
 def _pairs(
@@ -266,17 +258,17 @@ def _unlike(model: Array, read: Array, noise: Array, there: Flags) -> Flags:
     """Of each column of [reading, one]: whether no multiple of the model explains it."""
     u, d = np.where(there, model, 0.0), np.where(there, read, 0.0)
     size = (d**2).sum(axis=0)
-    gain = (u * d).sum(axis=0) / np.maximum((u**2).sum(axis=0), 1e-300)
+    gain = (u * d).sum(axis=0) / np.maximum((u**2).sum(axis=0), TINY)
     left = (d - gain * u) ** 2
-    share = left.sum(axis=0) / np.maximum(size, 1e-300)
+    share = left.sum(axis=0) / np.maximum(size, TINY)
     # a weak response, or one of noise alone, is described by a calibration or a gain
-    seen = (there.sum(axis=0) >= ENOUGH) & (size > SILENT**2 * (u**2).sum(axis=0))
+    seen = (there.sum(axis=0) >= FEW) & (size > SILENT**2 * (u**2).sum(axis=0))
     chance = chi2.sf((left / noise**2).sum(axis=0), there.sum(axis=0))
-    if seen.sum() < ENOUGH:
+    if seen.sum() < FEW:
         return np.zeros(len(share), dtype=bool)
     strange = seen & (share > max(UNEXPLAINED, RATIO * float(np.median(share[seen]))))
     strange &= chance < DEFAULT.false_alarm
-    return strange if strange.sum() <= MOST * seen.sum() else np.zeros_like(strange)
+    return strange if strange.sum() <= WRONG * seen.sum() else np.zeros_like(strange)
 
 
 def reversed_ones(state: State) -> list[str]:

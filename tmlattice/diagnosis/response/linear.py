@@ -9,16 +9,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.response.state import Kept, State
 from tmlattice.diagnosis.response.weights import taken, weighed, weight
-from tmlattice.inference.normal import Normal, Slopes, normal_equations, whole
+from tmlattice.inference.normal import Normal, Posterior, Slopes, normal_equations, solve, whole
 from tmlattice.inference.priors import Group
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 STILL = 0.05
 """Mean move of the ring, as a share of the step bounds, above which derivatives are renewed."""
@@ -77,6 +74,11 @@ class Linear(NamedTuple):
     groups: tuple[Group, ...]
     kept: Mapping[str, Kept]
     lowest: Array
+
+    @property
+    def posterior(self) -> Posterior:
+        """The solution, with the present priors."""
+        return solve(self.normal, self.groups, self.start, rounds=0)
 
     @property
     def by_ring(self) -> Array:

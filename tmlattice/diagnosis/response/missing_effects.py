@@ -14,25 +14,21 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.state import State, rms_of
+from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.weights import weight
+from tmlattice.inference.judgement import ENOUGH
 
-Array = NDArray[np.float64]
 Patterns: TypeAlias = Array | csr_array
 
 FREE = 30.0
 """Prior rms of a single parameter, in units of the largest plausible amount: nearly flat."""
-FEW = 6
-"""Largest number of amounts with such a prior."""
-CONTROL = 17
-"""Seed of the random parameters of the control."""
 SPARSE = 0.1
 """Share of non-zero readings below which patterns are sparse."""
 
@@ -70,10 +66,6 @@ class Weighed:
     evidence: float
     control_in_plane: float | None
     judgement: str
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return dict(vars(self))
 
 
 HELPS = 0.98
@@ -179,7 +171,7 @@ def control(hypothesis: Hypothesis) -> Hypothesis:
     Parameters of single columns are estimated from half of a held-out corrector's BPMs, so any
     smooth orbit improves the other half.
     """
-    rng = np.random.default_rng(CONTROL)
+    rng = np.random.default_rng(0)
     patterns = hypothesis.patterns.copy()
     monitors = patterns.shape[2]
     for c in range(patterns.shape[1]):
@@ -286,7 +278,7 @@ class Fitted:
         r = np.concatenate([part.flat @ target for part in parts]) - half.T @ self.vector
         # single amounts are free; many have the most probable scale, within physics
         owner = np.repeat(np.arange(len(parts)), np.diff(edge))
-        many = [len(part.across.T) > FEW for part in parts]
+        many = [len(part.across.T) > ENOUGH for part in parts]
         most = [one.most if m else FREE * min(one.most, 1e3)
                 for one, m in zip(hypotheses, many, strict=True)]  # fmt: skip
         spread = np.array(most)[owner]
@@ -337,9 +329,7 @@ class Fitted:
             near, far = seen & split.half[c], seen & ~split.half[c]
             for more, into in (([], inside), ([jumps[c]], jumped)):
                 both = np.stack([*patterns, *more], axis=1)
-                scale = np.abs(both[near]).max(axis=0)
-                amounts = np.linalg.lstsq(both[near] / scale, data[c, near], rcond=None)[0]
-                into.append(data[c, far] - (both[far] / scale) @ amounts)
+                into.append(amplitudes(both, data[c], near, far)[1])
         return rms_of(inside), rms_of(jumped)
 
 

@@ -7,20 +7,17 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tmlattice.diagnosis.families.family import Family, StatedCause
+from tmlattice.diagnosis.families.family import RingFamily
 from tmlattice.diagnosis.response.state import State
-from tmlattice.effects import Cause, find
+from tmlattice.effects import find
 from tmlattice.inference.priors import Group
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.observe.orbit_response import Hypothesis
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class _Others(Family):
+class _Others(RingFamily):
     """Causes of one number each; their priors are those of single faults.
 
     Attributes:
@@ -29,46 +26,16 @@ class _Others(Family):
 
     causes: tuple[Hypothesis, ...] = ()
 
-    per, trust, effects = "ring", 0.03, ()
+    trust, effects = 0.03, ()
     name: ClassVar[str]
-
-    @property
-    def units(self) -> Array:
-        """Amounts in units of the effect's largest fault, [number]."""
-        return np.array([find(effect).largest for effect, _ in self.causes])
-
-    def size(self, data: ResponseData) -> int:
-        """Number of causes."""
-        return len(self.causes)
 
     def groups(self, data: ResponseData) -> list[Group]:
         """None: each number has the prior of its single fault."""
         return []
 
-    def rows(self, at: Predicted, values: Array) -> Array:
-        """Derivatives of the response."""
-        out = np.empty((len(self.causes), *at.data.shape))
-        gain, slopes = at.gain(self.block), at.slopes_of(self.block, self.causes)
-        for row, slope, unit in zip(out, slopes, self.units, strict=True):
-            row[:] = unit * slope * gain
-        return out
-
-    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The errors with these causes in the ring."""
-        own = zip(self.causes, (values * self.units).tolist(), strict=True)
-        return replace(errors, ring=(*errors.ring, *(Cause(*h, a) for h, a in own if a)))
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """The causes with their amounts."""
-        amounts, sigmas = (values * self.units).tolist(), (sigma * self.units).tolist()
-        rows = zip(self.causes, amounts, sigmas, strict=True)
-        return [(Cause(*h, a), s) for h, a, s in rows]
-
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """The effect of each number, in its unit."""
-        return [{h: u} for h, u in zip(self.causes, self.units.tolist(), strict=True)]
+        """Each number is in units of its effect's largest fault."""
+        return [{cause: find(cause[0]).largest} for cause in self.causes]
 
 
 class OthersInPlane(_Others):

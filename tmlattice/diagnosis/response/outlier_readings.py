@@ -11,32 +11,20 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.state import State
+from tmlattice.errors import first_of
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import FEW, GROSS, OUTLIERS, SIGNIFICANT
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-GROSS = 20.0
-"""Ratio of a residual to the typical ones of its corrector and of its BPM above which a reading is
-rejected: no error of a ring has this effect on a single reading."""
-MANY_OF_STEP = 0.1
-"""Share of a step's readings above which, if more than one, its outliers are no single readings."""
-OUT = 5.0
-"""Ratio of a residual to the typical one of its column above which a reading is an outlier."""
-LEAST = 6
-"""Fewest readings of the RF's orbit for a typical residual."""
 NAMED = 3
 """Most BPMs, and correctors, named in a message."""
-MANY = 8
-"""Most outliers of the RF's orbit named in a message."""
 OFTEN = 2
 """Outliers of one BPM or corrector from which on it is named."""
-_MAD = 1.4826  # of a Gaussian
 
 
 def without_gross(measured: OrbitResponse, data: ResponseData) -> tuple[OrbitResponse, list[str]]:
@@ -81,9 +69,9 @@ def gross(data: ResponseData, read: Array) -> Flags:
             warnings.simplefilter("ignore", RuntimeWarning)  # no readings
             column, monitor = (np.nanmedian(own, axis=k, keepdims=True) for k in (1, 0))
         usual = np.fmax(np.fmax(column, monitor), data.noise[:, plane])
-        wrong[rows, :, plane] = np.nan_to_num(own) > GROSS * _MAD * usual
+        wrong[rows, :, plane] = np.nan_to_num(own) > GROSS * chi2.MAD * usual
     count = np.isfinite(data.orbits).sum(axis=(1, 2))
-    wrong[wrong.sum(axis=(1, 2)) > np.maximum(MANY_OF_STEP * count, 1)] = False
+    wrong[wrong.sum(axis=(1, 2)) > np.maximum(OUTLIERS * count, 1)] = False
     return wrong
 
 
@@ -135,10 +123,10 @@ def rf_shares(state: State, block: int, left: Array) -> Array:
         left: residuals, m, NaN where nothing is fitted, [monitor].
     """
     own = np.ones((2, len(left))) if state.rf_share is None else state.rf_share.copy()
-    if np.isfinite(left).sum() >= LEAST:
-        typical = _MAD * float(np.nanmedian(np.abs(left)))
+    if np.isfinite(left).sum() >= FEW:
+        typical = float(chi2.typical(left))
         pull = np.nan_to_num(np.abs(left) / np.maximum(state.data.noise_of(block)[-1], typical))
-        own[block] = (OUT / np.maximum(pull, OUT)) ** 4
+        own[block] = (SIGNIFICANT / np.maximum(pull, SIGNIFICANT)) ** 4
     return own
 
 
@@ -153,15 +141,13 @@ def shares(state: State, block: int, left: Array) -> Array:
     assert state.share is not None
     out = state.share.copy()
     pull = np.nan_to_num(np.abs(_pulls(state, block, left)))
-    out[block, :-1] = (OUT / np.maximum(pull, OUT)) ** 2
+    out[block, :-1] = (SIGNIFICANT / np.maximum(pull, SIGNIFICANT)) ** 2
     return out
 
 
 def _pulls(state: State, block: int, left: Array) -> Array:
     """Residuals in units of the column's typical one, or of the noise if that is larger."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # columns that are not fitted
-        typical = _MAD * np.nanmedian(np.abs(left), axis=1)
+    typical = chi2.typical(left, axis=1)
     return np.asarray(left / np.fmax(state.data.noise_of(block)[:-1], typical[:, None]))
 
 
@@ -175,7 +161,7 @@ def outlier_readings(state: State) -> list[str]:
     for block in (0, 1):
         left = np.where(state.fitted[:, None] & state.good, state.data.pick(state.at.left, block),
                         np.nan)[:-1]  # fmt: skip
-        out = np.nan_to_num(np.abs(_pulls(state, block, left))) > OUT
+        out = np.nan_to_num(np.abs(_pulls(state, block, left))) > SIGNIFICANT
         count, total = count + int(out.sum()), total + int(np.isfinite(left).sum())
         monitors.update(measured.monitors[i] for i in np.nonzero(out)[1])
         correctors.update(measured.correctors[i] for i in np.nonzero(out)[0])
@@ -183,7 +169,7 @@ def outlier_readings(state: State) -> list[str]:
         return messages
     return [
         *messages,
-        f"{count} of {total} readings are outliers, by more than {OUT:g} times the typical "
+        f"{count} of {total} readings are outliers, by more than {SIGNIFICANT:g} times the typical "
         f"residual of their corrector, and have reduced weights{_most(monitors, correctors)}.",
     ]
 
@@ -195,9 +181,8 @@ def _odd_rf(state: State) -> list[str]:
     odd = np.flatnonzero((state.rf_share < 1).any(axis=0) & state.good)
     if not len(odd):
         return []
-    names = ", ".join(state.data.measured.monitors[i] for i in odd[:MANY])
-    more = f" and {len(odd) - MANY} more" if len(odd) > MANY else ""
+    names = first_of([state.data.measured.monitors[i] for i in odd])
     return [
-        f"outlier readings of the RF's orbit, by more than {OUT:g} times its typical residual, "
-        f"with almost no weight: {names}{more}."
+        f"outlier readings of the RF's orbit, by more than {SIGNIFICANT:g} times its typical "
+        f"residual, with almost no weight: {names}."
     ]

@@ -28,36 +28,23 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import TINY, Array, Flags, Indices
 from tmlattice.beam.kicks import orbits_of_kicks
+from tmlattice.diagnosis.families.fields import FURTHEST
 from tmlattice.diagnosis.response.labels import SHARE, Label, swapped_correctors
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
+from tmlattice.diagnosis.response.weights import BLIND
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import ENOUGH, FEW, OUTLIERS, SIGNIFICANT, WRONG
+from tmlattice.observe.noise import SAME_PLACE
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Flags = NDArray[np.bool_]
-
-TIMES = 5.0
-"""Least ratio of an outlier to the typical one."""
-MOST = 0.25
-"""Largest share of outliers: more of them are model discrepancy."""
 ANYWHERE = 2.0
 """Weight of the residual given a kick, whose place is free."""
-LEAST = 0.05
-"""Displacement of a corrector, m, that the shape of any field explains."""
-ENOUGH, COLUMNS = 10, 5
-"""Fewest readings of a column, and columns of a plane."""
-BLIND = 0.2
-"""Gain below which a BPM does not read the beam."""
-SPARED = 0.1
-"""Largest share of readings that are omitted because they are between two places of a corrector."""
-MARGIN, SAME = 1.5, 1e-6
-"""Margin beyond the estimated place, as a share of the distance, that counts as between; and the
-distance, m, below which elements have one place."""
+MARGIN = 1.5
+"""Margin beyond the estimated place, as a share of the distance, that counts as between."""
 GAINS, ROLLS = "monitor_gain", "corrector_roll"
 """Families without which residuals look like kicks, and rolled correctors like spurious kicks."""
-_MAD = 1.4826  # of a Gaussian
 
 
 def outlying(sizes: Array, of: Array, least: float) -> Flags:
@@ -70,12 +57,12 @@ def outlying(sizes: Array, of: Array, least: float) -> Flags:
         least: typical size at least.
     """
     known = np.isfinite(sizes)
-    if known.sum() < COLUMNS:
+    if known.sum() < FEW:
         return np.zeros(len(sizes), dtype=bool)
     share = np.where(known, sizes, 0.0) / of
-    out = np.nan_to_num(sizes) > TIMES * max(float(np.median(sizes[known])), least)
-    out &= share > TIMES * float(np.median(share[known]))
-    return out if out.sum() <= MOST * known.sum() else np.zeros_like(out)
+    out = np.nan_to_num(sizes) > SIGNIFICANT * max(float(np.median(sizes[known])), least)
+    out &= share > SIGNIFICANT * float(np.median(share[known]))
+    return out if out.sum() <= WRONG * known.sum() else np.zeros_like(out)
 
 
 def outlier_steps(state: State) -> list[Label]:
@@ -170,12 +157,12 @@ class _Step:
         data = self.state.data
         every = np.ones(len(self.left), dtype=bool)
         by, missed = self._displaced(every)
-        by, _ = self._displaced(missed <= np.quantile(missed, 1 - SPARED))
+        by, _ = self._displaced(missed <= np.quantile(missed, 1 - OUTLIERS))
         way = np.array([data.ring[data.measured.monitors[m]].s for m in self.seen])
         way -= data.ring[data.measured.correctors[self.column]].s
-        beyond = (np.sign(by) * way + SAME) % data.ring.length - SAME
+        beyond = (np.sign(by) * way + SAME_PLACE) % data.ring.length - SAME_PLACE
         between = beyond <= MARGIN * abs(by)
-        return ~between if between.sum() <= max(SPARED * len(every), 1) else every
+        return ~between if between.sum() <= max(OUTLIERS * len(every), 1) else every
 
     def _displaced(self, among: Flags) -> tuple[float, Array]:
         patterns = np.column_stack([self.own, self.jump])
@@ -205,7 +192,7 @@ class _Step:
         normal = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)])
         size = np.sqrt((normal**2).sum(axis=0))
         triples = (normal * np.stack([left[:-2], left[1:-1], left[2:]])).sum(axis=0)
-        return _MAD * float(np.median(np.abs(triples[size > 0] / size[size > 0])))
+        return float(chi2.typical(triples[size > 0] / size[size > 0]))
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -247,7 +234,7 @@ def _labels(state: State, kicked: int, read: int) -> Iterator[Label]:
     pairs, usual = list[Label](), np.inf
     if kicked == read:
         pairs = swapped_correctors(state, {names[steps[i].column] for i in np.flatnonzero(odd)})
-        usual = max(TIMES * _MAD * float(np.median([abs(s.by) for s in steps])), LEAST)
+        usual = max(SIGNIFICANT * float(chi2.typical([s.by for s in steps])), FURTHEST)
     kicks = _kicks(state, read) if gains else np.zeros((0, data.shape[1]))
     for step in (steps[i] for i in np.flatnonzero(odd)):
         least, label = SHARE * step.missed(half=True), None
@@ -294,9 +281,9 @@ def _table(
     if len(kicks):
         near = np.arange(len(step.left)) % 2 == 0
         own, patterns = step.own[near], kicks[:, step.seen]
-        own = own / max(float(np.sqrt(own @ own)), 1e-300)
+        own = own / max(float(np.sqrt(own @ own)), TINY)
         across = patterns[:, near] - np.outer(patterns[:, near] @ own, own)
-        squares = np.maximum((across**2).sum(axis=1), 1e-300)
+        squares = np.maximum((across**2).sum(axis=1), TINY)
         score = across @ step.left[near]
         layer = int(np.argmax(score**2 / squares))
         words = (

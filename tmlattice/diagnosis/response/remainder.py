@@ -11,17 +11,14 @@ of the held-out corrector's calibration and roll. The kick of a held-out correct
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.diagnosis.assessment import Block
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_sizes
-from tmlattice.inference.normal import Posterior, solve
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from tmlattice.inference.normal import Posterior
 
 BLOCKS = ("in-plane", "coupling", "RF")
 
@@ -59,7 +56,7 @@ def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, 
     if not state.of_block(block):
         return None, None, None
     there = linear(state, block)
-    found = solve(there.normal, there.groups, there.start, rounds=0)
+    found = there.posterior
     return there, found, of_sizes(state, block, there)
 
 
@@ -101,7 +98,7 @@ class _Sum:
         size = 0 if found is None or more is None else len(found.prior) + more.shape[1]
         self.vector, self.matrix = np.zeros(size), np.eye(size)
 
-    def add(self, column: int, monitors: NDArray[np.bool_], free: bool = False) -> None:
+    def add(self, column: int, monitors: Flags, free: bool = False) -> None:
         """The readings of a column at some BPMs; with its kick free or fixed."""
         read = np.flatnonzero(
             monitors & np.isfinite(self.left[column]) & np.isfinite(self.noise[column])

@@ -6,23 +6,18 @@ the residual is (Q y) / Q_ii. For a linear fit with priors, Q y is the weighted 
 weights less the information that the fit takes. These residuals reveal families that fit each BPM
 by itself and predict none.
 
->>> there = linear(state, 0); found = solve(there.normal, there.groups, there.start, rounds=0)
+>>> there = linear(state, 0); found = there.posterior
 >>> rf_by_others(state, there, found)
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from tmlattice.arrays import INVISIBLE, Array, Indices
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference.normal import Posterior
-
-Array = NDArray[np.float64]
-
-LEAST = 1e-9
-"""Least share of a reading's weight after the fit, above rounding errors."""
 
 
 def rf_by_others(state: State, there: Linear | None, found: Posterior | None) -> Array:
@@ -44,11 +39,11 @@ def rf_by_others(state: State, there: Linear | None, found: Posterior | None) ->
         fitted = solve_triangular(found.factor, (weights @ rows @ found.spread).T, lower=True)
         precision -= (fitted**2).sum(axis=0)
     out = np.full(state.data.shape[1], np.nan)
-    out[read] = weights @ left / np.maximum(precision, LEAST * weights.diagonal())
+    out[read] = weights @ left / np.maximum(precision, INVISIBLE * weights.diagonal())
     return out
 
 
-def rf_fitted(state: State) -> tuple[NDArray[np.int64], Array, Array]:
+def rf_fitted(state: State) -> tuple[Indices, Array, Array]:
     """Return the BPMs at which the RF's orbit is fitted, the inverse covariance of these readings,
     1/m2, and their residuals, m."""
     column = len(state.data.plane) - 1

@@ -12,34 +12,30 @@ import numpy as np
 
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.weights import good_monitors, sound_monitors
+from tmlattice.diagnosis.response.weights import good_monitors
+from tmlattice.inference.judgement import GROSS
 
 log = logging.getLogger(__name__)
-
-HOPELESS = 20.0
-"""Ratio to the median rms residual above which a BPM stays rejected: with all families fitted, no
-magnet's error has that effect on a sound BPM."""
-WORTH = 0.5
-"""Log evidence that the other readings may lose for each reading regained: one standard error."""
 
 
 def taken_back(state: State) -> State:
     """Return the converged state with the rejected neighbours that agree with the fit."""
-    aside = ~state.good & good_monitors(state, HOPELESS)
+    aside = ~state.good & good_monitors(state, bad=GROSS)
     together = aside & (np.roll(aside, 1) | np.roll(aside, -1))
     if not together.any():
         return state
     good = state.good | together
     trial = settle(replace(state, good=good), look_at_monitors=False)
-    sound = sound_monitors(trial)
+    sound = good_monitors(trial) & good_monitors(trial, 1)
     back = together & sound
     lost = log_evidence(state, state.good, state.independent) - log_evidence(
         trial, state.good, state.independent
     )
     orbits = state.data.pick(state.data.orbits)[state.fitted]
     readings = int(np.isfinite(orbits[:, back]).sum())
+    # each regained reading may cost a standard error
     log.info("rejected neighbours: %s, sound: %s; evidence of the others falls by %.1f",
              np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
-    if not back.any() or (state.good & ~sound).any() or lost > WORTH * readings:
+    if not back.any() or (state.good & ~sound).any() or lost > readings / 2:
         return state
     return settle(replace(trial, good=state.good | back))

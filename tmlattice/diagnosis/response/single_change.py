@@ -11,29 +11,23 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.response.undetermined import Blur
 from tmlattice.effects import Cause, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.distributed import MarginalProblem
-from tmlattice.inference.newton import Fit, Outcome
+from tmlattice.inference.judgement import DEFAULT
+from tmlattice.inference.newton import AGAIN, Fit, Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.whitening import directions_of
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 AMOUNTS = np.geomspace(1e-5, 1.2, 120)
 """Start of the search for the most probable amount, as a share of the largest fault."""
 STEP = 0.01
 """Start for a change of unknown amount, as a share of the largest fault."""
-LINEARISED = 3
-"""Iterations of the change at its most probable amount."""
-SAME = 0.02
-"""Relative change of the amount below which the iterations end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +102,7 @@ class SingleChange:
         try:
             unit = self.blur.of((Cause(*hypothesis, at),)) / at**effect.power
             spread = self.plain.as_rows(unit)
-            for _ in range(LINEARISED):
+            for _ in range(AGAIN):
                 slope = self._made((Cause(*hypothesis, at),)) / at**effect.power
                 line = _Line(self.left, slope, spread)
                 near = None if found is None else at
@@ -117,7 +111,7 @@ class SingleChange:
                     found = self._amount(line, hypothesis, None)
                 if found is None:
                     return None
-                if effect.discrete or abs(found[0] - at) <= SAME * abs(found[0]):
+                if effect.discrete or abs(found[0] - at) <= DEFAULT.same * abs(found[0]):
                     break
                 at = found[0]
             assert found is not None

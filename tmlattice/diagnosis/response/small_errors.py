@@ -14,9 +14,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from tmlattice.arrays import Array, Flags
+from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import (
@@ -43,9 +44,6 @@ from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
 log = logging.getLogger(__name__)
 
 USUAL: tuple[Family, ...] = (
@@ -55,8 +53,6 @@ USUAL: tuple[Family, ...] = (
 """Families of every ring."""
 ANEW = 20_000
 """Most readings for a second fit, from the design, because the given one may be of a wrong ring."""
-EXPLAINED = 1.5
-"""Chi-square per reading of each plane below which one start is sufficient."""
 SIZES = 12
 """Rounds of EM for the prior scales."""
 SHARED = {
@@ -91,7 +87,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
             continue
         found.append((log_evidence(state, state.good), state))
         log.info("distributed errors: evidence %.1f", found[-1][0])
-        if all(own.per_reading < EXPLAINED for own in fit_chi2(state)[:2]):
+        if all(own.per_reading < MISSING for own in fit_chi2(state)[:2]):
             break
     return max(found, key=lambda one: one[0])[1] if found else continued
 

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import AT_ONCE, Array, Flags
+from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
+from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import StepwiseFit
@@ -24,8 +26,8 @@ from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection, leading
-from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.newton import Fit, fit
+from tmlattice.inference.judgement import BEYOND, Judgement
+from tmlattice.inference.newton import AGAIN, ITERATIONS, Fit, fit
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Identified, Search, explain
 from tmlattice.observe.orbit_response import Hypothesis, Predicted
@@ -33,17 +35,14 @@ from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response, single_causes
 from tmlattice.observe.split import Split
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
 MOST = 3
 """Most causes of a sparse solution: each costs a search of its own."""
 
 RARER = 100.0
 """Log prior odds of each further cause: the residual of an inexact cause looks like one more."""
 
-NOISE, REST = 1.5, 0.01
-"""Chi-square per reading, and share of the gap, below which a sparse solution is accepted although
+REST = 0.01
+"""Share of the gap below which a sparse solution is accepted although
 it leaves more than noise. Understated noise leaves as much, distributed errors leave more."""
 
 
@@ -51,19 +50,12 @@ PATTERNS, SPARE = 2, 2
 """Patterns of a cause: a thin error at one place changes each plane's response by a product of a
 column and a row. Spare patterns are for a magnet's length and sextupoles."""
 
-ROUNDS, SETTLED = 30, 0.99
-"""Rounds of filling in missing readings, and the least gain of chi-square in a round."""
-
-LESS = 0.98
-"""Ratio of rms, both planes multiplied, below which the hierarchical fit is preferred."""
-
-LARGER = 2.0
-"""Ratio to the largest fault above which a kick is implausible: it fits tunes by sextupoles."""
+SETTLED = 0.99
+"""Least gain of chi-square in a round of filling in missing readings."""
 
 
-BLURRED, AGAIN, LEADING, NEAR = 2 * 10**7, 3, 3, 12
-"""Most products of readings and undetermined errors; most searches; and hypotheses, before and
-after one of them explains the readings."""
+LEADING, NEAR = 3, 12
+"""Hypotheses that are tried, before and after one of them explains the readings."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +132,7 @@ def sparse_fit(
     count = int(problem.used.sum())
     gap = max(before.chi2 - count, 1.0)
     stated = float(chi2.isf(judgement.noise[1], count))
-    enough = max(stated, min(NOISE * count, count + REST * gap))
+    enough = max(stated, min(MISSING * count, count + REST * gap))
     search = _Search(
         problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress,
         stated=stated,
@@ -149,7 +141,7 @@ def sparse_fit(
         found = _explained(search, problem, before, gap)
     except UnstableRingError:  # the sparse solution stores no beam
         found = None
-    if open_ is not None and open_.root.size and open_.size(problem) <= BLURRED:
+    if open_ is not None and open_.root.size and open_.size(problem) <= AT_ONCE:
         found = _among_open(search, problem, before, found, open_)
     if found is None:
         return None
@@ -166,7 +158,7 @@ def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bo
     of_all = fit.heldout[1]
     of_few = score(replace(state, good=fit.state.good), state.split.held)
     gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
-    return bool(np.nansum(gained) < np.log(LESS))
+    return bool(np.nansum(gained) < np.log(HELPS))
 
 
 def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> Explanation | None:
@@ -267,7 +259,7 @@ def _hopeless(
     others = [h for h in hypotheses
               if not find(h[0]).responds or isinstance(find(h[0]), LaunchEffect)]  # fmt: skip
     seen = scan(problem.metric(left.point), others, left.residual, effective=1.0)
-    fault = np.abs(seen.amount) < LARGER * np.array([find(h[0]).largest for h in seen.hypotheses])
+    fault = np.abs(seen.amount) < BEYOND * np.array([find(h[0]).largest for h in seen.hypotheses])
     return bool(seen.statistic[fault].max(initial=0.0) < (left.chi2 - problem.used.sum()) / 2)
 
 
@@ -278,7 +270,7 @@ def _beyond(problem: Response, before: Fit, patterns: int, enough: float) -> flo
     left = problem.left(before.point)[0].reshape(len(problem.used), -1)
     used = problem.used.reshape(left.shape)
     filled, rest = left, np.inf
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         columns, size, rows = np.linalg.svd(filled, full_matrices=False)
         model = (columns[:, :patterns] * size[:patterns]) @ rows[:patterns]
         before_that, rest = rest, float(((left - model)[used] ** 2).sum())

@@ -9,24 +9,21 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.errors import UnstableRingError
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import FEW
 from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
 log = logging.getLogger(__name__)
 
 ALONE = 0.3
 """Ratio to which a column's misfit falls by its own number if it has no other significant error."""
-FEW = 3
-"""Readings required to check the gain of a BPM."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +136,7 @@ def begin(data: ResponseData, split: Split) -> State:
     """The state of the design."""
     at = Predicted(data, Errors.none(data))
     gap = data.pick(at.left)[~split.held]
-    size = float(np.nanmedian(np.abs(gap))) / 0.6745
+    size = float(chi2.typical(gap))
     return State(
         data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
     )

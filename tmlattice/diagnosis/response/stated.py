@@ -1,23 +1,20 @@
 """The stated errors of a hierarchical fit's numbers.
 
 >>> there = linear(state, 0)
->>> posterior = solve(there.normal, there.groups, there.start, rounds=0)
->>> sigma = stated(state, 0, there, posterior).sigma
+>>> sigma = stated(state, 0, there, there.posterior).sigma
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import Apart, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import errors
 from tmlattice.inference.errors import MAX_MEMBERS, LinearFit, Rows, cluster_robust_errors, moments
 from tmlattice.inference.normal import Posterior
-
-Array = NDArray[np.float64]
 
 
 class Stated(NamedTuple):
@@ -37,8 +34,7 @@ class Stated(NamedTuple):
 def unwidened(posterior: Posterior) -> Stated:
     """Posterior errors without widening."""
     prior = np.sqrt(np.sum(posterior.spread**2, axis=1))
-    covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
-    return Stated(posterior.sigma, prior, covariance)
+    return Stated(posterior.sigma, prior, posterior.whole)
 
 
 def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Stated:
@@ -63,8 +59,7 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
 
 def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
     """Return posterior errors, widened for columns or BPMs that contradict all others."""
-    covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
-    found = LinearFit.of(there.normal.matrix, covariance)
+    found = LinearFit.of(there.normal.matrix, posterior.whole)
     return _widened(state, block, there, posterior, found)
 
 
@@ -92,10 +87,9 @@ def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> floa
     """
     ends = np.cumsum([group.basis.shape[1] for group in posterior.groups])
     at = int(ends[[group.name for group in posterior.groups].index(one.name)]) - 1
-    covariance = posterior.spread @ posterior.covariance @ posterior.spread.T
     along = one.wide * posterior.spread @ posterior.covariance[:, [at]]
     variance = one.wide**2 * posterior.covariance[[at], at]
-    found = LinearFit(there.normal.matrix, covariance, along, variance)
+    found = LinearFit(there.normal.matrix, posterior.whole, along, variance)
     (sigma,) = _widened(state, one.block, there, posterior, found)
     return float(sigma**2 / variance[0])
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.others import KINDS
@@ -25,12 +25,8 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Hypothesis
 
-Array = NDArray[np.float64]
-
 AFFORDABLE = 4e9
 """Most products of signatures and derivatives; above it only numbers of families are compared."""
-BLIND = 1e-6
-"""Least share of a signature's information that remains given the distributed errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +216,7 @@ class Seen:
             along = found.spread.T @ it.across
             taken = np.einsum("ph,ph->h", along, found.covariance @ along)
             information[block] = np.maximum(it.own - taken, 0.0)
-            information[block][information[block] < BLIND * it.own] = 0.0
+            information[block][information[block] < REDUNDANT * it.own] = 0.0
             inner[block] = it.left - (found.values - it.there.start) @ it.across
         inner[information == 0] = 0.0
         total = information.sum(axis=0)

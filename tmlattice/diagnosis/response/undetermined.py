@@ -11,19 +11,17 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from tmlattice.arrays import Array
+from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import Cause, background_rms, find
 from tmlattice.inference.distributed import MarginalProblem
-from tmlattice.inference.normal import solve
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.response_problem import Response
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +42,7 @@ class Undetermined:
 
 
 ORBITS = (
-    "quadrupole_offset_x", "quadrupole_offset_y", "dipole_field", "dipole_roll",
-    "sextupole_offset_x", "sextupole_offset_y",
+    *HorizontalOrbit.effects, *VerticalOrbit.effects, "sextupole_offset_x", "sextupole_offset_y",
 )  # fmt: skip
 """Effects that make orbits: a response hardly shows them, but a change of sextupoles does."""
 
@@ -55,7 +52,7 @@ def undetermined(state: State) -> Undetermined:
     blocks: list[dict[Hypothesis, Array]] = []
     for block in (block for block in (0, 1) if state.of_block(block)):
         there = linear(state, block)
-        found = solve(there.normal, there.groups, there.start, rounds=0)
+        found = there.posterior
         numbers = found.spread @ np.linalg.cholesky(found.covariance)
         amounts: dict[Hypothesis, Array] = {}
         for family in {f.variable: f for f in state.of_block(block)}.values():

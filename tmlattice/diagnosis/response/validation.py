@@ -5,16 +5,14 @@ scored on the other half. The outer validation set (`score`) selects nothing. Th
 (`inner`) selects families, with standard errors, because it may have only four correctors.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
+from tmlattice.diagnosis.records import HIDDEN
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """Weights of log rms in the validation score: in-plane, coupling, RF (one reading per BPM); and the
@@ -22,8 +20,8 @@ fall of the score that rejects a family against the evidence, which may fit mode
 FLOOR = np.array([0.1, 0.1, 1.0])
 """Share of the noise that is added to each rms in quadrature, in-plane, coupling and RF: for
 readings without noise (simulated ones) a smaller residual is no improvement."""
-SURELY, WORTH = 1.0, 0.05
-"""Least significant fall of the score, in standard errors; the least one that rejects jitter."""
+WORTH = 0.05
+"""Least fall of the score that rejects jitter."""
 
 
 class Chi2(NamedTuple):
@@ -75,7 +73,7 @@ class Step:
     dispersion_rms: float
     heldout_rms_position: float = float("nan")
     heldout_rms_roll: float = float("nan")
-    kept: bool = True
+    kept: bool = field(default=True, metadata=HIDDEN)
 
     @classmethod
     def scored(cls, effect: str, parameters: int, s: Score) -> "Step":
@@ -84,10 +82,6 @@ class Step:
             effect, parameters, s.in_plane, s.coupling, s.chi2_per_dof, s.dispersion, s.position,
             s.roll,
         )  # fmt: skip
-
-    def as_json(self) -> dict[str, Any]:
-        """The entry in the file of the diagnosis."""
-        return {name: value for name, value in vars(self).items() if name != "kept"}
 
 
 class _Missed(NamedTuple):
@@ -122,7 +116,8 @@ def _missed(
     """Residuals of held-out correctors; see `score`.
 
     Args:
-        state, validation, rf: as there.
+        state, validation: as there.
+        rf: BPMs that validate the RF's response, [monitor]; None: those that are not fitted.
         jitter: orbits of beam jitter, see `State`, whose amplitudes the near BPMs determine, too.
     """
     data, at, half = state.data, state.at, state.split.half
@@ -175,15 +170,14 @@ def _missed(
                    of_rf**2 / variance[-1, scored], scored)  # fmt: skip
 
 
-def score(state: State, validation: Flags, rf: Flags | None = None) -> Score:
+def score(state: State, validation: Flags) -> Score:
     """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
     Args:
         state: to validate.
         validation: the held-out correctors, [column].
-        rf: BPMs that validate the RF's response, [monitor]; None: those that are not fitted.
     """
-    missed = _missed(state, validation, rf)
+    missed = _missed(state, validation)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
     return Score(
         in_plane=rms_of(missed.inside),
@@ -272,8 +266,8 @@ def lost(without: Validated, within: Validated) -> tuple[float, float]:
 
 
 def against(change: tuple[float, float], least: float = VETO) -> bool:
-    """Return whether validation is significantly better without, by `lost`, and by `least`."""
-    return change[0] < -max(least, SURELY * change[1])
+    """Return whether validation is better without, by `lost`: by a standard error and `least`."""
+    return change[0] < -max(least, change[1])
 
 
 def in_favour(change: tuple[float, float]) -> bool:

@@ -7,29 +7,21 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import REDUNDANT, TINY, Array, Flags
 from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
 from tmlattice.diagnosis.response.state import State
+from tmlattice.inference import chi2
+from tmlattice.inference.judgement import FEW, OUTLIERS, SIGNIFICANT
 from tmlattice.inference.normal import amounts, common, times_precision
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-BAD = 5.0
-"""Ratio of a BPM's rms residual, given its own gain, to the median one above which it is bad."""
-SPARED = 0.1
-"""Share of a BPM's readings, the largest residuals, without which it must be bad too: few outliers
-are rejected as readings."""
-FEW = 4
-"""Fewest correctors of a plane for the test of BPMs."""
 TYPICAL = 10.0
 """Number of readings by which the typical misfit counts in the model discrepancy of each column."""
 LEAST = 0.2
 """Least model discrepancy, and least noise given jitter, as a share of the noise."""
-ROUNDED = 1e-6
-"""Relative size of rounding errors: two equal responses differ by less."""
+BLIND = 0.2
+"""Gain below which a BPM does not read the beam."""
 DISPERSION = "quadrupole_gradient"
 """The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
 many times all others, and would bias the BPM gains."""
@@ -112,7 +104,7 @@ def look(state: State, block: int) -> State:
     left, alone = _without_jitter(state, block, left)
     if state.share is not None:
         state = replace(state, share=shares(state, block, left[:-1]))
-    typical = float(np.nanmedian(np.abs(left[:-1, state.good]))) / 0.6745
+    typical = float(chi2.typical(left[:-1, state.good]))
     noise = float(np.median(data.noise))
     share = 1.0 if state.share is None else state.share[block]
     shared = TYPICAL * typical**2 + np.nansum(share * left**2, axis=1)
@@ -122,7 +114,9 @@ def look(state: State, block: int) -> State:
         state = replace(state, rf_share=rf_shares(state, block, left[-1]))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
-    good = state.good & _good_across(state) if block else good_monitors(state)
+    good = good_monitors(state, block)
+    if block:
+        good &= state.good
     return _independent(replace(state, lacking=lacking, good=good), block, left, alone)
 
 
@@ -139,57 +133,35 @@ def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     return replace(state, independent=own)
 
 
-def good_monitors(state: State, bad: float = BAD) -> Flags:
-    """Return the BPMs that agree with the others in the kicked plane, [monitor].
+def good_monitors(state: State, block: int = 0, bad: float = SIGNIFICANT) -> Flags:
+    """Return the BPMs that agree with the others, given gains, [monitor]; in the plane that is not
+    kicked also given fitted skew gradients, before which all are good.
 
     Args:
         state: of the fit.
+        block: 0 in-plane, 1 coupling.
         bad: ratio to the median rms residual, given gains, above which a BPM is bad.
     """
     data = state.data
-    read, orbits = data.pick(state.at.read), data.pick(data.orbits)
     ratio = np.zeros(data.shape[1])
-    for p in (0, 1):
+    read, orbits = data.pick(state.at.read, block), data.pick(data.orbits, block)
+    for p in (0, 1) if block == 0 or state.allows(COUPLING) else ():
         rows = state.fitted & (data.plane == p)
         if rows.sum() < FEW:
             continue
         own = np.full(data.shape[1], np.inf)
-        rounded = ROUNDED * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
-        for spared in (0.0, SPARED):
+        rounded = REDUNDANT * float(np.sqrt(np.mean(np.nan_to_num(orbits[rows]) ** 2)))
+        for spared in (0.0, OUTLIERS):
             rms, gain, count = _given_own_gain(read[rows], orbits[rows], spared)
-            rms[gain < 0.2] = np.inf  # reversed, until gains are fitted
+            if block == 0:
+                rms[gain < BLIND] = np.inf  # reversed, until gains are fitted
             read_at_all = count > 0  # a plane may have no readings
             typical = max(np.median(rms[read_at_all]), rounded) if read_at_all.any() else np.inf
             # otherwise the fit has diverged, and BPMs are not bad
-            share = rms / typical if np.isfinite(typical) else np.zeros_like(rms)
+            share = rms / typical if 0 < typical < np.inf else np.zeros_like(rms)
             own = np.minimum(own, np.where(read_at_all, share, 0.0))
         ratio = np.maximum(ratio, own)
     return np.asarray(ratio <= bad)
-
-
-def sound_monitors(state: State) -> Flags:
-    """Return the BPMs that agree with the others in both planes, [monitor]."""
-    return good_monitors(state) & _good_across(state)
-
-
-def _good_across(state: State) -> Flags:
-    """The good BPMs in the plane that is not kicked, given gains and fitted skew gradients."""
-    data = state.data
-    good = np.ones(data.shape[1], dtype=bool)
-    if not state.allows(COUPLING):
-        return good
-    read, orbits = data.pick(state.at.read, 1), data.pick(data.orbits, 1)
-    for p in (0, 1):
-        rows = state.fitted & (data.plane == p)
-        if rows.sum() < FEW:
-            continue
-        bad = np.ones(data.shape[1], dtype=bool)
-        for spared in (0.0, SPARED):
-            rms, _, count = _given_own_gain(read[rows], orbits[rows], spared)
-            usual = rms[(count > 0) & state.good]
-            bad &= rms > BAD * np.median(usual) if len(usual) else False
-        good &= ~bad
-    return good
 
 
 def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Array, Array, Array]:
@@ -213,4 +185,4 @@ def _given_own_gain(read: Array, orbits: Array, spared: float = 0.0) -> tuple[Ar
 
 def _gain(read: Array, orbits: Array, seen: Flags) -> Array:
     u, d = np.where(seen, read, 0), np.where(seen, orbits, 0)
-    return np.asarray((u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), 1e-30))
+    return np.asarray((u * d).sum(axis=0) / np.maximum((u * u).sum(axis=0), TINY))

@@ -1,0 +1,21 @@
+"""Types of numpy arrays, and their sizes, largest and smallest."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+AT_ONCE = 2**24
+"""Numbers of an intermediate array in memory, 128 MB."""
+TINY = 1e-100
+"""In place of a divisor of zero; its square is a number, too."""
+ROUNDING = 1e-11
+"""Relative rounding error of a sum over all readings."""
+INVISIBLE = 1e-9
+"""Share of a square below which what is left of it may be rounding."""
+REDUNDANT = 1e-6
+"""Share of the information on a number below which the others determine it: what remains may be the
+rounding of large sums."""
