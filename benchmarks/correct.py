@@ -40,7 +40,7 @@ from scipy.stats import norm
 
 from tmlattice import diagnose, load_ring
 from tmlattice.correction import correct, default_knobs, solve
-from tmlattice.correction.estimate import estimate_of, estimate_with
+from tmlattice.correction.estimate import Estimate, estimate_of
 from tmlattice.correction.targets import ENERGY, Targets
 from tmlattice.effects import Cause, RingEffect, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
@@ -262,14 +262,13 @@ def case(ring, seed, options):
               "seconds_correction": time.process_time() - then}  # fmt: skip
     found |= {"tmlattice": left(of_settings(own, made)), "refused": own.refused,
               "devices": len(own.settings), "now": own.before, "expected": own.after,
-              "iterations": own.iterations,
               "at_limit": sum(s.at_limit for s in own.settings)}  # fmt: skip
     if options.sigmas:
         found["prices"] = {
             f"{n:g}": price(estimate, knobs, n, lambda c: left(of_settings(c, made))["square"])
             for n in options.sigmas
         }
-    truth = estimate_with(apply(ring, on_ring), ring, None)
+    truth = Estimate(apply(ring, on_ring), ring)
     best = correct(truth, knobs=[replace(k, error=0.0) for k in knobs], targets=OPTICS)
     found["oracle"] = left(of_settings(best))
     if options.kind == "response" and not options.alone:

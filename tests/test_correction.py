@@ -16,7 +16,7 @@ from tmlattice import correct, diagnose, simulate, write_measurement
 from tmlattice.cli.command import tmlattice
 from tmlattice.correction import Knob, default_knobs, read_knobs
 from tmlattice.correction.applied import applied, sentence
-from tmlattice.correction.estimate import estimate_with, read_estimate
+from tmlattice.correction.estimate import Estimate, read_estimate
 from tmlattice.correction.first_turn import estimate_of_turns
 from tmlattice.correction.knobs import read_settings, write_knobs
 from tmlattice.correction.result import read_correction
@@ -165,7 +165,7 @@ def test_limits_steps_and_excitation_curves(small_ring, wrong):
 
 def test_the_rf_frequency_moves_the_energy(small_ring):
     """An orbit of another energy: the RF brings it back."""
-    shifted = estimate_with(small_ring, small_ring, None)
+    shifted = Estimate(small_ring, small_ring)
     found = correct(replace(shifted, energy=2e-4), knobs=["rf"], targets=["closed_orbit"])
     (rf,) = found.settings
     assert rf.knob.unit == "Hz"
@@ -188,7 +188,7 @@ def test_intervals_hold_what_they_state(small_ring, quadrupoles):
     rng = np.random.default_rng(7)
     mean = 0.01 * rng.standard_normal(len(quadrupoles))
     known = posterior(quadrupoles, 2e-3, mean)
-    estimate = estimate_with(small_ring, small_ring, known)
+    estimate = Estimate(small_ring, small_ring, known)
     found = correct(estimate, knobs=["quadrupoles"], targets=NO_ORBIT)
     inside = []
     for _ in range(60):
@@ -222,7 +222,7 @@ def test_first_turns_alone_are_corrected(small_ring):
 def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupoles):
     """No error is known, all are possible: nothing is gained, and nothing is set."""
     found = correct(
-        estimate_with(small_ring, small_ring, posterior(quadrupoles, 5e-3)),
+        Estimate(small_ring, small_ring, posterior(quadrupoles, 5e-3)),
         knobs=["quadrupoles"], targets=NO_ORBIT,
     )  # fmt: skip
     assert found.settings == ()
@@ -232,7 +232,7 @@ def test_what_the_data_leave_undetermined_is_not_corrected(small_ring, quadrupol
     assert found.before == found.after
     rng = np.random.default_rng(3)
     small = posterior(quadrupoles, 5e-3, 1e-4 * rng.standard_normal(len(quadrupoles)))
-    hardly = correct(estimate_with(small_ring, small_ring, small), targets=["beta_beating"])
+    hardly = correct(Estimate(small_ring, small_ring, small), targets=["beta_beating"])
     assert not hardly.settings or hardly.gain > 2 * hardly.gain_error
 
 
@@ -241,7 +241,7 @@ def test_what_is_sure_to_gain_is_set(small_ring, quadrupoles):
     rms = np.array([1e-5 if name.startswith("QF") else 8e-3 for name in quadrupoles])
     mean = np.full(len(quadrupoles), 2e-3)
     known = replace(posterior(quadrupoles, 1.0, mean), rms=rms)
-    found = correct(estimate_with(small_ring, small_ring, known), targets=["tunes"])
+    found = correct(Estimate(small_ring, small_ring, known), targets=["tunes"])
     amounts = {s.knob.name: s.amount for s in found.settings}
     assert amounts["QF"] == pytest.approx(-2e-3, rel=0.15)
     assert abs(amounts.get("QD", 0.0)) < 1.3e-3
@@ -265,7 +265,7 @@ def test_a_mean_that_stores_no_beam_is_shortened(small_ring, quadrupoles):
                                    for name, amount in zip(quadrupoles, signs, strict=True)]),
                 goal=small_ring)  # fmt: skip
     known = posterior(quadrupoles, 1e-3, np.array(signs))
-    found = correct(estimate_with(small_ring, small_ring, known), targets=["tunes"])
+    found = correct(Estimate(small_ring, small_ring, known), targets=["tunes"])
     assert found.settings
 
 
@@ -279,7 +279,7 @@ def test_a_dispersion_that_the_errors_make_is_counted_once(small_ring):
     rolled = optics(apply(small_ring, [Cause("dipole_roll", bend, 1e-3)]))[1]
     names = [monitor.name for monitor in small_ring.monitors]
     beyond = dict(zip(names, (rolled - optics(small_ring)[1]).tolist(), strict=True))
-    estimate = estimate_with(small_ring, small_ring, known).with_beam(beyond)
+    estimate = Estimate(small_ring, small_ring, known).with_beam(beyond)
     found = correct(estimate, knobs=["supplies"], targets=NO_ORBIT)
     size = np.sqrt(np.mean(rolled[:, 1] ** 2))
     assert found.before["dispersion"][1][0] == pytest.approx(size, rel=0.05)
@@ -289,7 +289,6 @@ def test_few_knobs_where_few_are_enough(small_ring, wrong):
     machine = apply(small_ring, wrong[:1])
     found = correct(machine, goal=small_ring, knobs=["quadrupoles"], targets=NO_ORBIT)
     assert [s.knob.name for s in found.settings] == [wrong[0].element]
-    assert [n for n, _ in found.gains] == [1]
 
 
 def test_a_calibration_of_a_corrector_is_in_its_change(small_ring, quadrupoles):
@@ -300,7 +299,7 @@ def test_a_calibration_of_a_corrector_is_in_its_change(small_ring, quadrupoles):
     )  # fmt: skip
     ring = apply(small_ring, [Cause("corrector_kick_y", "v3", 1e-4)])
     knobs = [k for k in default_knobs(small_ring, ["correctors"]) if k.name == "v3"]
-    found = correct(estimate_with(ring, small_ring, known), knobs=knobs, targets=["closed_orbit"])
+    found = correct(Estimate(ring, small_ring, known), knobs=knobs, targets=["closed_orbit"])
     (own,) = found.settings
     assert own.new == pytest.approx(-1e-4 / 1.25, rel=0.01)
 
@@ -553,7 +552,7 @@ def test_a_beam_is_threaded_as_far_as_it_is_known(ring_kicking_x):
     known = replace(
         posterior(far, 3e-3), hypotheses=tuple(("quadrupole_offset_y", name) for name in far)
     )
-    found = correct(estimate_with(machine, ring, known), targets=["first_turn"])
+    found = correct(Estimate(machine, ring, known), targets=["first_turn"])
     assert found.settings
     read = [m.s < ring[far[0]].s for m in ring.monitors]
     now, then = (

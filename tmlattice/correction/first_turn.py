@@ -21,7 +21,7 @@ from scipy.stats import norm
 
 from tmlattice.beam.model import Model
 from tmlattice.beam.readouts import APERTURE
-from tmlattice.correction.estimate import Estimate, estimate_with
+from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.knobs import KINDS
 from tmlattice.correction.targets import TARGETS, THREADING, Weighted
 from tmlattice.effects import Cause, apply, background_rms, find
@@ -145,14 +145,14 @@ def estimate_of_turns(
         known = given_losses(ring, _given_readings(ring, data, known), data)
         changed = data.settings[-1].items()
         kicks = {name: own["kick"] for name, own in changed if "kick" in own}
-    estimate = estimate_with(ring, ring, known)
+    estimate = Estimate(ring, ring, known)
     settings, causes = ring, []
     for name, kick in kicks.items():
         element = ring[name]
         change = (kick - element.angle) * estimate.calibrations.get(element.name, 1.0)
         causes.append(Cause(str(KINDS[element.kind].effect), element.name, change))
         settings = settings.with_elements({ring.index(name): replace(element, angle=kick)})
-    return replace(estimate, settings=settings, ring=apply(estimate.ring, causes))
+    return replace(estimate, settings=settings, found=apply(ring, causes))
 
 
 def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> DistributedErrors:
@@ -220,7 +220,7 @@ def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> Distribute
     ]  # fmt: skip
     if not shots:
         return known
-    estimate = estimate_with(ring, ring, known)
+    estimate = Estimate(ring, ring, known)
     probed, behind = _probed(estimate.ring)
     model = Model(probed, [data.settings[i] for i in shots], data.turns)
     launches = data.launches[shots]

@@ -28,7 +28,7 @@ DOCUMENT, LATTICE = "correction.json", "correction.lattice.json"
 CODES = {"madx": "settings.madx", "at": "settings.at.py", "elegant": "settings.ele"}
 FILES = ("settings.csv", *CODES.values(), DOCUMENT, LATTICE, "correction.txt", "correction.png")
 """Files of a correction, apart from the page."""
-FORMAT, VERSION = "tmlattice-correction", 2
+FORMAT, VERSION = "tmlattice-correction", 3
 HEAD = (
     "device", "present", "new", "change", "unit", "low", "high", "gain",
     "kind", "members", "step", "error", "curve",
@@ -80,7 +80,6 @@ class Correction(Speaks):
         before, after: expected rms of each target's errors, by target, (x, y).
         stays: rms of each target's errors after the correction in the estimated ring, which these
             knobs do not reach, and the median of what the data leave undetermined, (x, y) each.
-        gains: of the first 1, 2, 5, 10, ... devices: their number, and the expected rms by target.
         gain, gain_error: share of the expected square, in units of the tolerances, that the
             correction removes, and its standard deviation.
         tunes: fractions, of the goal, now and expected.
@@ -88,7 +87,6 @@ class Correction(Speaks):
         profile: its errors at the readings now and expected, each [reading, plane, 3] (`Interval`).
         s: of the readings, m.
         targets: the wanted ones, with their tolerances.
-        iterations: of measurement and correction that are needed.
         warnings: for the reader.
         provenance: versions, options, seconds.
         ring: with the present settings.
@@ -99,7 +97,6 @@ class Correction(Speaks):
     before: Mapping[str, tuple[Interval, Interval]]
     after: Mapping[str, tuple[Interval, Interval]]
     stays: Mapping[str, tuple[tuple[float, float], tuple[float, float]]]
-    gains: tuple[tuple[int, Mapping[str, tuple[float, float]]], ...]
     gain: float
     gain_error: float
     tunes: Mapping[str, tuple[float, float]]
@@ -107,7 +104,6 @@ class Correction(Speaks):
     profile: tuple[Any, Any]
     s: tuple[float, ...]
     targets: Mapping[str, float]
-    iterations: int
     warnings: tuple[str, ...]
     provenance: Mapping[str, Any]
     ring: Any = None

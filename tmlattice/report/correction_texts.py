@@ -55,25 +55,11 @@ def amount(name: str, value: float) -> str:
     return f"{value:.2g}"
 
 
-def gain_rows(correction: Correction) -> list[list[str]]:
-    """Head and rows of gains: number of devices, expected rms of each target in the worse plane."""
-    return [
-        ["devices", *(TARGETS[name].words for name in correction.targets)],
-        *(
-            [str(n), *(amount(name, max(rms[name])) for name in correction.targets)]
-            for n, rms in correction.gains
-        ),
-    ]
-
-
 def correction_text(correction: Correction, width: int = WIDTH, most: int | None = None) -> str:
     """The whole report as plain text of so many columns; with fewer settings where only so many
     lines are wanted."""
     lines = wrapped(correction.words, "", width)
     more = ["", *columns(expected_rows(correction), width)]
-    if correction.gains:
-        more += ["", "Expected rms with the first devices:"]
-        more += columns(gain_rows(correction), width)
     for sentence in sentences(correction):
         more += ["", *wrapped(sentence, "", width)]
     if correction.settings:
@@ -85,10 +71,10 @@ def correction_text(correction: Correction, width: int = WIDTH, most: int | None
 
 
 def sentences(correction: Correction) -> list[str]:
-    """Sentences on the gain, its error, iterations and warnings."""
+    """Sentences on the gain, its error and warnings."""
     share, error = 100 * correction.gain, 100 * correction.gain_error
     found = [] if correction.refused else [
         f"Expected gain: {share:.3g} ± {error:.1g} % of the squared errors in units of their "
-        f"tolerances. Measurements and corrections that this ring needs: {correction.iterations}."
+        "tolerances."
     ]  # fmt: skip
     return found + [f"Note: {text}." for text in correction.warnings]
