@@ -86,6 +86,9 @@ def test_single_quadrupoles_correct_their_own_errors(small_ring, wrong):
     assert (after < 0.05 * before).all()
     predicted = [interval[0] for interval in found.before["beta_beating"]]
     np.testing.assert_allclose(predicted, before, rtol=0.01)
+    one = correct(apply(small_ring, wrong[:1]), goal=small_ring, knobs=["quadrupoles"],
+                  targets=NO_ORBIT)  # fmt: skip
+    assert [s.knob.name for s in one.settings] == [wrong[0].element]  # few where few are enough
 
 
 def test_supplies_gain_as_in_at(small_ring, wrong, quadrupoles):
@@ -285,12 +288,6 @@ def test_a_dispersion_that_the_errors_make_is_counted_once(small_ring):
     assert found.before["dispersion"][1][0] == pytest.approx(size, rel=0.05)
 
 
-def test_few_knobs_where_few_are_enough(small_ring, wrong):
-    machine = apply(small_ring, wrong[:1])
-    found = correct(machine, goal=small_ring, knobs=["quadrupoles"], targets=NO_ORBIT)
-    assert [s.knob.name for s in found.settings] == [wrong[0].element]
-
-
 def test_a_calibration_of_a_corrector_is_in_its_change(small_ring, quadrupoles):
     known = replace(
         posterior([], 1.0),
@@ -341,12 +338,22 @@ def test_a_table_of_knobs_comes_back(small_ring, tmp_path):
     ("- {knob: trim, members: QF::3 QF::3}", "'QF::3' is a member of 'trim' and 'trim'"),
     ("- {knob: q, members: QF::1, kind: pump}", "no kind 'pump'"),
     ("knob: QF", "no list of knobs"),
+    ("device,new\nQF,1\n", "no device, present or new"),
+    ("device,present,new\n", "contains no setting"),
+    ("device,present,new\nQF,0.9,nan\n", "no device, present or new"),
+    ("device,present,new\nQF,0.9,0.91\nQX,0.9,0.91\n", "'QX'.*none of this name"),
+    ("device,present,new\nQF,0.9,0.91\nQF,0.9,0.91\n", "occurs twice"),
+    ("device,present,new\nQF,0_9,0.91\n", "no device, present or new"),
+    ("device,present,new\nQF\n", "no device, present or new"),
+    ("device,present,new,change\nQF,0.9,0.91,0.02\n", "change of 'QF' is 0.02, but.* is 0.01;"),
 ])  # fmt: skip
 def test_tables_that_cannot_be_used(small_ring, tmp_path, row, said):
-    path = tmp_path / "knobs.yaml"
+    """Of knobs (.yaml), and of the settings of a correction (.csv)."""
+    of_settings = row.startswith("device")
+    path = tmp_path / ("settings.csv" if of_settings else "knobs.yaml")
     path.write_text(row)
     with pytest.raises(MeasurementError, match=said):
-        read_knobs(path, small_ring)
+        (read_settings if of_settings else read_knobs)(path, small_ring)
 
 
 def test_names_that_do_not_exist(small_ring, tmp_path):
@@ -419,20 +426,6 @@ def test_on_the_command_line(small_ring, wrong, quadrupoles, tmp_path):
     bare = run(tmlattice, ["correct", str(estimated)])
     assert bare.exit_code != 0
     assert "--design" in bare.output
-
-
-def test_the_written_table_is_that_of_the_result(small_ring, wrong, tmp_path):
-    found = correct(apply(small_ring, wrong), goal=small_ring, knobs=["quadrupoles"])
-    found.save(tmp_path / "out")
-    rows = list(csv.DictReader((tmp_path / "out" / "settings.csv").open()))
-    assert [row["device"] for row in rows] == [s.knob.name for s in found.settings]
-    shares = [float(row["gain"]) for row in rows]
-    assert shares == sorted(shares, reverse=True)
-    assert sum(shares) == pytest.approx(1.0, abs=0.05)
-    for row in rows:
-        assert float(row["new"]) - float(row["present"]) == pytest.approx(
-            float(row["change"]), abs=1e-8
-        )
 
 
 # --- a beam that is not stored --------------------------------------------------------------------
@@ -540,6 +533,21 @@ def test_a_loss_is_a_reading(ring_kicking_x):
     assert np.isfinite(beam[last]).all()
 
 
+def test_scales_are_learnt_in_both_planes_and_carried_on(ring_kicking_x):
+    """Quadrupoles displaced by thirty times the usual, in a ring that loses the beam."""
+    ring = ring_kicking_x("i % 2")
+    measured = measured_with(ring, displaced(ring, 3e-3, 5), {}, 0)
+    first = estimate_of_turns(ring, [measured]).known
+    assert not np.isfinite(measured.readings).all()
+    offsets = {f"quadrupole_offset_{plane}" for plane in "xy"}
+    usual = find("quadrupole_offset_x").background
+    rms = {name: r for (name, _), r in zip(first.hypotheses, first.rms, strict=True)}
+    assert all(10 < rms[name] / usual < 90 for name in offsets), rms
+    again = estimate_of_turns(ring, [measured_with(ring, displaced(ring, 3e-3, 5), {}, 1)], first)
+    before, after = (np.diag(known.scales) for known in (first, again.known))
+    assert (after < before).all()
+
+
 def test_a_beam_is_threaded_as_far_as_it_is_known(ring_kicking_x):
     """Errors behind the part that was read are unknown: they refuse no correction before it."""
     ring = ring_kicking_x("i % 2")
@@ -638,23 +646,6 @@ def test_applied_settings_have_a_calibration(small_ring, tmp_path):
     assert "does not determine it" in sentence(other)
 
 
-@pytest.mark.parametrize(("rows", "said"), [
-    ("device,new\nQF,1\n", "no device, present or new"),
-    ("device,present,new\n", "contains no setting"),
-    ("device,present,new\nQF,0.9,nan\n", "no device, present or new"),
-    ("device,present,new\nQF,0.9,0.91\nQX,0.9,0.91\n", "'QX'.*none of this name"),
-    ("device,present,new\nQF,0.9,0.91\nQF,0.9,0.91\n", "occurs twice"),
-    ("device,present,new\nQF,0_9,0.91\n", "no device, present or new"),
-    ("device,present,new\nQF\n", "no device, present or new"),
-    ("device,present,new,change\nQF,0.9,0.91,0.02\n", "change of 'QF' is 0.02, but.* is 0.01;"),
-])  # fmt: skip
-def test_settings_that_cannot_be_compared(small_ring, tmp_path, rows, said):
-    path = tmp_path / "settings.csv"
-    path.write_text(rows)
-    with pytest.raises(MeasurementError, match=said):
-        read_settings(path, small_ring)
-
-
 def test_settings_of_devices_of_a_table_come_back(small_ring, wrong, tmp_path):
     """The written table states members and excitation curve: the lattice need not know the name."""
     name = wrong[0].element
@@ -729,6 +720,14 @@ def test_a_report_of_a_correction_is_rendered_again(small_ring, wrong, tmp_path)
     out = tmp_path / "out"
     found = correct(apply(small_ring, wrong), goal=small_ring, knobs=["quadrupoles"])
     found.save(out)
+    rows = list(csv.DictReader((out / "settings.csv").open()))
+    assert [row["device"] for row in rows] == [s.knob.name for s in found.settings]
+    shares = [float(row["gain"]) for row in rows]
+    assert shares == sorted(shares, reverse=True)
+    assert sum(shares) == pytest.approx(1.0, abs=0.05)
+    for row in rows:
+        change = float(row["new"]) - float(row["present"])
+        assert change == pytest.approx(float(row["change"]), abs=1e-8)
     document = json.loads((out / "correction.json").read_text())
     jsonschema.validate(document, schema("correction"))
     page = (out / "report.html").read_text()
