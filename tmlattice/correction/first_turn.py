@@ -46,6 +46,10 @@ FITS = 12
 """Posteriors at most, each with readings that the one before it made reachable."""
 UNREAD = 2
 """Readings at the end of a shot, at least, that a lost beam lacks: one alone may be a dead BPM."""
+SURPRISE = 2.0
+"""Standard deviations beyond which a loss shows that the scale of the errors along one direction is
+too small: five per cent of all losses. It is then the one that makes it this far; the direction
+stays uncertain, since the loss may be elsewhere."""
 TRUNCATIONS = 50
 """Of the posterior, at most."""
 
@@ -142,7 +146,7 @@ def estimate_of_turns(
         known = given_losses(ring, _given_readings(ring, data, known), data)
         changed = data.settings[-1].items()
         kicks = {name: own["kick"] for name, own in changed if "kick" in own}
-    estimate = Estimate(ring, ring, known)
+    estimate = Estimate(ring, ring, known or DistributedErrors.usual([], {}))
     settings, causes = ring, []
     for name, kick in kicks.items():
         element = ring[name]
@@ -242,10 +246,12 @@ def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> Distribute
                 nearest.append((float(distance[k]), np.sign(at[k]) or 1.0, own[:, k] / sigma[k]))
         if not nearest:
             break
-        z, side, direction = min(nearest, key=lambda one: one[0])
-        mean = float(np.exp(norm.logpdf(z) - norm.logsf(z)))  # of a Gaussian beyond z
-        share = mean * (mean - z)
-        step = side * mean * direction
+        distance, side, direction = min(nearest, key=lambda one: one[0])
+        scale = max(distance / SURPRISE, 1.0)
+        z = distance / scale
+        mean = float(norm.pdf(z) / norm.sf(z))
+        share = max(1 - scale**2 * (1 + z * mean - mean**2), 0.0)
+        step = side * scale * mean * direction
         left = 1 - np.sqrt(1 - share)
         losses = [(at + step @ own, own - left * np.outer(direction, direction @ own))
                   for at, own in losses]  # fmt: skip
