@@ -64,9 +64,11 @@ def code(machines):
 
 def against(machines, other):
     """How many corrections leave a smaller square than another method's, an equal one and a larger
-    one: equal within what 1 % errors of the changes add to the oracle's."""
-    own, its, exact, made = (np.array([one[m]["square"] if one[m] else np.inf for one in machines])
-                             for m in ("tmlattice", other, "oracle", "oracle_made"))  # fmt: skip
+    one: equal within what 1 % errors of the changes add to the oracle's (0 where not measured)."""
+    own, its, exact, made = (
+        np.array([(one.get(m) or one["oracle"])["square"] for one in machines])
+        for m in ("tmlattice", other, "oracle", "oracle_made")
+    )
     ties = np.abs(own - its) <= np.abs(made - exact)
     return [int(n.sum()) for n in ((own < its) & ~ties, ties, (own > its) & ~ties)]
 
