@@ -6,9 +6,9 @@ Each case is a machine of its own with all usual errors of the catalogue (`--sca
 wrong by `--gradient` rms, and its orbit corrected by its correctors up to 5 % of their kicks. Its
 quadrupole supplies, or each quadrupole (`--knobs`), can be set within `--limit` of their strength,
 in steps of 1e-4 of it; each makes its change with a relative error of 1 %, which the oracle alone
-knows. The machine is measured with AT, diagnosed with default options and
-corrected; the settings are put into the machine, and AT gives the true optics at the BPMs: beta
-beating, dispersion, tunes, coupling. Compared with
+knows (`oracle_made`: its settings with these errors). The machine is measured with AT, diagnosed
+with default options and corrected; the settings are put into the machine, and AT gives the true
+optics at the BPMs: beta beating, dispersion, tunes, coupling. Compared with
 
 - oracle: the same knobs and targets, all errors known;
 - svd: the response matrix of the design's supplies, inverted with the number of singular values
@@ -37,10 +37,11 @@ from unittest import mock
 import at
 import numpy as np
 from scipy.stats import norm
+from tables import against, commit
 
 from tmlattice import diagnose, load_ring
 from tmlattice.correction import correct, default_knobs, solve
-from tmlattice.correction.estimate import estimate_of, estimate_with
+from tmlattice.correction.estimate import Estimate, estimate_of
 from tmlattice.correction.targets import ENERGY, Targets
 from tmlattice.effects import Cause, RingEffect, apply, background_rms, find
 from tmlattice.errors import TmlatticeError
@@ -210,8 +211,9 @@ def diagnosed(ring, causes, seed, kind):
     return data, diagnose(ring, data), time.process_time() - begun
 
 
-def case(ring, seed, options):
-    """One machine: rms errors by method, and what was predicted."""
+def machine(ring, seed, options):
+    """Its causes, knobs, made over asked change by knob, the errors that settings leave, and those
+    that the oracle's leave, with exact changes and with the made ones."""
     rms = background_rms({"all": options.scale})
     causes = [c for c in draw_background(ring, rms, seed) if c.effect != "quadrupole_gradient"]
     places = find("quadrupole_gradient").places(ring)
@@ -245,7 +247,16 @@ def case(ring, seed, options):
         except (at.AtError, TmlatticeError, np.linalg.LinAlgError):
             return None
 
-    found = {"seed": seed, "before": left([])}
+    truth = Estimate(apply(ring, on_ring), ring)
+    best = correct(truth, knobs=[replace(k, error=0.0) for k in knobs], targets=OPTICS)
+    oracle = {"oracle": left(of_settings(best)), "oracle_made": left(of_settings(best, made))}
+    return causes, knobs, made, left, oracle
+
+
+def case(ring, seed, options):
+    """One machine: rms errors by method, and what was predicted."""
+    causes, knobs, made, left, oracle = machine(ring, seed, options)
+    found = {"seed": seed, "before": left([]), **oracle}
     kept = options.keep and options.keep / f"{options.kind}-{seed}.pickle"
     if kept and kept.is_file():
         data, diagnosis, seconds = pickle.loads(kept.read_bytes())
@@ -262,16 +273,12 @@ def case(ring, seed, options):
               "seconds_correction": time.process_time() - then}  # fmt: skip
     found |= {"tmlattice": left(of_settings(own, made)), "refused": own.refused,
               "devices": len(own.settings), "now": own.before, "expected": own.after,
-              "iterations": own.iterations,
               "at_limit": sum(s.at_limit for s in own.settings)}  # fmt: skip
     if options.sigmas:
         found["prices"] = {
             f"{n:g}": price(estimate, knobs, n, lambda c: left(of_settings(c, made))["square"])
             for n in options.sigmas
         }
-    truth = estimate_with(apply(ring, on_ring), ring, None)
-    best = correct(truth, knobs=[replace(k, error=0.0) for k in knobs], targets=OPTICS)
-    found["oracle"] = left(of_settings(best))
     if options.kind == "response" and not options.alone:
         readings = response_data(ring, data)
         ratio = np.array([made[knob.name] for knob in knobs])
@@ -339,6 +346,9 @@ def summary(rows):
             better = np.sum(square["tmlattice"] <= square[other])
             print(f"better than {other}, or equal: {better} of {len(rows)} (beta beating "
                   f"{np.sum(beta['tmlattice'] <= beta[other])})")  # fmt: skip
+            if other != "before":
+                print("better, equal within the effect of the changes' errors, worse: "
+                      f"{against(rows, other)}")  # fmt: skip
     for when, true in (("now", "before"), ("expected", "tmlattice")):
         held = {}
         for name in OPTICS:
@@ -392,7 +402,7 @@ def main() -> None:
         if seed in done:
             continue
         try:
-            row = {"study": study, **case(ring, seed, options)}
+            row = {"study": study, "commit": commit(), **case(ring, seed, options)}
         except (TmlatticeError, ValueError) as error:
             print(f"seed {seed}: {type(error).__name__}: {error}", flush=True)
             continue

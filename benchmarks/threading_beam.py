@@ -15,12 +15,12 @@ The oracle knows all errors of the ring. A beam circulates if it is launched on 
 import argparse
 import json
 import logging
-import subprocess
 import time
 import warnings
 from pathlib import Path
 
 import numpy as np
+from tables import commit
 
 from tmlattice import correct, load_ring
 from tmlattice.correction.first_turn import estimate_of_turns
@@ -109,8 +109,6 @@ def main() -> None:
     if options.out and options.out.is_file():
         rows = [json.loads(line) for line in options.out.read_text().splitlines()]
         rows = [row for row in rows if study.items() <= row.items()]
-    commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent,
-                            text=True, stdout=subprocess.PIPE, check=False).stdout  # fmt: skip
     seed = max((row["seed"] for row in rows), default=options.first_seed - 1)
     while len(rows) < options.machines:
         seed += 1
@@ -119,7 +117,7 @@ def main() -> None:
         if row is None:
             continue
         row = {**study, **row, "seconds": round(time.process_time() - begun, 1),
-               "commit": commit.strip()}  # fmt: skip
+               "commit": commit()}  # fmt: skip
         rows.append(row)
         print(row, flush=True)
         if options.out:

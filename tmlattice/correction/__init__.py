@@ -11,21 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.correction.estimate import Estimate, estimate_of, estimate_with
+from tmlattice.correction.estimate import Estimate, estimate_of
 from tmlattice.correction.first_turn import Threading, estimate_of_turns
 from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_knobs
 from tmlattice.correction.result import Correction, Setting
-from tmlattice.correction.solve import (
-    COUNTS,
-    SIGMAS,
-    Point,
-    Problem,
-    drawn,
-    fewest,
-    nearly,
-    optimised,
-    safest,
-)
+from tmlattice.correction.solve import COUNTS, SIGMAS, Point, drawn, fewest, safest
 from tmlattice.correction.targets import OPTICS, THREADING, Targets, rms_of
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.errors import TmlatticeError, UnstableRingError
@@ -97,8 +87,8 @@ def correct(
         raise UnstableRingError(f"the estimated ring stores no beam: {error}") from error
     if not begin.slopes.any():
         raise TmlatticeError("no knob changes a target; name others (--knobs, --target)")
-    whole, order = _corrected(problem, begin)
-    end, aversion = safest(begin, whole, np.array(order, dtype=np.int64))
+    whole, order = fewest(problem)
+    end, aversion = safest(begin, whole, order)
     found = _fields(begin, whole, end, aversion, order)
     seconds = time.perf_counter() - begun
     made = {"lattice": estimate.settings.name, "seed": seed, "draws": DRAWS,
@@ -117,34 +107,19 @@ def _estimate(diagnosis: Any, goal: Ring | None) -> Estimate:
         diagnosis = [diagnosis]
     if isinstance(diagnosis, list | tuple):
         return estimate_of_turns(goal, diagnosis)
-    return estimate_with(load_ring(diagnosis), goal, None)
-
-
-def _corrected(problem: Problem, begin: Point) -> tuple[Point, list[int]]:
-    """Where the correction ends, and its knobs by falling gain."""
-    every = np.arange(len(problem.knobs))
-    whole = optimised(problem, begin, every)
-    order = fewest(whole, whole.step(every)[1])
-    if len(order) == len(every):
-        return whole, order
-    chosen = np.array(order, dtype=np.int64)
-    goal, _ = whole.step(chosen)
-    end = optimised(problem, problem.better(goal, begin.square) or begin, chosen)
-    if nearly(end.square, whole.square):
-        return end, order
-    return whole, [*whole.by_gain()]  # or not as linear as that
+    return Estimate(load_ring(diagnosis), goal)
 
 
 def _fields(
-    begin: Point, whole: Point, end: Point, aversion: float, order: Sequence[int]
+    begin: Point, whole: Point, end: Point, aversion: float, order: Array
 ) -> dict[str, Any]:
     """Fields of the result: the whole correction, and the safe one where all ends."""
     problem, targets = end.problem, end.problem.targets
     gain = begin.squares - (whole if end is begin else end).squares
     gain /= max(float(begin.squares.mean()), 1e-30)
     refused = _refusal(float(gain.mean()), float(gain.std())) if end is begin else ""
-    order = [] if refused else order
-    gains = end.gains(np.array(order, dtype=np.int64), aversion)
+    order = order[:0] if refused else order
+    gains = end.gains(order, aversion)
     gains /= max(float(gains.sum()), 1e-30)
     settings = [
         Setting(knob, amount, knob.setting(amount), own)
@@ -177,7 +152,7 @@ def _fields(
         "after": _intervals(end),
         "stays": stays,
         "gains": tuple(
-            (n, _expected(end.step(np.array(order[:n]), aversion)[0], end))
+            (n, _expected(end.step(order[:n], aversion)[0], end))
             for n in sorted({*COUNTS, len(order)}) if 0 < n <= len(order)
         ),
         "gain": float(gain.mean()),
@@ -187,7 +162,7 @@ def _fields(
         "profile": profile,
         "s": tuple(targets.s.tolist()),
         "targets": targets.tolerance,
-        "iterations": _iterations(end, aversion),
+        "iterations": 2 if aversion or _dominated(end) else 1,
         "warnings": tuple(_warnings(begin, whole, end, aversion, settings)),
     }  # fmt: skip
 
@@ -223,10 +198,9 @@ def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _iterations(end: Point, aversion: float) -> int:
-    """One, and another one after a shortened correction, or where most of what stays comes from
-    errors of the knobs' changes, which a second measurement shows."""
-    return 2 if aversion or float(end.unsure @ end.unsure) > float(end.rows @ end.rows) else 1
+def _dominated(end: Point) -> bool:
+    """Whether most of what stays is errors of the changes, which a second measurement shows."""
+    return float(end.unsure @ end.unsure) > float(end.rows @ end.rows)
 
 
 def _warnings(
@@ -238,6 +212,8 @@ def _warnings(
             f"the settings have {100 * share:.0f} % of the gain of the most probable correction, "
             "since larger ones may make the ring worse; measure again, and correct the rest"
         )
+    elif _dominated(end):
+        yield "most of what stays are errors of the changes; measure again, and correct them"
     held = [setting.knob.name for setting in settings if setting.at_limit]
     if held:
         yield f"held by their limits: {', '.join(held)}"

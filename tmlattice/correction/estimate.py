@@ -4,8 +4,8 @@
 >>> estimate.draw(200, np.random.default_rng(0)).shape      # [draw, error]
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -31,40 +31,60 @@ class Estimate:
     """An estimated ring and its uncertainty.
 
     Attributes:
-        ring: the posterior mean.
+        found: the estimated ring, without the mean of its distributed errors.
         settings: the ring with the present settings.
-        hypotheses: uncertain errors, (effect, place), of the ring.
-        known: their posterior; None: no uncertainty.
-        kept: indices of these errors in `known`.
-        calibrations: of correctors, kick over setting, by name.
+        known: posterior of the distributed errors; none: no uncertainty.
         dispersion: measured beyond the ring's, m, [BPM, plane], or 0.
         energy, energy_error: of the stored beam relative to the ring's at its RF frequency.
-        found: the ring without its distributed errors.
     """
 
-    ring: Ring
+    found: Ring
     settings: Ring
-    hypotheses: tuple[Hypothesis, ...] = ()
-    known: DistributedErrors | None = field(default=None, repr=False)
-    kept: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64), repr=False)
-    calibrations: dict[str, float] = field(default_factory=dict, repr=False)
+    known: DistributedErrors = field(default=DistributedErrors.usual([], {}), repr=False)
     dispersion: Array | float = field(default=0.0, repr=False)
     energy: float = 0.0
     energy_error: float = 0.0
-    found: Ring | None = field(default=None, repr=False)
+
+    @cached_property
+    def kept(self) -> NDArray[np.int64]:
+        """Indices in `known` of the errors of a stored beam's ring."""
+        own = zip(self.known.hypotheses, self.known.rms.tolist(), strict=True)
+        return np.array([i for i, ((name, _), rms) in enumerate(own) if rms > 0 and _of_ring(name)],
+                        dtype=np.int64)  # fmt: skip
+
+    @cached_property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """The errors `kept`, (effect, place)."""
+        return tuple(self.known.hypotheses[i] for i in self.kept)
+
+    @cached_property
+    def ring(self) -> Ring:
+        """The posterior mean."""
+        mean = zip(self.hypotheses, self.known.amounts[self.kept].tolist(), strict=True)
+        return apply(self.found, [Cause(*place, amount) for place, amount in mean if amount])
+
+    @cached_property
+    def calibrations(self) -> dict[str, float]:
+        """Kick over setting of correctors, by name."""
+        own = zip(self.known.hypotheses, self.known.amounts.tolist(), strict=True)
+        scales: dict[str, float] = {}
+        for cause in (*self.known.causes, *(Cause(*place, amount) for place, amount in own)):
+            if cause.effect == "corrector_calibration" and cause.element is not None:
+                scales[cause.element] = scales.get(cause.element, 1.0) * (1 + cause.amount)
+        return scales
 
     def storing(self) -> "Estimate":
         """Return the estimate whose ring stores a beam: with the posterior mean, which is
         linearised, or a half of it, a quarter, ...; unchanged if it stores none."""
-        if self.found is None or self.known is None:
-            return self
-        for share in (*STEP_SHARES, 0.0):
-            ring = _with_mean(self.found, self.known, self.kept, share)
+        for share in (*STEP_SHARES, 0.0) if len(self.kept) else ():
+            amounts = self.known.amounts.copy()
+            amounts[self.kept] *= share
+            tried = replace(self, known=replace(self.known, amounts=amounts))
             try:
-                StoredBeam(ResponseModel(ring))
+                StoredBeam(ResponseModel(tried.ring))
             except UnstableRingError:
                 continue
-            return replace(self, ring=ring)
+            return tried
         return self
 
     def with_beam(
@@ -75,63 +95,22 @@ class Estimate:
         The errors of a posterior with a covariance make the dispersion, and change it with the
         optics; else it stays.
         """
-        if self.known is not None and len(self.known.share):
+        if len(self.known.share):
             dispersion = {}
-        names = [monitor.name for monitor in self.ring.monitors]
+        names = [monitor.name for monitor in self.settings.monitors]
         more = np.array([dispersion.get(name, (0.0, 0.0)) for name in names]).reshape(-1, 2)
         return replace(self, dispersion=more, energy=energy, energy_error=energy_error)
 
     def draw(self, count: int, random: np.random.Generator) -> Array:
         """Return errors drawn from the posterior, less their mean, [draw, error]."""
-        if self.known is None:
-            return np.zeros((count, 0))
-        known = self.known
-        drawn = known.correlated(random.standard_normal((len(known.rms), count)))
-        return np.asarray((known.rms[:, None] * drawn)[self.kept].T)
+        drawn = self.known.correlated(random.standard_normal((len(self.known.rms), count)))
+        return np.asarray((self.known.rms[:, None] * drawn)[self.kept].T)
 
     def independent(self, slopes: Array) -> Array:
         """Return slopes by independent errors of size 1 from those by the errors, [error, ...]."""
-        assert self.known is not None
         every = np.zeros((len(self.known.rms), *slopes.shape[1:]))
         every[self.kept] = self.known.rms[self.kept, None] * slopes
         return self.known.correlated(every)
-
-
-def estimate_with(ring: Ring, settings: Ring, known: DistributedErrors | None) -> Estimate:
-    """Return the estimate of a ring with the posterior of its errors.
-
-    Args:
-        ring: the estimated ring, as `diagnose --lattice-out` writes it.
-        settings: the ring with the present settings.
-        known: posterior of its distributed errors; None: no uncertainty.
-    """
-    if known is None:
-        return Estimate(ring, settings)
-    kept = [i for i, (name, _) in enumerate(known.hypotheses) if _of_ring(name)]
-    kept = [i for i in kept if known.rms[i] > 0]
-    every = [*known.causes]
-    every += [Cause(*h, a) for h, a in zip(known.hypotheses, known.amounts.tolist(), strict=True)]
-    scales: dict[str, float] = {}
-    for cause in every:
-        if cause.effect == "corrector_calibration" and cause.element is not None:
-            scales[cause.element] = scales.get(cause.element, 1.0) * (1 + cause.amount)
-    return Estimate(
-        _with_mean(ring, known, kept),
-        settings,
-        tuple(known.hypotheses[i] for i in kept),
-        known,
-        np.array(kept, dtype=np.int64),
-        scales,
-        found=ring,
-    )
-
-
-def _with_mean(
-    ring: Ring, known: DistributedErrors, kept: Iterable[int], share: float = 1.0
-) -> Ring:
-    """The ring with a share of the mean of its distributed errors."""
-    mean = ((known.hypotheses[i], share * float(known.amounts[i])) for i in kept)
-    return apply(ring, [Cause(*place, amount) for place, amount in mean if amount])
 
 
 def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) -> Estimate:
@@ -144,10 +123,8 @@ def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) ->
     Of a change since a reference, and without a covariance of the distributed errors, each amount
     has its own standard deviation.
     """
-    known = known_of(diagnosis) if known is None else known
-    if known is None:
-        known = _each_alone(diagnosis)
-    found = estimate_with(diagnosis.as_found, diagnosis.ring, known)
+    known = known or known_of(diagnosis) or _each_alone(diagnosis)
+    found = Estimate(diagnosis.as_found, diagnosis.ring, known)
     if not diagnosis.by_steps or diagnosis.since_reference:
         return found  # in first turns the energy is the injected beam's
     pairs = zip(diagnosis.causes, diagnosis.errors, strict=True)
@@ -186,10 +163,11 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
             "the diagnosis started from"
         )
     with_beam, calibration = knowledge_file(path), path.with_name(f"{path.name}.calibration.json")
-    warnings: tuple[str, ...] = ()
-    if not with_beam.is_file():
+    found, warnings = Estimate(ring, settings), tuple[str, ...]()
+    if with_beam.is_file():
+        found = replace(found, known=read_known(with_beam, ring))
+    else:
         warnings = (f"'{with_beam.name}' is missing: the estimated ring is taken as certain",)
-    found = estimate_with(ring, settings, read_known(with_beam, ring) if not warnings else None)
     if calibration.is_file():
         energy = read_energy(calibration, ring)
         found = found.with_beam(read_dispersion(calibration, ring), *energy)

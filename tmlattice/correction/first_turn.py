@@ -4,7 +4,8 @@ The target is the trajectory of a beam that is launched on the axis, at the BPMs
 stays near the axis on both, it is closed.
 
 The estimated ring comes from where the beam was read and lost. Too few readings exist to search for
-single faults: all errors are distributed, and their scales are learnt with each measurement. A loss
+single faults: all errors are distributed. Their scales have a posterior, a Gaussian of the
+logarithms, which the next measurement starts from; the two planes of an error share theirs. A loss
 is a reading too: behind the last BPM that read it the beam was beyond the aperture.
 
 >>> estimate = estimate_of_turns(ring, [first, second])     # the second with the kicks after it
@@ -21,14 +22,15 @@ from scipy.stats import norm
 
 from tmlattice.beam.model import Model
 from tmlattice.beam.readouts import APERTURE
-from tmlattice.correction.estimate import Estimate, estimate_with
+from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.knobs import KINDS
 from tmlattice.correction.targets import TARGETS, THREADING, Weighted
 from tmlattice.effects import Cause, apply, background_rms, find
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.distributed import DistributedErrors, posterior
+from tmlattice.inference.distributed import DistributedErrors, families_of, posterior
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import fit_nuisances
+from tmlattice.inference.variance_components import prior_covariance
 from tmlattice.lattice import Element, Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import Data, of_measurement
@@ -42,13 +44,12 @@ LOST = 0.1
 still show the beam's direction."""
 FITS = 12
 """Posteriors at most, each with readings that the one before it made reachable."""
-UNSURE = 0.5
-"""Relative error of a scale from which it is not learnt."""
 UNREAD = 2
 """Readings at the end of a shot, at least, that a lost beam lacks: one alone may be a dead BPM."""
 SURPRISE = 2.0
-"""Standard deviations beyond which a loss shows that the scale of the errors is too small: five per
-cent of all losses. The scale is then the one that makes it this far."""
+"""Standard deviations beyond which a loss shows that the scale of the errors along one direction is
+too small: five per cent of all losses. It is then the one that makes it this far; the direction
+stays uncertain, since the loss may be elsewhere."""
 TRUNCATIONS = 50
 """Of the posterior, at most."""
 
@@ -145,14 +146,14 @@ def estimate_of_turns(
         known = given_losses(ring, _given_readings(ring, data, known), data)
         changed = data.settings[-1].items()
         kicks = {name: own["kick"] for name, own in changed if "kick" in own}
-    estimate = estimate_with(ring, ring, known)
+    estimate = Estimate(ring, ring, known or DistributedErrors.usual([], {}))
     settings, causes = ring, []
     for name, kick in kicks.items():
         element = ring[name]
         change = (kick - element.angle) * estimate.calibrations.get(element.name, 1.0)
         causes.append(Cause(str(KINDS[element.kind].effect), element.name, change))
         settings = settings.with_elements({ring.index(name): replace(element, angle=kick)})
-    return replace(estimate, settings=settings, ring=apply(estimate.ring, causes))
+    return replace(estimate, settings=settings, found=apply(ring, causes))
 
 
 def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> DistributedErrors:
@@ -161,7 +162,11 @@ def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> 
     problem = FirstTurns(model=Model(ring, data.settings, data.turns), data=data, places={})
     usual = background_rms({"all": None})
     seen = [(n, p) for n in usual for p in find(n).places(ring) if problem.sees((n, p))]
-    known = DistributedErrors.usual(seen, usual) if known is None else known.extended(seen)
+    if known is None:
+        known = DistributedErrors.usual(seen, usual)
+        kinds = [name.removesuffix("_x").removesuffix("_y") for name in families_of(known)[0]]
+        known = replace(known, scales=prior_covariance(kinds))
+    known = known.extended(seen)
     amounts, used, most = known.amounts, 0, data.valid.shape[1]
     found = None
     for _ in range(FITS):
@@ -183,10 +188,7 @@ def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> 
             most = int(np.flatnonzero(kept.any(axis=(0, 2)))[-1] + 1) // 2
     if found is None:
         raise UnstableRingError("the beam is lost in the model before it is read")
-    learnt = posterior(found, known, linearised_at=amounts)
-    sure = np.array([learnt.errors[name] < UNSURE for name, _ in known.hypotheses])
-    known = replace(known, rms=np.where(sure, learnt.before.rms, known.rms))
-    return posterior(found, known, linearised_at=amounts, learn=False).known
+    return posterior(found, known, linearised_at=amounts).known
 
 
 def _with(problem: FirstTurns, known: DistributedErrors, amounts: Array) -> FirstTurns:
@@ -220,40 +222,28 @@ def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> Distribute
     ]  # fmt: skip
     if not shots:
         return known
-    estimate = estimate_with(ring, ring, known)
+    estimate = Estimate(ring, ring, known)
     probed, behind = _probed(estimate.ring)
     model = Model(probed, [data.settings[i] for i in shots], data.turns)
     launches = data.launches[shots]
     paths = model.paths(launches)
     places = paths.states[:, model.where][..., [0, 2]]  # [shot, reading, plane]
     slopes = np.nan_to_num(model.signatures(paths, list(estimate.hypotheses), launches))
+    every = np.add.outer(np.arange(data.turns) * len(probed.monitors), behind).ravel()
     losses = []
     for shot, first in enumerate(end[shots].tolist()):
-        turn, monitor = divmod(first, len(ring.monitors))
-        some = turn * len(probed.monitors) + np.arange(behind[monitor], behind[monitor + 1])
+        some = np.arange(every[first - 1], every[first])
         own = slopes[:, shot, some].reshape(len(slopes), -1)
         losses.append((places[shot, some].ravel(), estimate.independent(own)))
-    return _truncated(known, losses)
-
-
-def _truncated(
-    known: DistributedErrors, losses: Sequence[tuple[Array, Array]]
-) -> DistributedErrors:
-    """The posterior beyond thresholds.
-
-    Args:
-        known: posterior.
-        losses: positions at some places, m, and their slopes by errors of `known.correlated`.
-    """
     for _ in range(TRUNCATIONS):
         nearest = []
-        for at, slopes in losses:
+        for at, own in losses:
             inside = (np.abs(at) < APERTURE).all()  # false for a beam that overflows
-            sigma = np.linalg.norm(slopes, axis=0)
+            sigma = np.linalg.norm(own, axis=0)
             distance = (APERTURE - np.abs(at)) / np.maximum(sigma, 1e-30)
             k = int(np.argmin(distance))
             if inside and sigma[k]:
-                nearest.append((float(distance[k]), np.sign(at[k]) or 1.0, slopes[:, k] / sigma[k]))
+                nearest.append((float(distance[k]), np.sign(at[k]) or 1.0, own[:, k] / sigma[k]))
         if not nearest:
             break
         distance, side, direction = min(nearest, key=lambda one: one[0])
@@ -262,20 +252,17 @@ def _truncated(
         mean = float(norm.pdf(z) / norm.sf(z))
         share = max(1 - scale**2 * (1 + z * mean - mean**2), 0.0)
         step = side * scale * mean * direction
-        losses = [
-            (at + step @ slopes,
-             slopes - (1 - np.sqrt(1 - share)) * np.outer(direction, direction @ slopes))
-            for at, slopes in losses
-        ]  # fmt: skip
-        amounts = known.amounts_at(step)
-        known = known.updated(amounts, np.array([share]), direction[None])
+        left = 1 - np.sqrt(1 - share)
+        losses = [(at + step @ own, own - left * np.outer(direction, direction @ own))
+                  for at, own in losses]  # fmt: skip
+        known = known.updated(known.amounts_at(step), np.array([share]), direction[None])
     return known
 
 
 def _probed(ring: Ring) -> tuple[Ring, list[int]]:
     """The ring with BPMs behind its magnets too, and the first of them behind each of its own."""
     elements: list[Element] = []
-    behind, count = [0], 0
+    behind, count = list[int](), 0
     for element in ring.elements:
         elements.append(element)
         if element.kind == "monitor":
@@ -284,4 +271,4 @@ def _probed(ring: Ring) -> tuple[Ring, list[int]]:
             end = element.s + element.length / 2
             elements.append(replace(ring.monitors[0], name=f"behind {element.name}", s=end))
             count += 1
-    return replace(ring, elements=tuple(elements)), [*behind, count]
+    return replace(ring, elements=tuple(elements)), behind

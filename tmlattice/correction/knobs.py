@@ -212,18 +212,26 @@ def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:
     made = {
         "supplies": lambda: _grouped(ring, "quadrupole", _supplies(ring)),
         "quadrupoles": lambda: _grouped(ring, "quadrupole", {}),
-        "skew_quadrupoles": lambda: _skew(ring),
-        "correctors": lambda: _correctors(ring),
+        "skew_quadrupoles": lambda: [
+            _knob(own[0].name, "skew_quadrupole", (own[0].name,),
+                  sum(p.errors.k1sl + p.k1 * p.length * -math.sin(2 * p.tilt) for p in own))
+            for own in magnets(ring, ("quadrupole",)) if not _upright(ring, own[0].name)
+        ],
+        "correctors": lambda: [
+            _knob(e.name, e.kind, (e.name,), e.angle)
+            for e in ring.elements if e.kind in ("hcorrector", "vcorrector")
+        ],
         "sextupoles": lambda: _grouped(
             ring, "sextupole", {e.name: e.family for e in ring.elements if e.kind == "sextupole"}
         ),
         "rf": lambda: [_knob("rf", "rf", (), rf_of(ring).frequency(ring))],
-    }
-    chosen = list(("supplies", "skew_quadrupoles", "correctors") if kinds is None else kinds)
-    for kind in chosen:
+    }  # fmt: skip
+    found = []
+    for kind in ("supplies", "skew_quadrupoles", "correctors") if kinds is None else kinds:
         if kind not in made:
             raise unknown_choice("kind of knobs", kind, made)
-    return [knob for kind in chosen for knob in made[kind]()]
+        found += made[kind]()
+    return found
 
 
 def _knob(name: str, kind: str, members: tuple[str, ...], present: float) -> Knob:
@@ -260,23 +268,6 @@ def _supplies(ring: Ring) -> dict[str, str]:
         families = {ring[name].family for name in own}
         owner |= dict.fromkeys(own, families.pop() if len(families) == 1 else kind)
     return owner
-
-
-def _skew(ring: Ring) -> list[Knob]:
-    """Quadrupoles rolled by 45 degrees."""
-    return [
-        _knob(own[0].name, "skew_quadrupole", (own[0].name,),
-              sum(p.errors.k1sl + p.k1 * p.length * -math.sin(2 * p.tilt) for p in own))
-        for own in magnets(ring, ("quadrupole",)) if not _upright(ring, own[0].name)
-    ]  # fmt: skip
-
-
-def _correctors(ring: Ring) -> list[Knob]:
-    return [
-        _knob(e.name, e.kind, (e.name,), e.angle)
-        for e in ring.elements
-        if e.kind in ("hcorrector", "vcorrector")
-    ]
 
 
 # --- tables ---------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ halvings of this range: of two per cent."""
 NEAR = 1.03
 """Standard deviations over `SIGMAS` at which a shortened correction is not lengthened again."""
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-"""Numbers of knobs with a stated gain."""
+"""Numbers of knobs that are tried, and whose gain is stated."""
 ROUNDING = 1e-10
 """Of the squares of slopes, relative to a knob's size: a ridge for knobs without errors."""
 MAX_PIVOTS = 50
@@ -369,14 +369,23 @@ def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
     return now
 
 
-def fewest(point: Point, square: float) -> list[int]:
-    """Return the first knobs by gain that nearly reach an expected square, to first order."""
-    order: list[int] = []
-    for k in point.by_gain():
-        order.append(k)
-        if len(order) in COUNTS and nearly(point.step(np.array(order))[1], square):
+def fewest(problem: Problem) -> tuple[Point, Indices]:
+    """Return the end of a correction, and its knobs by falling gain: the fewest of `COUNTS` whose
+    expected square is nearly that of all."""
+    every = np.arange(len(problem.knobs))
+    whole = optimised(problem, problem.begin, every)
+    order = np.array([*whole.by_gain()], dtype=np.int64)
+    least = whole.step(every)[1]
+    for count in COUNTS:
+        chosen = order[:count]
+        if len(chosen) == len(order):
+            return whole, order
+        goal, square = whole.step(chosen)
+        if nearly(square, least):
             break
-    return order
+    end = optimised(problem, problem.better(goal, problem.begin.square) or problem.begin, chosen)
+    # or it is not as linear as that
+    return (end, chosen) if nearly(end.square, whole.square) else (whole, order)
 
 
 def nearly(square: float, least: float) -> bool:

@@ -60,6 +60,8 @@ class DistributedErrors:
         seen: measured directions, orthonormal, in units of the rms, [direction, error].
         share: share of each direction's variance that measurements removed, [direction].
         causes: further causes that are certain.
+        scales: covariance of the logarithms of the rms by effect, see `families_of`; None: the
+            prior one.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -68,6 +70,7 @@ class DistributedErrors:
     seen: Array = field(repr=False)
     share: Array = field(repr=False)
     causes: tuple[Cause, ...] = ()
+    scales: Array | None = field(default=None, repr=False)
 
     @classmethod
     def usual(
@@ -552,6 +555,7 @@ def components_of_rows(
     rows: Array,
     belongs: Indices,
     noise: Sequence[Flags] = (),
+    prior: Array | None = None,
 ) -> VarianceComponents:
     """Return the variance components from a sample of rows.
 
@@ -561,6 +565,7 @@ def components_of_rows(
         rows: signatures of errors of size 1, [error, row].
         belongs: family of each error, [error].
         noise: parts of the rows whose noise is estimated too, [row] each.
+        prior: covariance of the log scales before these rows.
     """
     launch = directions[:, np.abs(directions).max(axis=0) > 0]
     size = np.linalg.norm(launch, axis=0)
@@ -569,7 +574,7 @@ def components_of_rows(
     there = np.any(noise, axis=0) | there if noise else np.ones_like(there)
     families = [rows[belongs == k][:, there] for k in range(belongs.max() + 1)]
     return fit_variance_components(
-        residual[there], basis[there], families, [part[there] for part in noise]
+        residual[there], basis[there], families, [part[there] for part in noise], prior
     )
 
 
@@ -582,14 +587,12 @@ class Posterior:
         amounts: most probable amounts, [error].
         visible: errors with a signature.
         spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
-        errors: relative error of each estimated scale, by effect.
     """
 
     before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
     visible: Indices = field(repr=False)
     spread: Array = field(repr=False)
-    errors: Mapping[str, float]
 
     @property
     def sizes(self) -> dict[str, float]:
@@ -651,27 +654,24 @@ def posterior(
         point, stored, nuisances = there, amounts, there.nuisances
         keep = sampled_rows(len(point.residual))
         sums = sums_at(inner, point, known, stored, keep)
-        amounts = _posterior_at(known, stored, sums, {}).amounts
+        amounts = _posterior_at(known, stored, sums).amounts
         change = amounts - stored
         expected = point.chi2 - float(change @ (2 * sums.inner - sums.gram @ change))
-    errors: dict[str, float] = {}
     if learn:
         assert point.projection is not None
-        names, belongs = families_of(known)
+        _, belongs = families_of(known)
         found = components_of_rows(
             point.residual[keep] + (stored - known.amounts) @ sums.some,
             point.projection.matrix()[keep],
-            known.correlated(known.rms[:, None] * sums.some), belongs,
+            known.correlated(known.rms[:, None] * sums.some), belongs, prior=known.scales,
         )  # fmt: skip
-        errors = dict(zip(names, found.error.tolist(), strict=True))
         least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
-        known = replace(known, rms=np.maximum(known.rms * found.scale[belongs], least))
-    return _posterior_at(known, stored, sums, errors)
+        rms = np.maximum(known.rms * found.scale[belongs], least)
+        known = replace(known, rms=rms, scales=found.covariance)
+    return _posterior_at(known, stored, sums)
 
 
-def _posterior_at(
-    known: DistributedErrors, at: Array, sums: Sums, errors: Mapping[str, float]
-) -> Posterior:
+def _posterior_at(known: DistributedErrors, at: Array, sums: Sums) -> Posterior:
     """The posterior of errors linearised at some amounts."""
     spread = known.correlated(known.correlated(known.rms[:, None] * sums.gram * known.rms).T)
     visible = np.flatnonzero(np.diag(spread) > 0)
@@ -682,7 +682,7 @@ def _posterior_at(
     ridge = (1 + rounding) * np.eye(len(visible))
     factor = cho_factor(spread + ridge, overwrite_a=True, check_finite=False)
     most_probable[visible] = cho_solve(factor, pull[visible], check_finite=False)
-    return Posterior(known, known.amounts_at(most_probable), visible, spread, errors)
+    return Posterior(known, known.amounts_at(most_probable), visible, spread)
 
 
 def sums_at(

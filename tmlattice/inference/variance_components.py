@@ -9,6 +9,7 @@ evidence decides whether there are distributed errors at all.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve
@@ -24,6 +25,9 @@ COMMON_SPREAD = 1.5
 FAMILY_SPREAD = 0.7
 """rms of one family's log scale relative to the others: by factors of two."""
 
+
+PLANES = 0.9
+"""Correlation of a family's log scale with that of the other plane: one survey, one hardware."""
 
 MIN_GAIN = 0.5
 """Gain of log likelihood below which the iteration ends: steps converge quadratically."""
@@ -54,7 +58,11 @@ class VarianceComponents:
 
 
 def fit_variance_components(
-    rows: Array, launches: Array, families: Sequence[Array], noise: Sequence[Flags] = ()
+    rows: Array,
+    launches: Array,
+    families: Sequence[Array],
+    noise: Sequence[Flags] = (),
+    prior: Array | None = None,
 ) -> VarianceComponents:
     """Return the most probable scales of families of distributed errors.
 
@@ -63,6 +71,7 @@ def fit_variance_components(
         launches: orthonormal directions of the launches, [row, direction].
         families: usual rms times signature of each error of a family, [error, row].
         noise: parts of the rows whose noise is estimated too, [row] each; none: noise is known.
+        prior: covariance of the log scales before these rows; None: of families without planes.
     """
 
     def out(x: Array) -> Array:
@@ -74,7 +83,9 @@ def fit_variance_components(
     parts = [own.T @ own for own in seen]
     # without a scale: the noise where it is known, and the launches' directions
     base = inside if noise else np.eye(len(rows))
-    precision = _prior(len(families), len(noise))
+    known = prior_covariance(range(len(families))) if prior is None else prior
+    precision = np.eye(len(known) + len(noise)) / SCALE_SPREAD**2
+    precision[: len(known), : len(known)] = np.linalg.inv(known)
     size = np.zeros(len(parts))
     now = _state(clean, base, parts, size, precision)
     damping = 1e-3
@@ -110,15 +121,15 @@ class _State:
     information: Array
 
 
-def _prior(families: int, noise: int) -> Array:
-    """Prior precision of the log scales."""
-    covariance = np.full((families, families), COMMON_SPREAD**2) + FAMILY_SPREAD**2 * np.eye(
-        families
-    )
-    precision = np.zeros((families + noise,) * 2)
-    precision[:families, :families] = np.linalg.inv(covariance)
-    precision[families:, families:] = np.eye(noise) / SCALE_SPREAD**2
-    return precision
+def prior_covariance(kinds: Sequence[Any]) -> Array:
+    """Return the prior covariance of the log scales, [family, family].
+
+    Args:
+        kinds: of each family; the two planes of one error are families of one kind.
+    """
+    alike = np.array([[one == other for other in kinds] for one in kinds])
+    own = np.where(np.eye(len(kinds), dtype=bool), 1.0, PLANES * alike)
+    return np.asarray(COMMON_SPREAD**2 + FAMILY_SPREAD**2 * own)
 
 
 def _state(
