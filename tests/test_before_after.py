@@ -330,7 +330,7 @@ def test_command_report_and_json(tmp_path, monkeypatch, before, after, change):
     assert {own["element"] for own in document["findings"]} == {"qf", "QD::5"}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Since the reference" in page
-    assert "residuals of the reference and of the result" in page
+    assert "residuals of the reference and the result" in page
     wrong = tmlattice(*words, "--lattice-out", "r.json", cwd=tmp_path, check=2)
     assert "no meaning for a change since a reference" in wrong.stderr
 

@@ -243,7 +243,7 @@ def test_what_is_left_out_is_warned_of_once():
         [quadrupole, quadrupole.deepcopy(), at.Quadrupole("p", 0.5, 1.0, PolynomB=[0, 1, 0, 5.0])],
         energy=1e9, periodicity=1,
     )  # fmt: skip
-    with pytest.warns(UserWarning, match=r"left out.* above the sextupole \(3\)") as caught:
+    with pytest.warns(UserWarning, match=r"left out.* above the sextupole of q, p \(3\)") as caught:
         ring_from_at(lattice, "x")
     assert len(caught) == 1
 

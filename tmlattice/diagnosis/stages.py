@@ -82,17 +82,18 @@ def _settled(
     fitted: Array,
     about: Mapping[Hypothesis, float],
 ) -> Stage:
-    """A model at its best nuisances; from those of the fit where from the others no beam comes to
-    the last BPM that read one."""
+    """A model at its best nuisances; from those of the fit, or the first ones, where from the
+    others no beam comes to the last BPM that read one."""
     for share in (*STEP_SHARES, 0.0):
         some = tuple(
             replace(c, amount=start + share * (c.amount - start))
             for c in static for start in [about[c.effect, c.element]]
         )  # fmt: skip
         there = replace(problem, fixed=(*problem.fixed, *some))
-        point = fit_nuisances(there, own, nuisances)
-        if point.lost:
-            point = fit_nuisances(there, own, fitted)
+        for start in (nuisances, fitted, problem.first):
+            point = fit_nuisances(there, own, start)
+            if not point.lost:
+                break
         if not point.lost or not static:
             break
     if point.lost:
