@@ -25,7 +25,7 @@ from tmlattice.beam.kicks import (
     kicking,
     orbits_of_kicks,
 )
-from tmlattice.diagnosis.families.family import Family, StatedCause
+from tmlattice.diagnosis.families.family import Family, RingFamily, StatedCause
 from tmlattice.effects import Cause, background_rms, directions, find
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -259,10 +259,10 @@ def orbit_patterns(model: ResponseModel, plane: int, effects: Sequence[str]) -> 
     return OrbitPatterns(causes, amounts, amounts @ orbits)
 
 
-class _Orbit(Family):
+class _Orbit(RingFamily):
     """Amplitudes of orbit patterns, in units of usual errors."""
 
-    per, single = "ring", False
+    single = False
     trust, rms = 1.0, 1.0
     plane: ClassVar[int]
 
@@ -287,12 +287,6 @@ class _Orbit(Family):
             slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, causes[some])]
             out += amounts[:, some] @ np.stack(slopes)
         return np.asarray(out.reshape(-1, *at.data.shape) * at.gain(self.block))
-
-    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The errors of bends and quadrupoles."""
-        causes, amounts, _ = self.patterns(data)
-        own = zip(causes, (values @ amounts).tolist(), strict=True)
-        return replace(errors, ring=(*errors.ring, *(Cause(*h, a) for h, a in own if a)))
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData
