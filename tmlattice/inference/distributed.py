@@ -12,10 +12,10 @@ as the square of the errors, whatever the number of readings. `DistributedProble
 signatures, since its search whitens rows by them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh
@@ -104,6 +104,16 @@ class DistributedErrors:
         amounts = (self.amounts + self.rms * self.correlated(x)).tolist()
         own = zip(self.hypotheses, amounts, strict=True)
         return np.array([find(name).floored(amount) for (name, _), amount in own])
+
+    def independent(self, change: Array) -> Array:
+        """A change of the amounts in independent errors of size 1, [error]: `correlated` undone."""
+        own = change / self.rms
+        return np.asarray(own + ((1 - self.share) ** -0.5 - 1) * (self.seen @ own) @ self.seen)
+
+    def square(self, amounts: Array) -> float:
+        """Sum of squares of the independent errors: the prior's part of the cost."""
+        own = self.independent(amounts - self.amounts)
+        return float(own @ own)
 
     def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
         """Return the distribution after more readings.
@@ -365,34 +375,34 @@ def fit_distributed_errors(
     Raises:
         UnstableRingError: no beam is stored with the most probable errors.
     """
-    amounts = known.amounts if linearised_at is None else linearised_at
-    stored = amounts if stored is None else stored
-    expected = np.inf
-    for step in range(ROUNDS):
-        inner, there, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
-        if step > 1 and abs(there.chi2 - expected) < LINEAR:
-            break
-        stored, point = amounts, there
+
+    def at(inner: Problem, point: Point, amounts: Array) -> DistributedProblem:
         slopes = signatures_of(inner, point, known.hypotheses)
         slopes *= chain_factors(known, amounts)[:, None]
         shift = ((amounts - known.amounts) @ slopes).reshape(inner.valid.shape)
         spread = known.correlated(known.rms[:, None] * slopes).reshape(-1, *inner.valid.shape)
-        among = DistributedProblem(
+        return DistributedProblem(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
             judgement=problem.judgement, inner=inner, known=known, linearised_at=amounts,
             spread=spread, shift=shift,
         )  # fmt: skip
-        if linearised_at is not None:
-            break
-        there = fit_nuisances(among, causes, point.nuisances)
-        if there.projection is None:
-            raise UnstableRingError(f"{there.lost} with distributed errors")
-        assert point.projection is not None
-        nuisances = there.nuisances
-        amounts = among.estimate(there.projection.out(there.residual))
-        change = ((amounts - stored) @ slopes).reshape(inner.valid.shape)
-        clean = point.projection.out(point.residual - inner.as_rows(change))
-        expected = float(clean @ clean)
+
+    def solved(inner: Problem, point: Point, amounts: Array) -> Linear:
+        among = at(inner, point, amounts)
+        there = among.at(causes, point.nuisances)
+        assert there.projection is not None
+        clean = there.projection.out(there.residual)
+        change = there.projection.coordinates(there.residual)
+        moved = among.moved(point.nuisances, change) if len(change) else point.nuisances
+        return Linear(among, point, among.estimate(clean), float(clean @ clean), moved)
+
+    if linearised_at is None:
+        made = most_probable(problem, known, known.amounts, causes, nuisances, solved)
+        among, point = made.made, made.point
+    else:
+        stored = linearised_at if stored is None else stored
+        inner, point, amounts = linearise(problem, known, linearised_at, stored, causes, nuisances)
+        among = at(inner, point, amounts)
     fitted = FittedErrors(among, problem, sizes_of(known))
     if learn:
         fitted = _scaled(fitted, point, causes, noisy, weigh)
@@ -500,6 +510,98 @@ def families_of(known: DistributedErrors) -> tuple[list[str], Indices]:
     return names, np.array([names.index(name) for name, _ in known.hypotheses])
 
 
+class Linear(NamedTuple):
+    """A linearisation at some amounts, and its most probable ones.
+
+    Attributes:
+        made: the linear problem, or its sums.
+        point: of the causes, at the amounts.
+        amounts: most probable, as far as a beam is stored and the cost falls, [error].
+        cost: expected there: chi-square and `DistributedErrors.square`.
+        nuisances: most probable.
+    """
+
+    made: Any
+    point: Point
+    amounts: Array
+    cost: float
+    nuisances: Array
+
+
+def most_probable(
+    problem: Problem,
+    known: DistributedErrors,
+    amounts: Array,
+    causes: Sequence[Cause],
+    nuisances: Array,
+    solved: Callable[[Problem, Point, Array], Linear],
+) -> Linear:
+    """Return the linearisation at the most probable amounts.
+
+    Where orbits are large in strong sextupoles, a beam's whole way is too nonlinear for steps from
+    the design. The amounts are then those of its first half, quarter, ..., and a further part of
+    the way follows, as a machine is threaded.
+
+    Args:
+        problem, known, causes, nuisances: see `fit_distributed_errors`.
+        amounts: first ones, [error].
+        solved: makes the linear problem, and solves it.
+
+    Raises:
+        UnstableRingError: no beam is stored with the first amounts.
+    """
+    way, done, step = problem.way(), 0.0, 1.0
+    smallest = 1 / len(np.unique(way))
+    failed: Linear | UnstableRingError | None = None
+    while True:
+        share = min(done + step, 1.0)
+        part = problem.without(problem.valid & (way > share))
+        begun = nuisances if step == 1 or done else problem.first
+        found: Linear | UnstableRingError
+        try:
+            found, good = _settled(part, known, amounts, causes, begun, solved)
+        except UnstableRingError as error:
+            found, good = error, False
+        if good:
+            assert isinstance(found, Linear)
+            if share == 1:
+                return found
+            done, step = share, 2 * step
+            amounts, nuisances = found.amounts, found.nuisances
+            continue
+        failed = failed or found
+        if step > smallest:
+            step /= 2
+        elif isinstance(failed, Linear):
+            return failed
+        else:
+            raise failed
+
+
+def _settled(
+    problem: Problem,
+    known: DistributedErrors,
+    amounts: Array,
+    causes: Sequence[Cause],
+    nuisances: Array,
+    solved: Callable[[Problem, Point, Array], Linear],
+) -> tuple[Linear, bool]:
+    """The linearisation of some readings, and whether its steps lowered the cost to the end."""
+    inner, point, _ = linearise(problem, known, amounts, amounts, causes, nuisances)
+    cost = point.chi2 + known.square(amounts)
+    for _ in range(ROUNDS):
+        found = solved(inner, point, amounts)
+        inner, point, at = linearise(
+            problem, known, found.amounts, amounts, causes, found.nuisances, cost
+        )
+        if at is amounts:  # at the minimum, but for the curvature
+            return found._replace(amounts=at), cost - found.cost < LINEAR * cost
+        amounts, cost = at, point.chi2 + known.square(at)
+        if abs(cost - found.cost) < LINEAR:
+            break
+    return found, True
+
+
 def linearise(
     problem: Problem,
     known: DistributedErrors,
@@ -507,13 +609,15 @@ def linearise(
     stored: Array,
     causes: Sequence[Cause],
     nuisances: Array,
+    cost: float = np.inf,
 ) -> tuple[Problem, Point, Array]:
-    """Return the problem linearised as near to some amounts as a beam is stored.
+    """Return the problem linearised as near to some amounts as a beam is stored and the cost falls.
 
     Args:
         problem, causes, nuisances, known: see `fit_distributed_errors`.
         amounts: wanted, [error].
         stored: amounts with a stored beam; the same object as `amounts`: unknown.
+        cost: chi-square and `DistributedErrors.square` at `stored`; inf: unknown.
 
     Returns:
         The problem with these errors, the point of the causes, and the amounts.
@@ -521,18 +625,15 @@ def linearise(
     Raises:
         UnstableRingError: no amounts between the two store a beam.
     """
-    first = amounts is stored
-    for turn in range(len(STEP_SHARES)):
-        own = zip(known.hypotheses, amounts.tolist(), strict=True)
+    for share in (1.0,) if amounts is stored else (*STEP_SHARES, 0.0):
+        some = stored + share * (amounts - stored) if share else stored
+        own = zip(known.hypotheses, some.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
         inner = replace(problem, fixed=(*problem.fixed, *there))
         alone = fit_nuisances(inner, causes, nuisances)
-        if alone.projection is not None:
-            return inner, alone, amounts
-        if first:
-            break
-        # beyond the linear range
-        amounts = stored if turn == len(STEP_SHARES) - 2 else (amounts + stored) / 2
+        lower = alone.chi2 + known.square(some) < cost + LINEAR
+        if alone.projection is not None and (lower or some is stored):
+            return inner, alone, some
     raise UnstableRingError(f"{alone.lost} with the most probable distributed errors")
 
 
@@ -617,11 +718,13 @@ class Sums:
     Attributes:
         gram: with each other, [error, error].
         inner: with the residual, [error].
-        some: slopes in a few rows, nuisances not projected out, [error, row].
+        keep: a few rows.
+        some: slopes in these, nuisances not projected out, [error, row].
     """
 
     gram: Array
     inner: Array
+    keep: Indices
     some: Array
 
 
@@ -645,30 +748,29 @@ def posterior(
     Raises:
         UnstableRingError: no beam is stored with the most probable errors.
     """
-    amounts = stored = known.amounts if linearised_at is None else linearised_at
-    nuisances, expected = problem.first, np.inf
-    for step in range(ROUNDS):
-        inner, there, amounts = linearise(problem, known, amounts, stored, (), nuisances)
-        if step > (linearised_at is None) and abs(there.chi2 - expected) < LINEAR:
-            break
-        point, stored, nuisances = there, amounts, there.nuisances
-        keep = sampled_rows(len(point.residual))
-        sums = sums_at(inner, point, known, stored, keep)
-        amounts = _posterior_at(known, stored, sums).amounts
-        change = amounts - stored
-        expected = point.chi2 - float(change @ (2 * sums.inner - sums.gram @ change))
-    if learn:
-        assert point.projection is not None
-        _, belongs = families_of(known)
-        found = components_of_rows(
-            point.residual[keep] + (stored - known.amounts) @ sums.some,
-            point.projection.matrix()[keep],
-            known.correlated(known.rms[:, None] * sums.some), belongs, prior=known.scales,
-        )  # fmt: skip
-        least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
-        rms = np.maximum(known.rms * found.scale[belongs], least)
-        known = replace(known, rms=rms, scales=found.covariance)
-    return _posterior_at(known, stored, sums)
+
+    def solved(inner: Problem, point: Point, amounts: Array) -> Linear:
+        sums = sums_at(inner, point, known, amounts)
+        there = _posterior_at(known, amounts, sums).amounts
+        change = there - amounts
+        chi2 = point.chi2 - float(change @ (2 * sums.inner - sums.gram @ change))
+        return Linear((sums, amounts), point, there, chi2 + known.square(there), point.nuisances)
+
+    start = known.amounts if linearised_at is None else linearised_at
+    made = most_probable(problem, known, start, (), problem.first, solved)
+    (sums, stored), point = made.made, made.point
+    if not learn:
+        return replace(_posterior_at(known, stored, sums), amounts=made.amounts)
+    assert point.projection is not None
+    _, belongs = families_of(known)
+    found = components_of_rows(
+        point.residual[sums.keep] + (stored - known.amounts) @ sums.some,
+        point.projection.matrix()[sums.keep],
+        known.correlated(known.rms[:, None] * sums.some), belongs, prior=known.scales,
+    )  # fmt: skip
+    least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
+    rms = np.maximum(known.rms * found.scale[belongs], least)
+    return _posterior_at(replace(known, rms=rms, scales=found.covariance), stored, sums)
 
 
 def _posterior_at(known: DistributedErrors, at: Array, sums: Sums) -> Posterior:
@@ -690,7 +792,6 @@ def sums_at(
     point: Point,
     known: DistributedErrors,
     amounts: Array,
-    keep: Indices,
 ) -> Sums:
     """Return the sums at a point.
 
@@ -699,13 +800,12 @@ def sums_at(
         point: of nuisances alone.
         known: the errors.
         amounts: amounts of the errors in the problem, [error].
-        keep: rows for `Sums.some`.
     """
     assert point.projection is not None
     clean = point.projection.out(point.residual)
     directions = np.linalg.qr(point.projection.matrix())[0]
     slope = chain_factors(known, amounts)
-    count = len(slope)
+    keep, count = sampled_rows(len(clean)), len(slope)
     gram, inner = np.zeros((count, count)), np.zeros(count)
     along, some = np.zeros((count, directions.shape[1])), np.zeros((count, len(keep)))
     column = np.full(len(clean), -1)
@@ -719,4 +819,4 @@ def sums_at(
         here = column[rows]
         some[np.ix_(visible, here[here >= 0])] = own[:, here >= 0]
     gram -= along @ along.T
-    return Sums(gram, inner, some)
+    return Sums(gram, inner, keep, some)
