@@ -516,7 +516,7 @@ class Linear(NamedTuple):
     Attributes:
         made: the linear problem, or its sums.
         point: of the causes, at the amounts.
-        amounts: most probable, as far as a beam is stored and the cost falls, [error].
+        amounts: most probable, as far as a beam is stored, [error].
         cost: expected there: chi-square and `DistributedErrors.square`.
         nuisances: most probable.
     """
@@ -586,20 +586,19 @@ def _settled(
     nuisances: Array,
     solved: Callable[[Problem, Point, Array], Linear],
 ) -> tuple[Linear, bool]:
-    """The linearisation of some readings, and whether its steps lowered the cost to the end."""
-    inner, point, _ = linearise(problem, known, amounts, amounts, causes, nuisances)
-    cost = point.chi2 + known.square(amounts)
+    """The linearisation of some readings, and whether it predicts the cost at its amounts.
+
+    Steps may raise the cost: where noise is small, they leave a curved valley and come back."""
+    inner, point, amounts = linearise(problem, known, amounts, amounts, causes, nuisances)
     for _ in range(ROUNDS):
         found = solved(inner, point, amounts)
         inner, point, at = linearise(
-            problem, known, found.amounts, amounts, causes, found.nuisances, cost
+            problem, known, found.amounts, amounts, causes, found.nuisances
         )
-        if at is amounts:  # at the minimum, but for the curvature
-            return found._replace(amounts=at), cost - found.cost < LINEAR * cost
         amounts, cost = at, point.chi2 + known.square(at)
         if abs(cost - found.cost) < LINEAR:
             break
-    return found, True
+    return found._replace(amounts=amounts), abs(cost - found.cost) < LINEAR * cost
 
 
 def linearise(
@@ -609,15 +608,13 @@ def linearise(
     stored: Array,
     causes: Sequence[Cause],
     nuisances: Array,
-    cost: float = np.inf,
 ) -> tuple[Problem, Point, Array]:
-    """Return the problem linearised as near to some amounts as a beam is stored and the cost falls.
+    """Return the problem linearised as near to some amounts as a beam is stored.
 
     Args:
         problem, causes, nuisances, known: see `fit_distributed_errors`.
         amounts: wanted, [error].
         stored: amounts with a stored beam; the same object as `amounts`: unknown.
-        cost: chi-square and `DistributedErrors.square` at `stored`; inf: unknown.
 
     Returns:
         The problem with these errors, the point of the causes, and the amounts.
@@ -631,8 +628,7 @@ def linearise(
         there = [Cause(*h, a) for h, a in own if a]
         inner = replace(problem, fixed=(*problem.fixed, *there))
         alone = fit_nuisances(inner, causes, nuisances)
-        lower = alone.chi2 + known.square(some) < cost + LINEAR
-        if alone.projection is not None and (lower or some is stored):
+        if alone.projection is not None:
             return inner, alone, some
     raise UnstableRingError(f"{alone.lost} with the most probable distributed errors")
 
