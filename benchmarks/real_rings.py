@@ -39,6 +39,7 @@ import numpy as np
 
 import tmlattice
 from tmlattice import read_measurement
+from tmlattice.diagnosis.records import record_of
 from tmlattice.diagnosis.response import procedure
 from tmlattice.errors import TmlatticeError
 from tmlattice.files import output_file, write_json
@@ -186,10 +187,10 @@ def _diagnosed(lattice, folder, told, seed, missing, pictures, name):
         "verdict": found.verdict,
         "seconds": seconds,
         "fit": MICRO * found.fit_after.rms,
-        "steps": [_step(step.as_json()) for step in found.steps],
-        "refused": [_step(step.as_json()) for step in found.rejected_steps],
+        "steps": [_step(record_of(step)) for step in found.steps],
+        "refused": [_step(record_of(step)) for step in found.rejected_steps],
         "findings": [own.words or f"{own.effect} {own.element}" for own in found.findings],
-        "hypotheses": [row.as_json() for row in found.hypotheses or ()],
+        "hypotheses": [record_of(row) for row in found.hypotheses or ()],
         "warnings": list(found.warnings),
         "amounts": _amounts(found),
     }

@@ -559,7 +559,7 @@ def most_probable(
         begun = nuisances if step == 1 or done else problem.first
         found: Linear | UnstableRingError
         try:
-            found, good = _settled(part, known, amounts, causes, begun, solved)
+            found, good = _settled(part, known, amounts, causes, begun, solved, share < 1)
         except UnstableRingError as error:
             found, good = error, False
         if good:
@@ -585,6 +585,7 @@ def _settled(
     causes: Sequence[Cause],
     nuisances: Array,
     solved: Callable[[Problem, Point, Array], Linear],
+    roughly: bool,
 ) -> tuple[Linear, bool]:
     """The linearisation of some readings, and whether it predicts the cost at its amounts.
 
@@ -596,7 +597,7 @@ def _settled(
             problem, known, found.amounts, amounts, causes, found.nuisances
         )
         amounts, cost = at, point.chi2 + known.square(at)
-        if abs(cost - found.cost) < LINEAR:
+        if abs(cost - found.cost) < LINEAR * (cost if roughly else 1.0):
             break
     return found._replace(amounts=amounts), abs(cost - found.cost) < LINEAR * cost
 

@@ -331,12 +331,13 @@ STEPS = (
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),
     Trial((HorizontalOrbit(),), 2, 0),
-    Trial((VerticalOrbit(),), 0, 2),
+    Trial((VerticalOrbit(),), 2, 2),
     Trial((HorizontalKicks(),), 2, 0),
     Trial((EnergyOffset(),), 2, 0),
     Trial((VerticalKicks(),), 0, 2),
 )
-"""The trials, in order. Skew gradients move the tunes to second order, which the gradients correct.
+"""The trials, in order. Skew gradients, and vertical orbits in sextupoles, move the tunes to second
+order, which the gradients correct.
 The energy offset changes the dispersion, and comes after the kicks that do so, too."""
 
 CHANGES = (
