@@ -46,7 +46,7 @@ from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.stated import unwidened
 from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
-from tmlattice.diagnosis.response.validation import Step, score
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.response.weights import LEAST
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.support import FREE, Support
@@ -270,21 +270,19 @@ def _fit_change(
 ) -> StepwiseFit:
     """The fit of all possible changes, with the estimated noise of the difference."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
-    before = score(design, split.held)
-    steps = [Step.scored("reference", 0, before)]
+    steps = [score(design, "reference")]
     state = design
     for trial, settled in one_by_one(design, trials, progress):
         state = settled
         count = sum(family.count(data) for family in trial.families)
         title = ", ".join(family.title for family in trial.families)
-        steps.append(Step.scored(title, count, score(state, split.held)))
+        steps.append(score(state, title, count))
     state = settle(bend(jump(state)))
     state = settle(_learnt_noise(state))
-    after = score(state, split.held)
-    if len(steps) > 1:
-        steps[-1] = Step.scored(steps[-1].effect, steps[-1].parameters, after)
+    steps[-1] = score(state, steps[-1].effect, steps[-1].parameters)
     design = _with_noise(design, state.data.noise)
-    return StepwiseFit(design, state, tuple(steps), (), (score(design, split.held), after))
+    steps[0] = score(design, "reference")
+    return StepwiseFit(design, state, tuple(steps), ())
 
 
 def _learnt_noise(state: State) -> State:

@@ -29,7 +29,7 @@ from tmlattice.diagnosis.response.state import Apart, State, allow, bend
 from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.stepwise import ROUGH, StepwiseFit, fit_chi2
 from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspects_of
-from tmlattice.diagnosis.response.validation import Chi2, Step, score
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.alternatives import linear_evidence
@@ -141,25 +141,25 @@ class _Search:
         """Whether the residual far exceeds the noise, and no single cause explains most of it:
         model discrepancy could be detected as a fault."""
         planes = fit_chi2(self.state)[:2]
-        worst = max((0, 1), key=lambda plane: planes[plane].per_reading)
+        worst = max((0, 1), key=lambda plane: planes[plane].ratio)
         own = planes[worst]
-        if own.per_reading <= LACKS or self.state.apart:
+        if own.ratio**2 <= LACKS or self.state.apart:
             return False
         # by the noise alone: a large residual of a column reduces its weight
-        left = [self.left_beside(*leader)[worst].total for leader in self.leaders()]
-        return min(left, default=np.inf) > (own.total + own.readings) / 2
+        left = [self.left_beside(*leader)[worst] for leader in self.leaders()]
+        return min(left, default=np.inf) > (own.chi2 + own.freedom) / 2
 
-    def left_beside(
-        self, cause: Hypothesis, amount: float, information: Array
-    ) -> tuple[Chi2, Chi2, Chi2]:
-        """Chi-square with one more cause, all else unchanged; infinite without a closed orbit."""
+    def left_beside(self, cause: Hypothesis, amount: float, information: Array) -> list[float]:
+        """Chi-square of each plane with one more cause, all else unchanged; infinite without a
+        closed orbit."""
         state, suspect = _as_number(self.state, cause, information)
         assert suspect.members is not None
         values = state.values[suspect.variable] + amount * suspect.members
         try:
-            return fit_chi2(state.moved({**state.values, suspect.variable: values}))
+            moved = state.moved({**state.values, suspect.variable: values})
         except TmlatticeError:
-            return (Chi2(np.inf, 1),) * 3
+            return [np.inf, np.inf]
+        return [own.chi2 for own in fit_chi2(moved)]
 
     def seen(self, state: State) -> Seen:
         """All suspects, linearised at the state."""
@@ -403,10 +403,11 @@ def given_faults(fit: StepwiseFit, apart: Sequence[Apart]) -> StepwiseFit:
     settled = _settled(state)
     if settled is None:
         return fit
-    after = score(settled, settled.split.held)
-    before = fit.heldout[1]
-    if after.in_plane > WORSE * before.in_plane or after.coupling > WORSE * before.coupling:
-        return fit
     title = ", ".join(f"{effect} {place}" for effect, place in own)
-    steps = (*fit.steps, Step.scored(title, len(own), after))
-    return replace(fit, state=settled, steps=steps, heldout=(fit.heldout[0], after))
+    before, after = fit.steps[-1], score(settled, title, len(own))
+    if (
+        after.heldout_rms_in_plane > WORSE * before.heldout_rms_in_plane
+        or after.heldout_rms_coupling > WORSE * before.heldout_rms_coupling
+    ):
+        return fit
+    return replace(fit, state=settled, steps=(*fit.steps, after))

@@ -67,8 +67,7 @@ from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
-from tmlattice.inference import chi2
-from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
@@ -354,8 +353,8 @@ def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> 
 def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
     """`none` if the design's residual is noise, of fitted and held-out readings, in-plane, coupling
     and RF; else `distributed`."""
-    messages = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
-    chances = [chi2.sf(own.total, own.readings) for own in messages if own.readings]
+    blocks = (*fit_chi2(fit.design), *fit.steps[0].compared)
+    chances = [own.p_value for own in blocks if own.freedom]
     return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
@@ -379,10 +378,10 @@ def _gap(fit: StepwiseFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
     # in units of each reading's noise: the planes differ in it
     before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
-    seen = fit.heldout[0].chi2[0]  # a gap below five sigma of the noise is not significant
-    there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
+    seen = fit.steps[0].compared[0]  # a gap below this many sigma of the noise is none
+    there = before > 0 and seen.chi2 - seen.freedom > SIGNIFICANT * np.sqrt(2 * seen.freedom)
     explained = 1 - after / before if there and len(misfits) > 1 else None
-    return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, seen.readings)
+    return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, int(seen.freedom))
 
 
 def _patterns(fit: StepwiseFit) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
             continue
         found.append((log_evidence(state, state.good), state))
         log.info("distributed errors: evidence %.1f", found[-1][0])
-        if all(own.per_reading < MISSING for own in fit_chi2(state)[:2]):
+        if all(own.ratio**2 < MISSING for own in fit_chi2(state)[:2]):
             break
     return max(found, key=lambda one: one[0])[1] if found else continued
 

@@ -19,7 +19,7 @@ from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import StepwiseFit
 from tmlattice.diagnosis.response.undetermined import Blur, Undetermined
-from tmlattice.diagnosis.response.validation import Step, score
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect
@@ -155,9 +155,9 @@ def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bo
     if sparse.fit.p_value < judgement.noise[0] <= fit.p_value:
         return True
     state = sparse.fit.state
-    of_all = fit.heldout[1]
-    of_few = score(replace(state, good=fit.state.good), state.split.held)
-    gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
+    of_all, of_few = fit.steps[-1], score(replace(state, good=fit.state.good), "sparse")
+    gained = np.log([of_all.heldout_rms_in_plane / of_few.heldout_rms_in_plane,
+                     of_all.heldout_rms_coupling / of_few.heldout_rms_coupling])  # fmt: skip
     return bool(np.nansum(gained) < np.log(HELPS))
 
 
@@ -304,16 +304,15 @@ def _result(
         replace(found, full=False), findings, p_value, False, judgement
     )
     design = begin(data, split)
-    steps = [Step.scored("design", 0, score(design, split.held))]
+    steps = [score(design, "design")]
     state = design
     for i, cause in enumerate(causes, 1):
         state = replace(design, at=base.with_causes(causes[:i]))
         name = f"{cause.effect} {cause.element or ''}".rstrip()
-        steps.append(Step.scored(name, 1, score(state, split.held)))
-    heldout = (score(design, split.held), score(state, split.held))
+        steps.append(score(state, name, 1))
     covariance = found.fit.covariance
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    stepwise = StepwiseFit(design, state, tuple(steps), (), heldout)
+    stepwise = StepwiseFit(design, state, tuple(steps), ())
     fitted_causes = list(zip(causes, errors, strict=True))
     expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
     noise = expected and stepwise.p_value >= judgement.noise[0]

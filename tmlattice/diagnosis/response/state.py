@@ -252,7 +252,7 @@ def jump(state: State, beyond: float | None = None) -> State:
 
 def rms_of(parts: Iterable[Array]) -> float:
     """Return the rms of all entries; NaN without any."""
-    values = np.concatenate(list(parts))
+    values = np.concatenate([np.zeros(0), *parts])
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 

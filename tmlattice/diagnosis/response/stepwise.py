@@ -38,8 +38,6 @@ from tmlattice.diagnosis.response.state import (
 )
 from tmlattice.diagnosis.response.validation import (
     WORTH,
-    Chi2,
-    Score,
     Step,
     against,
     in_favour,
@@ -72,19 +70,16 @@ FIRST, ROUGH = 4, 0.03
 required for another one."""
 
 
-def fit_chi2(state: State) -> tuple[Chi2, Chi2, Chi2]:
-    """Return chi-square of the fitted readings by their noise alone: in-plane, coupling, RF."""
-    data = state.data
-    out = []
-    use = ~state.split.held
-    for block in (0, 1):
-        pull = data.pick(state.at.left, block) / data.noise_of(block)
-        squares = (pull[:-1][use[:-1]][:, state.good]) ** 2
-        out.append(Chi2(float(np.nansum(squares)), int(np.isfinite(squares).sum())))
-        if block == 0:
-            rf = pull[-1][state.split.half[-1] & state.good] ** 2
-    out.append(Chi2(float(np.nansum(rf)), int(np.isfinite(rf).sum())))
-    return out[0], out[1], out[2]
+def fit_chi2(state: State) -> tuple[Block, ...]:
+    """Return the fitted readings by their noise alone: in-plane, coupling, RF."""
+    data, fitted = state.data, ~state.split.held[:-1]
+    pulls = [data.pick(state.at.left, block) / data.noise_of(block) for block in (0, 1)]
+    own = [pull[:-1][fitted][:, state.good] for pull in pulls]
+    own.append(pulls[0][-1][state.split.half[-1] & state.good])
+    return tuple(
+        Block(name, float(np.nansum(pull**2)), int(np.isfinite(pull).sum()))
+        for name, pull in zip(("in-plane", "coupling", "RF"), own, strict=True)
+    )
 
 
 # --- the steps ------------------------------------------------------------------------------------
@@ -96,7 +91,6 @@ class StepwiseFit:
         design, state: before and after.
         steps: accepted; the first is the design's, the last the result's.
         rejected_steps: did not improve the fit.
-        heldout: validation scores of the design and of the result.
         messages: about rejected readings, implausible families and beam jitter.
         labels: of rejected steps.
     """
@@ -105,7 +99,6 @@ class StepwiseFit:
     state: State
     steps: tuple[Step, ...]
     rejected_steps: tuple[Step, ...]
-    heldout: tuple[Score, Score]
     messages: tuple[str, ...] = ()
     labels: tuple[Label, ...] = ()
 
@@ -205,12 +198,11 @@ def needed_families(
     """
     design, labels = started.design, started.labels
     state, moving = _beside_jitter(started.state, progress)
-    split = state.split
-    before = score(design, split.held)
+    before = score(design, "design")
     steps = {
-        trial: Step.scored(
+        trial: score(
+            without_readings(own, started.rejected),
             _title(trial), sum(family.count(state.data) for family in trial.families),
-            score(without_readings(own, started.rejected), split.held),
         )
         for trial, own in started.stages.items()
     }  # fmt: skip
@@ -222,9 +214,9 @@ def needed_families(
     enough = int(np.sum(validated.columns[:, 0, 1] > 0)) >= ENOUGH
     worse = -lost(inner(replace(design, jitter=state.jitter)), validated)[0]
     nothing = StepwiseFit(
-        design, design, (Step.scored("design", 0, before),),
+        design, design, (before,),
         (*rejected_steps, *(replace(step, kept=False) for step in steps.values())),
-        (before, before), tuple(notes), labels,
+        tuple(notes), labels,
     )  # fmt: skip
     if enough and worse > SPOILT:  # together they worsen the validation
         return nothing
@@ -246,13 +238,10 @@ def needed_families(
             "lattice may be too far from the ring, and no effect is reported"
         )
         return replace(nothing, messages=(*nothing.messages, diverged))
-    after = score(state, split.held)
-    kept = [Step.scored("design", 0, before), *steps.values()]
-    kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
+    kept = [before, *steps.values()]
+    kept[-1] = score(state, kept[-1].effect, kept[-1].parameters)
     notes += [] if moving is None else [moving.sentence]
-    return StepwiseFit(
-        design, state, tuple(kept), tuple(rejected_steps), (before, after), tuple(notes), labels
-    )
+    return StepwiseFit(design, state, tuple(kept), tuple(rejected_steps), tuple(notes), labels)
 
 
 def _outliers(state: State) -> tuple[Flags, list[Label]]:
