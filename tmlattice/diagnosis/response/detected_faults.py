@@ -1,7 +1,6 @@
 """Single faults of an orbit response among distributed errors.
 
->>> found = detected_faults(data, split, fit.state, hypotheses, judgement)
->>> [(one.cause, one.sigma, one.statistic) for one in found.faults]
+>>> apart, findings = detected_faults(data, split, fit.state, hypotheses, most, judgement)
 
 One cause after another is given a prior of its own, together with all usual distributed errors
 (`small_errors`). Their scales are learnt without it, and everything is fitted again, not
@@ -11,7 +10,7 @@ chance level of so many causes and families.
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,26 +18,26 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
+from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
-from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.linear import Linear, linear
-from tmlattice.diagnosis.response.others import KINDS, with_number
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, small_errors
-from tmlattice.diagnosis.response.state import Apart, State, allow, bend
+from tmlattice.diagnosis.response.state import Candidate, State, allow, bend
 from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.stepwise import ROUGH, StepwiseFit, fit_chi2
-from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspects_of
+from tmlattice.diagnosis.response.suspected import KINDS, Seen, Weighed, suspects_of, with_number
 from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.alternatives import linear_evidence
+from tmlattice.inference.alternatives import Detection, linear_evidence
 from tmlattice.inference.common_factors import MIN_CHI2
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import BEYOND, SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
 from tmlattice.inference.scan import Scan
-from tmlattice.observe.orbit_response import Hypothesis
+from tmlattice.observe.orbit_response import Errors, Hypothesis
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import Split
@@ -62,27 +61,12 @@ BEHIND = 2.0
 """Log evidence by which an alternative must be ahead to replace an accepted cause."""
 LISTED = 24
 """Most alternatives of a fault that are compared."""
-BEYOND = 1.5
-"""Ratio to the largest fault above which an amount is implausible."""
 LACKS = 2.0
 """Largest chi-square per reading of a plane, given distributed errors, for a search in any case."""
 WORSE = 1.02
 """Largest ratio of held-out residuals with and without the faults."""
 MEMBERS = 16
 """Assumed number of orbit patterns, where there are none."""
-
-
-@dataclass(frozen=True, eq=False)
-class DetectedFaults:
-    """The detected faults.
-
-    Attributes:
-        state: distributed errors together with the faults.
-        faults: by falling statistic.
-    """
-
-    state: State
-    faults: tuple[Fault, ...]
 
 
 def detected_faults(
@@ -93,8 +77,8 @@ def detected_faults(
     most: int,
     judgement: Judgement,
     progress: Callable[[str], Any] = lambda stage: None,
-) -> DetectedFaults:
-    """Detect faults one after another, each given those before it.
+) -> tuple[tuple[Candidate, ...], list[Finding]]:
+    """Return the detected faults, one after another, each given those before it; and the findings.
 
     Args:
         data, split: the data, and the validation split.
@@ -119,9 +103,7 @@ def detected_faults(
             break
         seen_before.append(chosen)
     seen = search.seen(search.state)
-    errors = search.state.at.errors
-    faults = [as_turned(search.fault(seen, one), errors, data) for one in search.state.apart]
-    return DetectedFaults(search.state, tuple(sorted(faults, key=lambda fault: -fault.statistic)))
+    return search.state.apart, [search.finding(seen, one) for one in search.state.apart]
 
 
 class _Search:
@@ -153,7 +135,6 @@ class _Search:
         """Chi-square of each plane with one more cause, all else unchanged; infinite without a
         closed orbit."""
         state, suspect = _as_number(self.state, cause, information)
-        assert suspect.members is not None
         values = state.values[suspect.variable] + amount * suspect.members
         try:
             moved = state.moved({**state.values, suspect.variable: values})
@@ -226,7 +207,7 @@ class _Search:
         """
         return _settled(_apart(_as_number(state, cause, information)[0], cause))
 
-    def better(self, state: State, one: Apart) -> State:
+    def better(self, state: State, one: Candidate) -> State:
         """The state with an alternative instead of a cause, if that explains more."""
         seen = self.seen(state)
         own = seen.beside(one.name)
@@ -261,22 +242,22 @@ class _Search:
             state = self.better(fewer, fewer.apart[-1])
         return state
 
-    def members(self, state: State, one: Apart) -> int:
+    def members(self, state: State, one: Candidate) -> int:
         """Number of amounts that determine the statistic's scale, of the family or orbit
         patterns."""
         if one.variable not in (kind.variable for kind in KINDS):
             return max(len(one.members) - 1, 1)
-        orbit = [len(state.values[f.variable]) for f in state.of_block(one.block)
+        orbit = [len(state.values[f.variable]) for f in state.of_block(one.block or 0)
                  if f.name in ORBITS]  # fmt: skip
         return max(min(orbit, default=MEMBERS) - 1, 1)
 
-    def p_value(self, seen: Seen, statistic: float, one: Apart) -> float:
+    def p_value(self, seen: Seen, statistic: float, one: Candidate) -> float:
         """Probability that the largest of so many errors reaches this statistic by chance."""
         members = self.members(seen.state, one)
         own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), members))
         return min(1.0, own * len(self.hypotheses))
 
-    def clear(self, seen: Seen, one: Apart) -> bool:
+    def clear(self, seen: Seen, one: Candidate) -> bool:
         """Whether the cause is detected."""
         statistic, cause, _ = _shown(seen, one)
         if not abs(cause.amount) < BEYOND * find(cause.effect).largest:
@@ -285,25 +266,41 @@ class _Search:
             statistic > MIN_CHI2 and self.p_value(seen, statistic, one) < self.judgement.false_alarm
         )
 
-    def fault(self, seen: Seen, one: Apart) -> Fault:
+    def finding(self, seen: Seen, one: Candidate) -> Finding:
         """The fault with its amount, error and alternatives."""
         own = seen.beside(one.name)
         evidence = self.evidence(seen, own)
-        here = _place(seen, one)
-        order = [int(h) for h in np.argsort(-evidence)[:LISTED] if np.isfinite(evidence[h])]
-        order = [here, *(h for h in order if h != here)]
         statistic, cause, sigma = _shown(seen, one)
-        return Fault(
-            cause,
-            sigma,
-            statistic,
-            self.p_value(seen, statistic, one),
-            tuple(Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in order),
-            evidence[order],
-        )
+        cause, sigma = as_turned(cause, sigma, seen.state.at.errors, seen.state.data)
+        known = {one.cause, (cause.effect, cause.element)}
+        rivals = [int(h) for h in np.argsort(-evidence)[:LISTED]
+                  if np.isfinite(evidence[h]) and seen.suspects[h].cause not in known]  # fmt: skip
+        chance = np.exp(evidence[[_place(seen, one), *rivals]] - evidence.max())
+        causes = (Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in rivals)
+        detection = Detection(statistic, MIN_CHI2, self.p_value(seen, statistic, one))
+        return finding_of(
+            seen.state.data.ring, (cause, *causes), chance / chance.sum(), sigma, detection,
+            self.judgement.mass,
+        )  # fmt: skip
 
 
-def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Suspect]:
+def as_turned(
+    cause: Cause, sigma: float, errors: Errors, data: ResponseData
+) -> tuple[Cause, float]:
+    """Return a cause with its error, reported as a roll if the corrector kicks significantly in the
+    other plane: it has one number for each plane, and the kick that is missing in one is no
+    calibration error. A corrector without any kick is not rolled."""
+    if cause.effect != "corrector_calibration":
+        return cause, sigma
+    columns = [data.ring[own].name for own in data.measured.correctors]
+    column = columns.index(data.ring[cause.element or ""].name)
+    if not errors.turned[column] or abs(errors.roll[column]) < SIGNIFICANT * sigma:
+        return cause, sigma
+    roll = Cause("corrector_roll", cause.element, float(errors.angle[column]))
+    return roll, sigma / float(errors.kick[column])
+
+
+def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Candidate]:
     """The state with a number for the cause, in the more sensitive block, and that number."""
     (suspect,) = suspects_of(state, [cause])
     if suspect.block is None:
@@ -314,20 +311,17 @@ def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[Sta
 
 def _apart(state: State, cause: Hypothesis) -> State:
     """The state with a separate prior for a number of the fit."""
-    (suspect,) = suspects_of(state, [cause])
-    assert suspect.block is not None
-    assert suspect.members is not None
-    own = Apart(cause, suspect.variable, suspect.block, suspect.members, find(cause[0]).largest)
-    return replace(state, apart=(*state.apart, own))
+    return replace(state, apart=(*state.apart, *suspects_of(state, [cause])))
 
 
-def _place(seen: Seen, one: Apart) -> int:
+def _place(seen: Seen, one: Candidate) -> int:
     return next(h for h, suspect in enumerate(seen.suspects) if suspect.cause == one.cause)
 
 
-def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
+def _shown(seen: Seen, one: Candidate) -> tuple[float, Cause, float]:
     """Statistic, amount and error of a cause, widened for contradicting BPMs and columns."""
     own, here = seen.beside(one.name), _place(seen, one)
+    assert one.block is not None
     it = seen.blocks[one.block]
     posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
     wider = doubt(seen.state, one, it.there, posterior)
@@ -339,15 +333,15 @@ def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
     return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))
 
 
-def _scatter(there: Linear, sizes: Sequence[Group], one: Apart) -> float:
+def _scatter(there: Linear, sizes: Sequence[Group], one: Candidate) -> float:
     """rms of the amount by the distributed errors of its family."""
     along = np.zeros(len(there.start))
-    along[there.where[one.variable]] = one.members / float(one.members @ one.members)
+    along[there.where[one.variable]] = one.unit
     return float(np.sqrt(sum(np.sum((along @ group.basis * group.scale) ** 2)
                              for group in sizes if group.name != one.name)))  # fmt: skip
 
 
-def _without(state: State, one: Apart) -> State:
+def _without(state: State, one: Candidate) -> State:
     """The state without a cause, not converged: the next step takes its number back."""
     return replace(state, apart=tuple(other for other in state.apart if other is not one))
 
@@ -368,11 +362,9 @@ def _settled(state: State) -> State | None:
 
 def _possible(state: State) -> bool:
     """Whether each amount, with its family's part, is a plausible fault."""
-    amounts = [
-        float(state.values[one.variable] @ one.members / (one.members @ one.members))
-        for one in state.apart
-    ]
-    return all(abs(a) < BEYOND * one.wide for a, one in zip(amounts, state.apart, strict=True))
+    return all(
+        abs(float(state.values[one.variable] @ one.unit)) < BEYOND * one.wide for one in state.apart
+    )
 
 
 def _stepped(state: State) -> State:
@@ -388,13 +380,13 @@ def _stepped(state: State) -> State:
 
 
 # --- report ---------------------------------------------------------------------------------------
-def given_faults(fit: StepwiseFit, apart: Sequence[Apart]) -> StepwiseFit:
+def given_faults(fit: StepwiseFit, apart: Sequence[Candidate]) -> StepwiseFit:
     """Return the hierarchical fit with the faults' numbers free of their families, as a further
     step; unchanged where held-out residuals grow."""
     state = fit.state
     for one in apart:
         if one.variable in (kind.variable for kind in KINDS):
-            state = with_number(state, one.cause, one.block)
+            state = with_number(state, one.cause, one.block or 0)
         elif one.variable not in state.values:
             state = allow(state, [f for f in USUAL if f.variable == one.variable])
     own = {one.cause: one for one in apart}

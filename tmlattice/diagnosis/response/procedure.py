@@ -238,11 +238,11 @@ def _faults(
              if own.kind == "swapped planes"]  # fmt: skip
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
-        alone = detected_faults(
+        apart, alone = detected_faults(
             state.data, state.split, state, hypotheses, most, judgement, progress
         )
-        fit = given_faults(fit, alone.state.apart) if alone.faults else fit
-        found += [fault.finding(ring, judgement) for fault in alone.faults]
+        fit = given_faults(fit, apart) if apart else fit
+        found += alone
     of_labels = (own.finding(ring) for own in labels)
     found = [*strongest_first(found)[:most], *(own for own in of_labels if own is not None)]
     return fit, strongest_first(found)
