@@ -22,11 +22,10 @@ import numpy as np
 
 from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.beam.kicks import orbits_of_kicks
-from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.missing_effects import FREE
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
-from tmlattice.diagnosis.response.weights import weight
+from tmlattice.diagnosis.response.weights import independent, weight
 from tmlattice.inference.judgement import DEFAULT, ENOUGH
 from tmlattice.inference.newton import AGAIN
 from tmlattice.inference.normal import amounts, common, times_precision

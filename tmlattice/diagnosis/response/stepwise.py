@@ -21,13 +21,17 @@ from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
 from tmlattice.diagnosis.response.labels import Label, label_messages
-from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.linear import Linear, linear, rf_by_others
 from tmlattice.diagnosis.response.outlier_readings import gross, robust, told_gross
 from tmlattice.diagnosis.response.outlier_steps import outlier_steps, rejected, without_readings
 from tmlattice.diagnosis.response.remainder import remainder
-from tmlattice.diagnosis.response.rf_by_others import rf_by_others
-from tmlattice.diagnosis.response.rounds import Evidence, evidence_of, linear_evidence, settle
-from tmlattice.diagnosis.response.set_aside import taken_back
+from tmlattice.diagnosis.response.rounds import (
+    Evidence,
+    evidence_of,
+    linear_evidence,
+    log_evidence,
+    settle,
+)
 from tmlattice.diagnosis.response.state import (
     State,
     allow,
@@ -45,7 +49,9 @@ from tmlattice.diagnosis.response.validation import (
     lost,
     score,
 )
+from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.errors import TmlatticeError
+from tmlattice.inference.judgement import GROSS
 from tmlattice.inference.normal import Posterior
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
@@ -317,6 +323,33 @@ def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
             return settled, doubts
         doubts += _doubts(settled, doubted[-1])
         state = forbid(state, doubted[-1].families)
+
+
+def taken_back(state: State) -> State:
+    """Return the converged state with the rejected neighbours that agree with the fit.
+
+    Sound BPMs next to a magnet with a large error contradict all others, and without them the error
+    cannot be found. A broken BPM has no rejected neighbours.
+    """
+    aside = ~state.good & good_monitors(state, bad=GROSS)
+    together = aside & (np.roll(aside, 1) | np.roll(aside, -1))
+    if not together.any():
+        return state
+    good = state.good | together
+    trial = settle(replace(state, good=good), look_at_monitors=False)
+    sound = good_monitors(trial) & good_monitors(trial, 1)
+    back = together & sound
+    lost = log_evidence(state, state.good, state.independent) - log_evidence(
+        trial, state.good, state.independent
+    )
+    orbits = state.data.pick(state.data.orbits)[state.fitted]
+    readings = int(np.isfinite(orbits[:, back]).sum())
+    # each regained reading may cost a standard error
+    log.info("rejected neighbours: %s, sound: %s; evidence of the others falls by %.1f",
+             np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
+    if not back.any() or (state.good & ~sound).any() or lost > readings / 2:
+        return state
+    return settle(replace(trial, good=state.good | back))
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
