@@ -1,6 +1,7 @@
 """Effects that may be missing from a fitted orbit response, as patterns of readings.
 
-To add one, write a function that returns its patterns at the fit, and add it to `HYPOTHESES`.
+To add one, write a function that returns its patterns at the fit, and add it to `HYPOTHESES`. What
+is a family of the fit is none: every fit tests it.
 """
 
 from collections.abc import Callable
@@ -10,8 +11,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from tmlattice.arrays import Array
-from tmlattice.diagnosis.families.dispersion import HorizontalKicks
-from tmlattice.diagnosis.families.fields import QuadrupoleGradient, between
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
 from tmlattice.lattice.alike import families
@@ -102,28 +102,14 @@ def _corrector_energy(state: State) -> Hypothesis:
     )  # fmt: skip
 
 
-def _position(
-    state: State, which: str, names: Callable[[State], list[str]] | None = None
-) -> Hypothesis:
+def _position(state: State, by_family: bool) -> Hypothesis:
     """The position of the field of each corrector; or one for all whose names begin alike."""
-    jumps = _readings(state, state.at.jumps) * state.data.kicks[:, None]
-    rows = jumps[None]
-    if names is not None:
-        members = families([*names(state), "\0"])[1]
+    rows = (_readings(state, state.at.jumps) * state.data.kicks[:, None])[None]
+    if by_family:
+        members = families([*state.data.measured.correctors, "\0"])[1]
         rows = members.T[:, :, None] * rows
-    name = f"corrector's field displaced in s, {which}"
-    return Hypothesis(name, "m", "< 0.05 m", rows, own=names is None, most=0.05)
-
-
-def _position_beside(state: State) -> Hypothesis | None:
-    if state.allows("corrector_position"):
-        return None  # the fit has it
-
-    def neighbours(own: State) -> list[str]:
-        measured = own.data.measured
-        return between(own.data.ring, measured.correctors, measured.planes)
-
-    return _position(state, "by the magnets next to it", neighbours)
+    name = f"corrector's field displaced in s, {'by family' if by_family else 'each'}"
+    return Hypothesis(name, "m", "< 0.05 m", rows, own=not by_family, most=0.05)
 
 
 def _energy_drift(state: State) -> Hypothesis:
@@ -200,20 +186,6 @@ def _hysteresis(state: State) -> Hypothesis:
     return Hypothesis("hysteresis: a share of earlier steps", "share", "< 0.01", rows, most=0.01)
 
 
-def _energy_spread(state: State) -> Hypothesis | None:
-    if state.allows("energy_spread"):
-        return None  # the fit has it
-    curved = state.at.curved.copy()
-    curved[-1] = 0
-    return Hypothesis(
-        "energy spread of the beam", "(1e-3)^2", "about 1", _readings(state, curved)[None], most=4.0
-    )
-
-
-def _energy_offset(state: State) -> Hypothesis | None:
-    return None if state.allows("energy_offset") else _chromatic(state)  # the fit has it
-
-
 def _chromatic(state: State) -> Hypothesis:
     """An energy offset of the beam, which changes the effect of quadrupoles and sextupoles."""
     scale = (1 + state.at.errors.calibration)[:, None, None] * DELTA
@@ -221,31 +193,11 @@ def _chromatic(state: State) -> Hypothesis:
     return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
 
 
-def _dispersion(state: State) -> Hypothesis | None:
-    """Dispersion by kicks, see `dispersion`; one amount per pattern."""
-    if state.allows("horizontal kicks"):
-        return None  # the fit has them
-    kicks = HorizontalKicks()
-    count = kicks.size(state.data)
-    if not count:
-        return None
-    rows = kicks.rows(state.at, np.zeros(count))
-    return Hypothesis("dispersion that no gradient makes (kicks)", "rad", "< 1e-3", rows, most=1e-3)
-
-
 def _nonlinear(state: State) -> Hypothesis:
     """Cubic BPMs with two-sided steps: x^3 / 4 of the whole change."""
     cubes = state.data.pick(state.at.read) ** 3 / 4 / MILLIMETRE**2
     rows = np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
     return Hypothesis("nonlinear BPMs (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
-
-
-def _gradients(state: State, name: str, effect: str, kind: str, most: float) -> Hypothesis | None:
-    places = [e.name for e in state.data.ring.elements if e.kind == kind]
-    if not places:
-        return None
-    slopes = state.at.rows(effect, places, 0)
-    return Hypothesis(name, "1/m", f"< {most:g}", slopes, most=most)
 
 
 def _radiation(state: State) -> Hypothesis | None:
@@ -322,25 +274,10 @@ HYPOTHESES: dict[str, Callable[[State], Hypothesis | None]] = {
     "chromatic_in_time": _chromatic_in_time,
     "hysteresis": _hysteresis,
     "corrector_energy": _corrector_energy,
-    "corrector_position_family": lambda state: _position(
-        state, "by family", lambda own: list(own.data.measured.correctors)
-    ),
-    "corrector_position_neighbours": _position_beside,
-    "corrector_position": lambda state: _position(state, "each"),
-    "energy_spread": _energy_spread,
-    "energy_offset": _energy_offset,
-    "dispersion": _dispersion,
+    "corrector_position_family": lambda state: _position(state, True),
+    "corrector_position": lambda state: _position(state, False),
     "monitor_nonlinearity": _nonlinear,
     "monitor_position": _monitor_position,
-    "wiggler_gradient": lambda state: _gradients(
-        state, "gradients of damping wigglers", "insertion_device_focusing", "wiggler", 3e-3
-    ),
-    "straight_gradient": lambda state: _gradients(
-        state, "gradients in straights (markers)", "gradient_absolute", "marker", 2e-3
-    ),
-    "sextupole_gradient": lambda state: _gradients(
-        state, "gradients at sextupoles (orbit)", "gradient_absolute", "sextupole", 2e-3
-    ),
     "bend_gradient": _bend_gradient,
     "radiation": _radiation,
     "second_order_coupling": _second_order_coupling,
