@@ -84,8 +84,8 @@ class State:
         groups: the families' priors with learnt scales, by name.
         exploring: the inner validation correctors are not fitted, and select families.
         kept: derivatives by the ring's variables, used until the ring has moved.
-        share: factors on the weights, [block, column, monitor]; None: all 1.
-        rf_share: factors on the weights of the RF's readings, [block, monitor]; None: all 1.
+        share: factors on the weights, less for outliers, [block, column, monitor].
+        robust: whether outliers among the correctors' readings have less weight, too.
         apart: detected single faults.
         independent: effective sample size as a share of the readings, see `independent`, [block,
             plane that is read]; None: all 1.
@@ -100,14 +100,14 @@ class State:
     split: Split
     at: Predicted
     lacking: Array
+    share: Array
     good: Flags
     families: tuple[Family, ...] = ()
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
-    share: Array | None = None
-    rf_share: Array | None = None
+    robust: bool = False
     apart: tuple[Candidate, ...] = ()
     independent: Array | None = None
     jitter: Array | None = None
@@ -147,8 +147,9 @@ def begin(data: ResponseData, split: Split) -> State:
     gap = data.pick(at.left)[~split.held]
     size = float(chi2.typical(gap))
     return State(
-        data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
-    )
+        data, split, at, lacking=np.full((2, data.shape[0]), size),
+        share=np.ones((2, *data.shape)), good=np.ones(data.shape[1], dtype=bool),
+    )  # fmt: skip
 
 
 def bend(state: State) -> State:

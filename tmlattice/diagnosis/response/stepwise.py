@@ -22,7 +22,7 @@ from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
 from tmlattice.diagnosis.response.labels import Label, label_messages
 from tmlattice.diagnosis.response.linear import Linear, linear, rf_by_others
-from tmlattice.diagnosis.response.outlier_readings import gross, robust, told_gross
+from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.outlier_steps import outlier_steps, rejected, without_readings
 from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.rounds import (
@@ -232,7 +232,7 @@ def needed_families(
     if moving is not None:
         moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
-    state = taken_back(settle(robust(state)))
+    state = taken_back(settle(replace(state, robust=True)))
     for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since
         notes += _doubts(state, trial)
         state = _without(state, trial)

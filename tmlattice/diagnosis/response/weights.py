@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from tmlattice.arrays import REDUNDANT, TINY, Array, Flags
-from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
+from tmlattice.diagnosis.response.outlier_readings import DISPERSION, shares
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW, OUTLIERS, SIGNIFICANT
@@ -21,9 +21,6 @@ LEAST = 0.2
 """Least model discrepancy, and least noise given jitter, as a share of the noise."""
 BLIND = 0.2
 """Gain below which a BPM does not read the beam."""
-DISPERSION = "quadrupole_gradient"
-"""The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
-many times all others, and would bias the BPM gains."""
 COUPLING = "skew_gradient"
 """The family that determines the readings in the other plane."""
 
@@ -40,12 +37,7 @@ def weight(state: State, block: int) -> Array:
     if state.exploring:
         use[-1] &= ~split.inner_rf
     variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
-    count = np.array(np.broadcast_to(counts(state, block), use.shape))
-    if state.share is not None:
-        count *= state.share[block]
-    if state.rf_share is not None:
-        count[-1] *= state.rf_share[block]
-    return np.where(use, count / variance, 0.0)
+    return np.where(use, counts(state, block) * state.share[block] / variance, 0.0)
 
 
 def taken(state: State, block: int) -> Array | None:
@@ -104,22 +96,19 @@ def look(state: State, block: int) -> State:
     use = weight(state, block) > 0
     left = np.where(use, data.pick(state.at.left, block), np.nan)
     left, alone = _without_jitter(state, block, left)
-    if state.share is not None:
-        state = replace(state, share=shares(state, block, left[:-1]))
+    share = shares(state, block, left)
     typical = float(chi2.typical(left[:-1, state.good]))
     noise = float(np.median(data.noise))
-    share = 1.0 if state.share is None else state.share[block]
-    shared = TYPICAL * typical**2 + np.nansum(share * left**2, axis=1)
+    shared = TYPICAL * typical**2 + np.nansum(share[block] * left**2, axis=1)
     squares = shared / (TYPICAL + use.sum(axis=1))
     if state.allows(DISPERSION):
         squares[-1] = typical**2  # the RF counts like a typical column
-        state = replace(state, rf_share=rf_shares(state, block, left[-1]))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
     good = good_monitors(state, block)
     if block:
         good &= state.good
-    return _independent(replace(state, lacking=lacking, good=good), block, left, alone)
+    return _independent(replace(state, lacking=lacking, share=share, good=good), block, left, alone)
 
 
 def _independent(state: State, block: int, left: Array, noise: Array) -> State:
@@ -127,8 +116,8 @@ def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     are betatron oscillations, too."""
     if state.independent is None or not state.allows(DISPERSION):
         return state
-    own, shares = state.independent.copy(), state.share
-    read = left[:-1] if shares is None else left[:-1] * np.sqrt(shares[block, :-1])
+    own = state.independent.copy()
+    read = left[:-1] * np.sqrt(state.share[block, :-1])
     for p in (0, 1):
         rows = state.data.plane_of(block)[:-1] == p
         own[block, p] = independent(read[rows], noise[:-1][rows])
