@@ -58,9 +58,8 @@ from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.stepwise import (
     StepwiseFit,
-    all_families,
     fit_chi2,
-    needed_families,
+    fit_steps,
 )
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import outliers
@@ -190,22 +189,19 @@ def _families(
 ) -> tuple[StepwiseFit, OrbitResponse, list[Label]]:
     """The hierarchical fit of the corrected measurement, that measurement, and all labels.
 
-    Swaps are corrected, and rejected channels are removed, by the design, by the fit of all
-    families, and by that of the needed ones, until there are no new ones."""
+    Swaps are corrected, and rejected channels are removed, by the design, then by the fit, until
+    there are no new ones."""
     known: list[Label] = []
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
         found = _wrong(begin(data, split), known, of_design=True)
         if not found:
-            started = all_families(data, split, trials, progress)
-            swapped = [own for own in started.labels if own.kind == "swapped correctors"]
-            found = [*new(swapped, known), *_wrong(started.state, known)]
+            fit = fit_steps(data, split, trials, most, progress)
+            swapped = [own for own in fit.labels if own.kind == "swapped correctors"]
+            found = [*new(swapped, known), *_wrong(fit.state, known)]
             if not found:
-                fit = needed_families(started, most, progress)
-                found = _wrong(fit.state, known)
-            if not found:
-                return fit, measured, [*known, *started.labels]
+                return fit, measured, [*known, *fit.labels]
         known += found
         measured = corrected(measured, found)
 

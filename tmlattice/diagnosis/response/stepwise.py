@@ -128,49 +128,13 @@ def fit_steps(
 ) -> StepwiseFit:
     """Return the fit of all families that are needed, to all correctors except the held-out ones.
 
-    Args:
-        data, split, trials, progress: see `all_families`.
-        most: most accepted steps.
-    """
-    return needed_families(all_families(data, split, trials, progress), most, progress)
-
-
-@dataclass(frozen=True, eq=False)
-class AllFamilies:
-    """The fit of all families, before the unneeded ones are removed.
-
-    Attributes:
-        design, state: before and after, without rejected readings.
-        stages: the state after each trial was added, with these readings.
-        rejected: readings, [column, monitor, plane that is read].
-        labels: of outlier steps.
-        messages: about rejected readings.
-        doubts: about implausible families.
-    """
-
-    design: State
-    state: State
-    stages: dict[Trial, State]
-    rejected: Flags
-    labels: tuple[Label, ...]
-    messages: tuple[str, ...]
-    doubts: tuple[str, ...]
-
-
-def all_families(
-    data: ResponseData,
-    split: Split,
-    trials: Sequence[Trial] = STEPS,
-    progress: Callable[[str], Any] = lambda stage: None,
-) -> AllFamilies:
-    """Return the fit of all families, without outliers.
-
     Families need one another: BPM gains improve nothing before the gradients, for example. So all
-    are fitted together, and each is tested by the loss without it, with the others fitted again.
+    are fitted together, without outliers, and each is tested by the loss without it.
 
     Args:
         data, split: the data, and the validation split.
         trials: families, in the order in which they are added.
+        most: most accepted steps.
         progress: called with each step's name.
     """
     design = begin(data, split)
@@ -181,48 +145,34 @@ def all_families(
         more, labels = _outliers(state)
         single = single | more
     progress("all together")
-    state, doubts = _together(without_readings(state, single | rejected(state, labels)), stages)
+    state, notes = _together(without_readings(state, single | rejected(state, labels)), stages)
     log.info("effective sample size per reading: %s", state.independent)
     more, later = _outliers(state)  # typical residuals are smaller now
     single, labels = single | more, [*labels, *later]
     odd = single | rejected(state, labels)
-    return AllFamilies(
-        without_readings(design, odd), without_readings(state, odd), stages, odd, tuple(labels),
-        (*told_gross(data, single, "the fit"), *label_messages(labels)), tuple(doubts),
-    )  # fmt: skip
-
-
-def needed_families(
-    started: AllFamilies, most: int, progress: Callable[[str], Any] = lambda stage: None
-) -> StepwiseFit:
-    """Return the fit of the families that are needed.
-
-    Args:
-        started: the fit of all families.
-        most: most accepted steps.
-        progress: called with each step's name.
-    """
-    design, labels = started.design, started.labels
-    state, moving = _beside_jitter(started.state, progress)
+    design, state = (without_readings(own, odd) for own in (design, state))
+    notes = [*told_gross(data, single, "the fit"), *label_messages(labels), *notes]
+    state, moving = _beside_jitter(state, progress)
     before = score(design, "design")
     steps = {
         trial: score(
-            without_readings(own, started.rejected),
-            _title(trial), sum(family.count(state.data) for family in trial.families),
+            without_readings(own, odd),
+            _title(trial),
+            sum(family.count(state.data) for family in trial.families),
         )
-        for trial, own in started.stages.items()
-    }  # fmt: skip
-    started.stages.clear()  # of many readings, they are large
+        for trial, own in stages.items()
+    }
+    stages.clear()  # of many readings, they are large
     state, gone, others = _needed(state, steps, most, progress)
     rejected_steps = [replace(steps.pop(own), kept=False) for own in gone]
-    notes = [*started.messages, *started.doubts, *others]
+    notes += others
     validated = inner(state)
     enough = int(np.sum(validated.columns[:, 0, 1] > 0)) >= ENOUGH
     worse = -lost(inner(replace(design, jitter=state.jitter)), validated)[0]
     nothing = StepwiseFit(
         design, design, (before,),
         (*rejected_steps, *(replace(step, kept=False) for step in steps.values())),
-        tuple(notes), labels,
+        tuple(notes), tuple(labels),
     )  # fmt: skip
     if enough and worse > SPOILT:  # together they worsen the validation
         return nothing
@@ -247,7 +197,9 @@ def needed_families(
     kept = [before, *steps.values()]
     kept[-1] = score(state, kept[-1].effect, kept[-1].parameters)
     notes += [] if moving is None else [moving.sentence]
-    return StepwiseFit(design, state, tuple(kept), tuple(rejected_steps), tuple(notes), labels)
+    return StepwiseFit(
+        design, state, tuple(kept), tuple(rejected_steps), tuple(notes), tuple(labels)
+    )
 
 
 def _outliers(state: State) -> tuple[Flags, list[Label]]:
