@@ -86,6 +86,18 @@ class Linear(NamedTuple):
         """The ring's derivatives in one array, [error, column, monitor]: a copy of them."""
         return whole(self.ring, self.by_monitor.shape)
 
+    def readings(self, plane: Indices, values: Array) -> Array:
+        """Change of the readings, m, [column, monitor], by values of all parameters."""
+        columns, monitors = self.by_monitor.shape
+        m, end = 2 * monitors, 2 * monitors + columns
+        out = values[:m].reshape(-1, 2)[:, plane].T * self.by_monitor
+        out += values[m:end, None] * self.by_column
+        for own in self.ring:
+            moved = np.tensordot(values[end : end + len(own.rows)], own.rows, 1)
+            out += moved if own.now is None else own.now * moved
+            end += len(own.rows)
+        return out
+
     def of_column(self, column: int, read: Indices, plane: int) -> Array:
         """Derivatives of some readings of a column in a plane, [reading, parameter]."""
         columns, monitors = self.by_monitor.shape

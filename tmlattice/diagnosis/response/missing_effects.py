@@ -24,6 +24,8 @@ from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.inference.judgement import ENOUGH
+from tmlattice.inference.normal import solve
+from tmlattice.inference.priors import Group
 
 Patterns: TypeAlias = Array | csr_array
 
@@ -205,19 +207,13 @@ class Fitted:
     def __init__(self, state: State) -> None:
         state = replace(state, jitter=None)  # a hypothesis among the others here
         self.state, data = state, state.data
-        there = linear(state, 0)
-        normal, self.start = there.normal, there.start
-        self.slopes = there.by_ring
+        self.there = there = linear(state, 0)
         # a dummy without effect where no family was accepted
-        basis = np.zeros((len(self.start), 1))
-        basis = np.concatenate([basis, *(g.basis for g in there.groups)], axis=1)
-        prior = np.concatenate([np.ones(1), *(g.scale for g in there.groups)])
-        self.spread = basis * prior
-        A = self.spread.T @ normal.matrix @ self.spread
-        self.factor = cho_factor(A + np.eye(len(A)), lower=True)
-        self.vector = self.spread.T @ (normal.vector + normal.matrix @ self.start)
+        dummy = Group("none", np.zeros((len(there.start), 1)), 1.0)
+        found = solve(there.normal, (dummy, *there.groups), there.start, rounds=0)
+        self.spread, self.factor = found.spread, (found.factor, True)
+        self.vector = self.spread.T @ (there.normal.vector + there.normal.matrix @ there.start)
         self.weight = weight(state, 0)
-        self.by_monitor, self.by_column = there.by_monitor, there.by_column
         self.read = data.pick(state.at.read)
         # readings by the monitors' and the columns' own parameters, [reading, parameter]
         columns, monitors = self.weight.shape
@@ -226,29 +222,23 @@ class Fitted:
         by_column = 2 * monitors + reading // monitors
         self.own = csr_array(
             (
-                np.concatenate([self.by_monitor.ravel(), self.by_column.ravel()]),
+                np.concatenate([there.by_monitor.ravel(), there.by_column.ravel()]),
                 (np.tile(reading, 2), np.concatenate([by_monitor, by_column])),
             ),
             shape=(len(reading), 2 * monitors + columns),
         )
         self._parts: dict[int, _Part] = {}
         residual = np.where(self.weight > 0, data.pick(state.at.left), 0.0)
-        self.target = residual + self.change(self.start)
+        self.target = residual + self.change(there.start)
 
     def change(self, values: Array) -> Array:
         """Readings [column, monitor] for a change of the base parameters."""
-        data = self.state.data
-        m, c = 2 * len(data.at), len(data.plane)
-        out = values[:m].reshape(-1, 2)[:, data.plane].T * self.by_monitor
-        out = out + values[m : m + c, None] * self.by_column
-        if len(self.slopes):
-            out = out + np.tensordot(values[m + c :], self.slopes, 1)
-        return np.asarray(out)
+        return self.there.readings(self.state.data.plane, values)
 
     def across(self, flat: Patterns) -> Array:
         """J^T W H, [base parameter, pattern], of patterns [pattern, reading]."""
         weighted = _scaled(flat, self.weight.ravel())
-        ring = self.slopes.reshape(len(self.slopes), self.weight.size).T
+        ring = self.there.by_ring.reshape(-1, self.weight.size).T
         own = _dense(weighted @ self.own)
         return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
 
@@ -260,7 +250,9 @@ class Fitted:
         """The scores of these hypotheses together on held-out readings."""
         if not hypotheses:  # the same linear step as with one: the fit itself may still move
             moved = cho_solve(self.factor, self.vector)
-            in_plane, position = self._score(self.change(self.spread @ moved - self.start), None)
+            in_plane, position = self._score(
+                self.change(self.spread @ moved - self.there.start), None
+            )
             return Answer(np.zeros(0), np.zeros(0), in_plane, position, 0.0)
         parts = [self._part(hypothesis) for hypothesis in hypotheses]
         edge = np.cumsum([0, *(part.across.shape[1] for part in parts)])
@@ -292,7 +284,7 @@ class Fitted:
                 scale = float(np.sqrt(np.mean(amounts[mine] ** 2 + variance[mine])))
                 spread[mine] = min(scale, most[i])
         moved = cho_solve(self.factor, self.vector - B @ amounts)
-        change = self.change(self.spread @ moved - self.start)
+        change = self.change(self.spread @ moved - self.there.start)
         for i, (hypothesis, part) in enumerate(zip(hypotheses, parts, strict=True)):
             if not hypothesis.own:
                 change = change + (amounts[owner == i] @ part.flat).reshape(change.shape)

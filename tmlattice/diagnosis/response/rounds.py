@@ -42,16 +42,10 @@ HELD = 4
 """Iterations that fix numbers at their lower bounds and solve for the rest."""
 
 
-class Moved(NamedTuple):
-    """A state after a round, and the cost before and after it."""
-
-    state: State
-    before: float
-    after: float
-
-
-def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Moved:
-    """Solve the readings of one block, and move.
+def one_round(
+    state: State, block: int, there: Linear, bold: float = 1.0
+) -> tuple[State, float, float]:
+    """Solve the readings of one block, and move. Return the state, and the cost before and after.
 
     Args:
         state: the start.
@@ -72,7 +66,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         )
         return float(np.sum(left * weighed(state, block, left))) + penalty
 
-    best, aim = Moved(learnt, cost(state), np.inf), found.values
+    best, last, aim = learnt, np.inf, found.values
     for _ in range(CORRECTED + 1):
         values = {name: np.maximum(aim[at], there.lowest[at]) for name, at in there.where.items()}
         then = learnt.moved({**state.values, **values})
@@ -80,10 +74,10 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
             after = cost(then)
         except UnstableRingError:  # diverged: no closed orbit
             break
-        last = best.after
+        gained = after <= (1 - CORRECTS) * last
         if after <= last:
-            best = best._replace(state=then, after=after)
-        if after > (1 - CORRECTS) * last:
+            best, last = then, after
+        if not gained:
             break
         # the score there, with the derivatives of the start
         moved = np.zeros_like(there.start)
@@ -96,7 +90,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         further = aim - before
         if further @ there.normal.matrix @ further < CORRECTS * after:
             break  # linear enough
-    return best
+    return best, cost(state), last
 
 
 def bounded_step(there: Linear, bold: float) -> Posterior:
@@ -179,15 +173,15 @@ def settle(
             there = linear(state, block)
             state = replace(state, kept={**state.kept, **there.kept})
             for _ in range(RETRIES):
-                moved = one_round(state, block, there, bold[block])
-                if moved.after <= moved.before:
+                moved, before, after = one_round(state, block, there, bold[block])
+                if after <= before:
                     break
                 bold[block] /= ASTRAY
-            if moved.after > moved.before:
+            if after > before:
                 continue
             bold[block] = min(BOLDER * bold[block], BOLDEST)
-            gained = max(gained, (moved.before - moved.after) / max(moved.after, 1e-300))
-            state = moved.state
+            gained = max(gained, (before - after) / max(after, 1e-300))
+            state = moved
             for seen in (0, 1):
                 if state.of_block(seen):
                     state = look(state, seen)

@@ -101,9 +101,7 @@ def _widened(
     data = state.data
     rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.by_ring)
     weights = weight(state, block)
-    left = np.where(weights > 0, data.pick(state.at.left, block), 0.0)
-    moved = posterior.values - there.start  # rounds end before full precision
-    for column in np.flatnonzero(weights.any(axis=1)):
-        seen = np.flatnonzero(weights[column])
-        left[column, seen] -= rows.times(np.full(len(seen), column), seen, moved[:, None])[:, 0]
+    # rounds end before full precision
+    moved = there.readings(rows.plane, posterior.values - there.start)
+    left = np.where(weights > 0, data.pick(state.at.left, block) - moved, 0.0)
     return cluster_robust_errors(rows, weights, left, found, taken(state, block))
