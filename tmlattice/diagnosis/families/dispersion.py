@@ -259,7 +259,7 @@ def orbit_patterns(model: ResponseModel, plane: int, effects: Sequence[str]) -> 
     return OrbitPatterns(causes, amounts, amounts @ orbits)
 
 
-class _Orbit(RingFamily):
+class OrbitFamily(RingFamily):
     """Amplitudes of orbit patterns, in units of usual errors."""
 
     single = False
@@ -307,7 +307,7 @@ class _Orbit(RingFamily):
         return [{causes[i]: pattern[i] for i in first} for pattern, first in own]
 
 
-class HorizontalOrbit(_Orbit):
+class HorizontalOrbit(OrbitFamily):
     """The horizontal closed orbit, which focuses in sextupoles."""
 
     name, effects = "horizontal orbit", ("dipole_field", "quadrupole_offset_x")
@@ -315,7 +315,7 @@ class HorizontalOrbit(_Orbit):
     title = "horizontal closed orbit in sextupoles"
 
 
-class VerticalOrbit(_Orbit):
+class VerticalOrbit(OrbitFamily):
     """The vertical closed orbit, which couples in sextupoles."""
 
     name, effects = "vertical orbit", ("dipole_roll", "quadrupole_offset_y")

@@ -22,7 +22,11 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
-from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
+from tmlattice.diagnosis.families.dispersion import (
+    OrbitFamily,
+    dispersion_by_kicks,
+    fitted_orbit_kicks,
+)
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.families.fields import REPRODUCED, FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, EnergyOffset, Trial
@@ -35,7 +39,6 @@ from tmlattice.diagnosis.findings import (
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
-from tmlattice.diagnosis.response.detected_faults import ORBITS
 from tmlattice.diagnosis.response.fitted_causes import with_support
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
@@ -122,7 +125,9 @@ def diagnose_change(
     progress("the reference")
     rng = np.random.default_rng(seed)
     # a changed gradient would move a closed orbit of the reference's ring, which operators correct
-    still = [trial for trial in STEPS if not any(f.name in ORBITS for f in trial.families)]
+    still = [
+        trial for trial in STEPS if not any(isinstance(f, OrbitFamily) for f in trial.families)
+    ]
     steps = () if same else trials_of(effects, still)
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
     orbit_kicks = fitted_orbit_kicks(fitted.at)

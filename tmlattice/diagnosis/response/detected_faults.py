@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
+from tmlattice.diagnosis.families.dispersion import OrbitFamily
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.linear import Linear, linear
@@ -46,7 +46,6 @@ Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
-ORBITS = (HorizontalOrbit.name, VerticalOrbit.name)
 FAULTS = 8
 """Most faults: more of them are distributed errors."""
 WORTH, HIDDEN = 15.0, 8.0
@@ -248,7 +247,7 @@ class _Search:
         if one.variable not in (kind.variable for kind in KINDS):
             return max(len(one.members) - 1, 1)
         orbit = [len(state.values[f.variable]) for f in state.of_block(one.block or 0)
-                 if f.name in ORBITS]  # fmt: skip
+                 if isinstance(f, OrbitFamily)]  # fmt: skip
         return max(min(orbit, default=MEMBERS) - 1, 1)
 
     def p_value(self, seen: Seen, statistic: float, one: Candidate) -> float:
