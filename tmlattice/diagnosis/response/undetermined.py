@@ -36,10 +36,6 @@ class Undetermined:
     hypotheses: tuple[Hypothesis, ...]
     root: Array
 
-    def size(self, problem: Response) -> int:
-        """The largest dimension of the covariance."""
-        return len(self.hypotheses) * problem.used.size
-
 
 ORBITS = (
     *HorizontalOrbit.effects, *VerticalOrbit.effects, "sextupole_offset_x", "sextupole_offset_y",
