@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array
-from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
+from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, MissingEffect
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.weights import weight
@@ -40,12 +40,12 @@ class Weighed:
     """A hypothesis and its scores on held-out readings.
 
     Attributes:
-        effect, unit, expected: see `Hypothesis`.
+        effect, unit, expected: see `MissingEffect`.
         parameters: their number.
         amount: the parameter, or the rms of several.
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
-        on_top_in_plane, on_top_position: with it and all accepted ones, m.
+        on_top_in_plane: with it and all accepted ones, m.
         evidence: gain of log evidence of the fitted readings with it alone: the misfit that it
             explains, less the cost of its parameters.
         control_in_plane: with as many random parameters instead, m; None unless columns have
@@ -64,7 +64,6 @@ class Weighed:
     heldout_rms_in_plane: float
     heldout_rms_position: float
     on_top_in_plane: float
-    on_top_position: float
     evidence: float
     control_in_plane: float | None
     judgement: str
@@ -91,7 +90,7 @@ def weigh(
     """
     fitted = Fitted(state)
     base = fitted.weigh([])
-    found: list[Hypothesis] = []
+    found: list[MissingEffect] = []
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
         hypothesis = HYPOTHESES[name](state)
@@ -131,8 +130,8 @@ def weigh(
     }
     before = together
     take([i for i, answer in on_top.items() if i in helpful and _helps(found[i], answer, before)])
-    four = base.in_plane, base.position, together.in_plane, together.position
-    out = [Weighed("none", "", "", 0, 0.0, 0.0, *four, 0.0, None, "")]
+    rms = base.in_plane, base.position, together.in_plane
+    out = [Weighed("none", "", "", 0, 0.0, 0.0, *rms, 0.0, None, "")]
     for i, hypothesis in enumerate(found):
         given = together if i in chosen else on_top[i]
         if i in chosen:
@@ -148,26 +147,26 @@ def weigh(
             Weighed(
                 hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts),
                 _size(amounts), float(np.median(sigma)), in_plane, position, given.in_plane,
-                given.position, evidence, random[i], judgement,
+                evidence, random[i], judgement,
             )
         )  # fmt: skip
     return out
 
 
 def _refusal(
-    hypothesis: Hypothesis, alone: "Answer", given: "Answer", base: "Answer", before: "Answer"
+    hypothesis: MissingEffect, alone: "Answer", given: "Answer", base: "Answer", before: "Answer"
 ) -> str:
     best = min(alone.in_plane / base.in_plane, given.in_plane / before.in_plane)
     unphysical = best < HELPS and not _sensible(hypothesis, given)
     return "unphysical" if unphysical else "excluded"
 
 
-def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:
+def _helps(hypothesis: MissingEffect, answer: "Answer", before: "Answer") -> bool:
     gains = answer.in_plane < HELPS * before.in_plane and answer.evidence > before.evidence
     return gains and _sensible(hypothesis, answer)
 
 
-def control(hypothesis: Hypothesis) -> Hypothesis:
+def control(hypothesis: MissingEffect) -> MissingEffect:
     """Return random parameters of the same number, size and smoothness, unrelated to their columns.
 
     Parameters of single columns are estimated from half of a held-out corrector's BPMs, so any
@@ -186,7 +185,7 @@ def _size(amounts: Array) -> float:
     return float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
 
 
-def _sensible(hypothesis: Hypothesis, answer: "Answer") -> bool:
+def _sensible(hypothesis: MissingEffect, answer: "Answer") -> bool:
     return abs(_size(answer.amounts)) < hypothesis.most
 
 
@@ -242,11 +241,11 @@ class Fitted:
         own = _dense(weighted @ self.own)
         return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
 
-    def sees(self, hypothesis: Hypothesis) -> bool:
+    def sees(self, hypothesis: MissingEffect) -> bool:
         """Whether any fitted reading is sensitive to it."""
         return bool(hypothesis.patterns.any() and self._part(hypothesis).flat.shape[0])
 
-    def weigh(self, hypotheses: Sequence[Hypothesis]) -> Answer:
+    def weigh(self, hypotheses: Sequence[MissingEffect]) -> Answer:
         """The scores of these hypotheses together on held-out readings."""
         if not hypotheses:  # the same linear step as with one: the fit itself may still move
             moved = cho_solve(self.factor, self.vector)
@@ -294,7 +293,7 @@ class Fitted:
         evidence = 0.5 * float(r @ amounts) - float(np.log(np.diag(root[0])).sum())
         return Answer(amounts[last], np.sqrt(variance[last]), rms, jumped, evidence)
 
-    def _part(self, hypothesis: Hypothesis) -> "_Part":
+    def _part(self, hypothesis: MissingEffect) -> "_Part":
         """Patterns to which fitted readings are sensitive."""
         key = id(hypothesis)
         if key not in self._parts:
@@ -329,7 +328,7 @@ class Fitted:
 class _Part:
     """A hypothesis as derivatives of readings, and its products with the fit."""
 
-    hypothesis: Hypothesis
+    hypothesis: MissingEffect
     flat: Patterns  # [pattern, reading]
     across: Array
 
