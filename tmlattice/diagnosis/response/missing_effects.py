@@ -141,7 +141,9 @@ def weigh(
         elif i not in helpful and _helps(hypothesis, alone[i], base):
             judgement = "as random ones do"
         else:
-            judgement = _refusal(hypothesis, alone[i], given, base, before)
+            best = min(alone[i].in_plane / base.in_plane, given.in_plane / before.in_plane)
+            sensible = best >= HELPS or _sensible(hypothesis, given)
+            judgement = "excluded" if sensible else "unphysical"
         amounts, sigma, in_plane, position, evidence = alone[i]
         out.append(
             Weighed(
@@ -151,14 +153,6 @@ def weigh(
             )
         )  # fmt: skip
     return out
-
-
-def _refusal(
-    hypothesis: MissingEffect, alone: "Answer", given: "Answer", base: "Answer", before: "Answer"
-) -> str:
-    best = min(alone.in_plane / base.in_plane, given.in_plane / before.in_plane)
-    unphysical = best < HELPS and not _sensible(hypothesis, given)
-    return "unphysical" if unphysical else "excluded"
 
 
 def _helps(hypothesis: MissingEffect, answer: "Answer", before: "Answer") -> bool:
