@@ -21,6 +21,7 @@ from tmlattice.diagnosis.families.dispersion import OrbitFamily
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, small_errors
 from tmlattice.diagnosis.response.state import Candidate, State, allow, bend
@@ -53,17 +54,8 @@ WORTH, HIDDEN = 15.0, 8.0
 family, and for other causes, which increase the scales of all patterns of an orbit."""
 TRIES = 3
 """Most candidates per step; one in a response of many readings."""
-NEAR, SHARE = 8.0, 0.1
-"""Log evidence by which an alternative may be behind and still be tried; and the error of the
-linear model, as a share of the statistic."""
-BEHIND = 2.0
-"""Log evidence by which an alternative must be ahead to replace an accepted cause."""
-LISTED = 24
-"""Most alternatives of a fault that are compared."""
 LACKS = 2.0
 """Largest chi-square per reading of a plane, given distributed errors, for a search in any case."""
-WORSE = 1.02
-"""Largest ratio of held-out residuals with and without the faults."""
 MEMBERS = 16
 """Assumed number of orbit patterns, where there are none."""
 
@@ -185,7 +177,8 @@ class _Search:
         worth = [HIDDEN if one.block is None else WORTH for one in seen.suspects]
         evidence[own.statistic < worth] = -np.inf
         first = int(np.argmax(evidence))
-        least = evidence[first] - NEAR - SHARE * own.statistic[first]
+        least = evidence[first] - self.judgement.window
+        least -= self.judgement.drift * own.statistic[first]
         order = [int(h) for h in np.argsort(-evidence) if evidence[h] > max(least, -np.inf)]
         found: dict[str, tuple[Hypothesis, float, Array]] = {}
         have = [one.cause for one in self.state.apart]
@@ -215,7 +208,7 @@ class _Search:
         have = [other.cause for other in state.apart if other is not one]
         evidence[[h for h, s in enumerate(seen.suspects) if s.cause in have]] = -np.inf
         best = int(np.argmax(evidence))
-        if not evidence[best] > evidence[here] + BEHIND:
+        if not evidence[best] > evidence[here] + self.judgement.behind:
             return state
         other = self.put(_without(state, one), seen.suspects[best].cause, own.information[:, best])
         if other is None:
@@ -272,7 +265,7 @@ class _Search:
         statistic, cause, sigma = _shown(seen, one)
         cause, sigma = as_turned(cause, sigma, seen.state.at.errors, seen.state.data)
         known = {one.cause, (cause.effect, cause.element)}
-        rivals = [int(h) for h in np.argsort(-evidence)[:LISTED]
+        rivals = [int(h) for h in np.argsort(-evidence)[: self.judgement.alternatives]
                   if np.isfinite(evidence[h]) and seen.suspects[h].cause not in known]  # fmt: skip
         chance = np.exp(evidence[[_place(seen, one), *rivals]] - evidence.max())
         causes = (Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in rivals)
@@ -397,8 +390,8 @@ def given_faults(fit: StepwiseFit, apart: Sequence[Candidate]) -> StepwiseFit:
     title = ", ".join(f"{effect} {place}" for effect, place in own)
     before, after = fit.steps[-1], score(settled, title, len(own))
     if (
-        after.heldout_rms_in_plane > WORSE * before.heldout_rms_in_plane
-        or after.heldout_rms_coupling > WORSE * before.heldout_rms_coupling
+        HELPS * after.heldout_rms_in_plane > before.heldout_rms_in_plane
+        or HELPS * after.heldout_rms_coupling > before.heldout_rms_coupling
     ):
         return fit
     return replace(fit, state=settled, steps=(*fit.steps, after))
