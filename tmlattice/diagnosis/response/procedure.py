@@ -66,7 +66,7 @@ from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
-from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
+from tmlattice.inference.judgement import DEFAULT, ENOUGH, SIGNIFICANT, Judgement
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
@@ -80,8 +80,6 @@ Array = NDArray[np.float64]
 
 PATTERNS = 8
 """Number of the strongest patterns of the residual."""
-TYPICAL = 6
-"""Fewest columns of a plane for the typical one."""
 LARGE = 60_000
 """Most readings for the search for single faults among distributed errors, which refits all."""
 TOO_LARGE = (
@@ -214,7 +212,7 @@ def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> lis
     names = [own.elements[0] for own in gone if own.kind == "rejected BPM"]
     good = state.good & ~np.isin(state.data.measured.monitors, names)
     there = replace(state, good=good)
-    far = of_design and (strange(there, TYPICAL) > FAR or first_guess(there) is not None)
+    far = of_design and (strange(there, ENOUGH) > FAR or first_guess(there) is not None)
     return new([*([] if far else swaps(state, gone)), *swapped_planes(state)], known) or gone
 
 

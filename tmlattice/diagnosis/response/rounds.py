@@ -31,15 +31,14 @@ GAIN = 3e-3
 EACH = 4
 """Iterations of EM for the prior scales in a round."""
 LEARN = 10
-"""Iterations of EM for the evidence: prior scales of absent errors fall slowly."""
+"""Iterations of EM for prior scales alone: those of absent errors fall slowly."""
 RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
-"""Repetitions of a diverged round; divisor of the step bounds then; their growth, and its limit."""
+"""Repetitions of a diverged round, and of a step that crosses lower bounds; divisor of the step
+bounds of a diverged round; their growth, and its limit."""
 CORRECTED, CORRECTS = 6, 1e-3
 """Corrections of a step by the residuals at its end, with the derivatives at its start; and the
 relative fall of the cost required for another one. Correlated numbers follow a curved valley of the
 cost, which its tangent leaves."""
-HELD = 4
-"""Iterations that fix numbers at their lower bounds and solve for the rest."""
 
 
 def one_round(
@@ -96,7 +95,7 @@ def one_round(
 def bounded_step(there: Linear, bold: float) -> Posterior:
     """The bounded step, with numbers fixed at their lower bounds where it would cross them."""
     groups, trust = there.groups, bold * there.trust
-    for _ in range(HELD):
+    for _ in range(RETRIES):
         found = solve(there.normal, groups, there.start, trust, rounds=EACH)
         low = found.values < there.lowest
         if not low.any():
