@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import (
     dispersion_behind,
@@ -29,8 +29,6 @@ from tmlattice.diagnosis.families.family import Family, RingFamily, StatedCause
 from tmlattice.effects import Cause, background_rms, directions, find
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
 
 LEAST = 3e-3
 """Share of the strongest pattern below which a weaker one is omitted."""

@@ -14,9 +14,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.dispersion import OrbitFamily
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
@@ -42,8 +42,6 @@ from tmlattice.observe.orbit_response import Errors, Hypothesis
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import (
     dispersion_beside,
@@ -75,8 +75,6 @@ from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
-
-Array = NDArray[np.float64]
 
 PATTERNS = 8
 """Number of the strongest patterns of the residual."""

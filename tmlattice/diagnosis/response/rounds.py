@@ -9,18 +9,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import log_scale, look, weighed, weight
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.priors import Group
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 

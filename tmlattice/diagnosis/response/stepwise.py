@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.assessment import Block, combined_p_value
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
@@ -55,9 +55,6 @@ from tmlattice.inference.judgement import GROSS
 from tmlattice.inference.normal import Posterior
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
