@@ -19,7 +19,6 @@ from tmlattice.diagnosis.families.dispersion import (
 )
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause, apply
@@ -94,7 +93,8 @@ def beside(plain):
 
 def test_patterns_of_kicks_make_what_displaced_quadrupoles_make_in_at(plain, beside):
     state = state_of(plain, simulated(plain, [], kick=1e-5, noise=2e-8, engine="ocelot"), False)
-    patterns = HYPOTHESES["dispersion"](state).patterns
+    family = HorizontalKicks()
+    patterns = family.rows(state.at, np.zeros(family.size(state.data)))
     assert len(patterns) < len(beside) / 2
     amounts = np.linalg.lstsq(patterns[:, -1].T, beside, rcond=None)[0]
     left = beside - amounts @ patterns[:, -1]

@@ -10,8 +10,7 @@ from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.set_aside import taken_back
-from tmlattice.diagnosis.response.stepwise import fit_steps
+from tmlattice.diagnosis.response.stepwise import fit_steps, taken_back
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.observe.orbit_response import Errors, Predicted

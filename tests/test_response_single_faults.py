@@ -9,7 +9,7 @@ from shared import parted
 
 from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
-from tmlattice.diagnosis.response.faults import Fault, as_turned
+from tmlattice.diagnosis.response.detected_faults import as_turned
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.small_errors import sizes_in, small_errors
 from tmlattice.diagnosis.response.state import begin
@@ -46,10 +46,9 @@ def test_a_corrector_that_is_off_is_not_turned(small_ring, measured_with):
     errors = Errors.none(data)
     column = list(data.measured.correctors).index("v2")
     errors.calibration[column], errors.roll[column] = -0.9995, 0.0008
-    fault = Fault(cause, 0.04, 600.0, 1e-9, (cause,), np.zeros(1))
-    assert as_turned(fault, errors, data).cause == cause
+    assert as_turned(cause, 0.04, errors, data) == (cause, 0.04)
     errors.roll[column] = 0.9
-    assert as_turned(fault, errors, data).cause.effect == "corrector_roll"
+    assert as_turned(cause, 0.04, errors, data)[0].effect == "corrector_roll"
 
 
 def test_gradient_errors_in_one_plane_are_distributed(small_ring):

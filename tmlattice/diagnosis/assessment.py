@@ -57,7 +57,7 @@ class Block:
     @property
     def ratio(self) -> float:
         """Rms of the residual over the expected rms."""
-        return float(np.sqrt(self.chi2 / self.freedom))
+        return float(np.sqrt(self.chi2 / max(self.freedom, 1)))
 
     def as_json(self) -> dict[str, Any]:
         """The entry in the file of the diagnosis."""

@@ -11,8 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, LaunchEffect, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
@@ -28,8 +28,6 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.search import Explanation, Search, explain, revised
-
-Array = NDArray[np.float64]
 
 STEPS = 4
 """Linearisations of the distributed errors at new findings, at most; two are usual."""

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from tmlattice.arrays import Indices
+from tmlattice.arrays import Array, ComplexArray, Flags, Indices
 from tmlattice.beam.nonlinear import nonlinear_turn, track
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
@@ -42,9 +42,6 @@ from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
 from tmlattice.observe.steady import SteadyMetric
 from tmlattice.observe.stored import Beams, Stored, rf_of, seen_by, stacked
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 TUNE = 3e-4
 """Smallest error of a tune: it moves with the unknown energy."""
@@ -70,8 +67,6 @@ STEP = 0.1
 AT_ONCE = 256
 """Changes of modes in memory: 4 MB for 246 monitors."""
 
-
-Flags = NDArray[np.bool_]
 
 TURNS = (256, 1024)
 """Fewest and most turns that are tracked, else as many as were measured: the first resolve a line;

@@ -190,7 +190,6 @@ def common_factors_sentence(result: Diagnosis) -> str:
 
 
 INSTEAD = "Alternative common factors of the same gradients:"
-OUTLIERS = "Outlier magnets, of which another fault than a gradient error is probable:"
 MISSING = "Missing effects: held-out rms in µm, each alone, and on top of those that improve:"
 REJECTED = "Rejected, because they increase the held-out residual or their amount is implausible:"
 
@@ -213,21 +212,6 @@ def instead_texts(result: Diagnosis) -> list[str]:
             continue
         parts = [", ".join(other)] * bool(other) + ["without " + ", ".join(gone)] * bool(gone)
         said.append(f"{'; '.join(parts)} ({100 * one.probability:.0f} %)")
-    return said
-
-
-def outlier_texts(result: Diagnosis) -> list[str]:
-    """Outlier magnets, with the neighbours that they are correlated with."""
-    said = []
-    found = {finding.element for finding in result.findings}  # the fault is known
-    outliers = () if result.common_factors is None else result.common_factors.outliers
-    for own in [one for one in outliers if one.element not in found][:SHOWN]:
-        text = f"{own.element} {100 * own.amount:+.1f} ± {100 * own.amount_sigma:.1f} %"
-        pulls = ", ".join(
-            f"{name} ({100 * amount:+.1f} %, correlation {correlation:+.2f})"
-            for name, amount, correlation in own.against
-        )
-        said.append(f"{text}; it is correlated with {pulls}" if pulls else text)
     return said
 
 
@@ -288,11 +272,6 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
         if instead:
             lines += ["", *wrapped(INSTEAD, "", width)]
             for text in instead:
-                lines += wrapped(text, "   ", width)
-        outliers = outlier_texts(result)
-        if outliers:
-            lines += ["", *wrapped(OUTLIERS, "", width)]
-            for text in outliers:
                 lines += wrapped(text, "   ", width)
         for i, text in enumerate(inconsistency_texts(result)):
             lines += wrapped(text, "   ", width) if i else ["", *wrapped(text, "", width)]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.validation import Validated, against, lost
+from tmlattice.diagnosis.response.weights import independent
 
 COLUMNS, MONITORS = 60, 90
 

@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.rf_by_others import rf_by_others
+from tmlattice.diagnosis.response.linear import linear, rf_by_others
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.diagnosis.response.weights import taken, weight

@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import (
     dispersion_behind,
@@ -29,8 +29,6 @@ from tmlattice.diagnosis.families.family import Family, RingFamily, StatedCause
 from tmlattice.effects import Cause, background_rms, directions, find
 from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
-
-Array = NDArray[np.float64]
 
 LEAST = 3e-3
 """Share of the strongest pattern below which a weaker one is omitted."""
@@ -259,7 +257,7 @@ def orbit_patterns(model: ResponseModel, plane: int, effects: Sequence[str]) -> 
     return OrbitPatterns(causes, amounts, amounts @ orbits)
 
 
-class _Orbit(RingFamily):
+class OrbitFamily(RingFamily):
     """Amplitudes of orbit patterns, in units of usual errors."""
 
     single = False
@@ -307,7 +305,7 @@ class _Orbit(RingFamily):
         return [{causes[i]: pattern[i] for i in first} for pattern, first in own]
 
 
-class HorizontalOrbit(_Orbit):
+class HorizontalOrbit(OrbitFamily):
     """The horizontal closed orbit, which focuses in sextupoles."""
 
     name, effects = "horizontal orbit", ("dipole_field", "quadrupole_offset_x")
@@ -315,7 +313,7 @@ class HorizontalOrbit(_Orbit):
     title = "horizontal closed orbit in sextupoles"
 
 
-class VerticalOrbit(_Orbit):
+class VerticalOrbit(OrbitFamily):
     """The vertical closed orbit, which couples in sextupoles."""
 
     name, effects = "vertical orbit", ("dipole_roll", "quadrupole_offset_y")

@@ -22,7 +22,11 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
-from tmlattice.diagnosis.families.dispersion import dispersion_by_kicks, fitted_orbit_kicks
+from tmlattice.diagnosis.families.dispersion import (
+    OrbitFamily,
+    dispersion_by_kicks,
+    fitted_orbit_kicks,
+)
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.families.fields import REPRODUCED, FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, EnergyOffset, Trial
@@ -35,7 +39,6 @@ from tmlattice.diagnosis.findings import (
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
-from tmlattice.diagnosis.response.detected_faults import ORBITS
 from tmlattice.diagnosis.response.fitted_causes import with_support
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
@@ -46,7 +49,7 @@ from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.stated import unwidened
 from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
-from tmlattice.diagnosis.response.validation import Step, score
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.response.weights import LEAST
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.support import FREE, Support
@@ -122,7 +125,9 @@ def diagnose_change(
     progress("the reference")
     rng = np.random.default_rng(seed)
     # a changed gradient would move a closed orbit of the reference's ring, which operators correct
-    still = [trial for trial in STEPS if not any(f.name in ORBITS for f in trial.families)]
+    still = [
+        trial for trial in STEPS if not any(isinstance(f, OrbitFamily) for f in trial.families)
+    ]
     steps = () if same else trials_of(effects, still)
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
     orbit_kicks = fitted_orbit_kicks(fitted.at)
@@ -270,21 +275,19 @@ def _fit_change(
 ) -> StepwiseFit:
     """The fit of all possible changes, with the estimated noise of the difference."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
-    before = score(design, split.held)
-    steps = [Step.scored("reference", 0, before)]
+    steps = [score(design, "reference")]
     state = design
     for trial, settled in one_by_one(design, trials, progress):
         state = settled
         count = sum(family.count(data) for family in trial.families)
         title = ", ".join(family.title for family in trial.families)
-        steps.append(Step.scored(title, count, score(state, split.held)))
+        steps.append(score(state, title, count))
     state = settle(bend(jump(state)))
     state = settle(_learnt_noise(state))
-    after = score(state, split.held)
-    if len(steps) > 1:
-        steps[-1] = Step.scored(steps[-1].effect, steps[-1].parameters, after)
+    steps[-1] = score(state, steps[-1].effect, steps[-1].parameters)
     design = _with_noise(design, state.data.noise)
-    return StepwiseFit(design, state, tuple(steps), (), (score(design, split.held), after))
+    steps[0] = score(design, "reference")
+    return StepwiseFit(design, state, tuple(steps), ())
 
 
 def _learnt_noise(state: State) -> State:

@@ -8,7 +8,6 @@ again given the candidates, and likewise that of undetermined changes of other s
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -47,22 +46,8 @@ OTHERS = tuple(float(own) for own in np.geomspace(1e-4, 1e-2, 9))
 """Rms of undetermined changes of supplies that are tried, relative."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """Candidates for a change, as causes of amount one, and their derivatives."""
-
-    causes: tuple[tuple[str, str], ...]
-    members: Array  # [number, candidate]
-    scatter: Array  # covariance of single numbers, [number, number]
-
-
-@dataclass(frozen=True, eq=False)
-class _Weighed:
-    """Candidates with some scatter, the selected ones, and their log evidence."""
-
-    among: _Candidates
-    there: GivenOthers
-    evidence: float
+Causes = tuple[tuple[str, str], ...]
+"""Candidates for a change, of amount one."""
 
 
 def changed_supplies(
@@ -120,34 +105,34 @@ def _found(
         there = linear(state, block)
         if block in blurred:
             there = with_numbers(there, state, block, "left open", blurred[block])
-        scatter, own = _by_evidence(state, block, there, fitted)
+        scatter, causes, own = _by_evidence(state, block, there, fitted)
         if QuadrupoleGradient.name in scatter:
-            of_magnets = {**scatter, FamilyGradient.name: own.there.rms}
+            of_magnets = {**scatter, FamilyGradient.name: own.rms}
         found += [
-            _finding(state.data.ring, own.among.causes, reason, judgement)
-            for reason in own.there.levels.reasons(own.there.chosen, own.there.over)
+            _finding(state.data.ring, causes, reason, judgement)
+            for reason in own.levels.reasons(own.chosen, own.over)
         ]
     return found, of_magnets
 
 
 def _by_evidence(
     state: State, block: int, there: Linear, fitted: Mapping[str, Family]
-) -> tuple[dict[str, float], _Weighed]:
-    """The scatter of each family, at most that of the fit, and the selected candidates."""
+) -> tuple[dict[str, float], Causes, GivenOthers]:
+    """The scatter of each family, at most that of the fit; the candidates; those selected."""
     information, pull = marginal(there, list(fitted))
     wider = _widened(state, block, there)
 
-    def weighed(scatter: Mapping[str, float]) -> _Weighed:
-        among = _candidates(state, fitted.values(), scatter)
-        odds = [0.0 if name == FamilyGradient.name else ALONE for name, _ in among.causes]
+    def weighed(scatter: Mapping[str, float]) -> tuple[float, Causes, GivenOthers]:
+        causes, members, alone = _candidates(state, fitted.values(), scatter)
+        odds = [0.0 if name == FamilyGradient.name else ALONE for name, _ in causes]
         levels = FactorModel(
-            information / wider**2, pull / wider**2, among.members, among.scatter,
+            information / wider**2, pull / wider**2, members, alone,
             np.full(len(odds), USUAL), np.array(odds),
         )  # fmt: skip
-        supplies = [i for i, (name, _) in enumerate(among.causes) if name == FamilyGradient.name]
+        supplies = [i for i, (name, _) in enumerate(causes) if name == FamilyGradient.name]
         there = levels.given_others(levels.choose(MAX_CHOSEN), supplies, OTHERS)
         evidence = there.levels.background + there.levels.log_evidence(there.chosen)
-        return _Weighed(among, there, evidence)
+        return evidence, causes, there
 
     least = {
         f.name: REPRODUCED if isinstance(f, QuadrupoleGradient) else STRAY for f in fitted.values()
@@ -160,14 +145,16 @@ def _by_evidence(
         while finer > least[name]:
             finer = max(FINER * finer, least[name])
             other = weighed({**scatter, name: finer})
-            if other.evidence > best.evidence:
+            if other[0] > best[0]:
                 best, scatter = other, {**scatter, name: finer}
-    return scatter, best
+    return scatter, *best[1:]
 
 
 def _candidates(
     state: State, fitted: Iterable[Family], scatter: Mapping[str, float]
-) -> _Candidates:
+) -> tuple[Causes, Array, Array]:
+    """The candidates, what each moves [number, candidate], and the covariance of the scatter of
+    single numbers, [number, number]."""
     causes: list[tuple[str, str]] = []
     blocks: list[Array] = []
     covariance: list[Array] = []
@@ -185,7 +172,7 @@ def _candidates(
         covariance.append(alone)
         causes += [(name, place) for place in places]
         blocks.append(own)
-    return _Candidates(tuple(causes), block_diag(*blocks), block_diag(*covariance))
+    return tuple(causes), block_diag(*blocks), block_diag(*covariance)
 
 
 def _widened(state: State, block: int, there: Linear) -> float:

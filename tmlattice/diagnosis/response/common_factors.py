@@ -5,8 +5,8 @@
 
 A hierarchical fit estimates an error of every quadrupole. The same readings are explained again by
 common factors, numbers that many magnets share. Candidates of every level are compared by the
-marginal likelihood (`inference.levels`), with alternative sets (`inference.sets`). The learnt
-scatter of single magnets is in every error. Outlier magnets are reported, with their neighbours.
+marginal likelihood (`inference.common_factors`), with alternative sets. The learnt scatter of
+single magnets is in every error.
 """
 
 from collections.abc import Sequence
@@ -17,13 +17,12 @@ import numpy as np
 
 from tmlattice.arrays import TINY, Array, Flags, Indices
 from tmlattice.diagnosis.families.fields import (
-    LARGEST_GRADIENT,
     REPRODUCED,
     USUAL,
     QuadrupoleGradient,
 )
 from tmlattice.diagnosis.records import named, of
-from tmlattice.diagnosis.response.fitted_causes import AGAINST, SHOWN
+from tmlattice.diagnosis.response.fitted_causes import SHOWN
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.stated import of_readings, of_sizes
@@ -106,33 +105,12 @@ class Instead:
 
 
 @dataclass(frozen=True)
-class Outlier:
-    """An outlier magnet, given the common factors.
-
-    Attributes:
-        element: its first piece.
-        amount, amount_sigma: relative, beyond what it shares.
-        share_from_data: of the amount, 1 - posterior variance / prior variance.
-        against: correlated neighbours: name, amount and correlation.
-    """
-
-    element: str
-    amount: float
-    amount_sigma: float
-    against: tuple[tuple[str, float, float], ...] = field(
-        metadata=of("element", "amount", "correlation")
-    )
-    share_from_data: float
-
-
-@dataclass(frozen=True)
 class CommonFactors:
     """The common factors of the gradients.
 
     Attributes:
         common_factors: of the most probable set, by falling chi-square.
         instead: alternative sets, by falling probability.
-        outliers: by falling size.
         share: of the gradients' mean square that the common factors explain.
         scatter: rms of single magnets about them, relative.
         between: rms of families about what they share, relative; 0 if families are alike, or are
@@ -141,7 +119,6 @@ class CommonFactors:
 
     common_factors: tuple[Reason, ...]
     instead: tuple[Instead, ...]
-    outliers: tuple[Outlier, ...]
     share: float
     scatter: float
     between: float = field(metadata=named("between_families"))
@@ -169,8 +146,6 @@ def explain_gradients(state: State) -> CommonFactors | None:
     sizes = of_sizes(state, 0, there)[rows]
     more = np.sqrt(np.maximum(wider**2 - 1, 0))
     single = scatter**2 * np.eye(len(own)) + covariance * np.outer(more, more) + sizes @ sizes.T
-    covariance = covariance * np.outer(wider, wider) + sizes @ sizes.T
-    sigma = np.sqrt(np.maximum(np.diag(covariance), TINY))
     between, levels, sets = weighed(information, pull, among, single)
     found = [
         (one, chance)
@@ -204,14 +179,6 @@ def explain_gradients(state: State) -> CommonFactors | None:
     return CommonFactors(
         common_factors,
         instead,
-        _outliers(
-            places,
-            left,
-            values,
-            sigma,
-            covariance / np.outer(sigma, sigma),
-            np.sqrt(np.sum(spread**2, axis=1)),
-        ),
         1 - float(np.sum(left**2)) / size if size else 0.0,
         float(np.sqrt(np.mean(left**2))),
         between,
@@ -283,31 +250,6 @@ def weighed(
         chosen = (*(int(others[c]) for c in one.chosen), *families.tolist())
         sets.append(LikelySet(chosen, one.probability, *whole.fitted(chosen)))
     return best, whole, sets
-
-
-def _outliers(
-    places: Sequence[str],
-    left: Array,
-    values: Array,
-    sigma: Array,
-    correlation: Array,
-    prior: Array,
-) -> tuple[Outlier, ...]:
-    found = []
-    for i in np.flatnonzero(np.abs(left) - sigma > LARGEST_GRADIENT).tolist():
-        other = np.argsort(-np.abs(correlation[i]))
-        pulls = [int(j) for j in other if j != i and abs(correlation[i, j]) > AGAINST][:SHOWN]
-        against = tuple((places[j], float(values[j]), float(correlation[i, j])) for j in pulls)
-        found.append(
-            Outlier(
-                places[i],
-                float(left[i]),
-                float(sigma[i]),
-                against,
-                share_from_data(float(sigma[i]), float(prior[i])),
-            )
-        )
-    return tuple(sorted(found, key=lambda one: -abs(one.amount)))
 
 
 # --- candidates -----------------------------------------------------------------------------------

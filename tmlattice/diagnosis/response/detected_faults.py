@@ -1,7 +1,6 @@
 """Single faults of an orbit response among distributed errors.
 
->>> found = detected_faults(data, split, fit.state, hypotheses, judgement)
->>> [(one.cause, one.sigma, one.statistic) for one in found.faults]
+>>> apart, findings = detected_faults(data, split, fit.state, hypotheses, most, judgement)
 
 One cause after another is given a prior of its own, together with all usual distributed errors
 (`small_errors`). Their scales are learnt without it, and everything is fitted again, not
@@ -11,43 +10,41 @@ chance level of so many causes and families.
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
+from tmlattice.arrays import Array
+from tmlattice.diagnosis.families.dispersion import OrbitFamily
+from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
-from tmlattice.diagnosis.response.faults import Fault, as_turned
 from tmlattice.diagnosis.response.linear import Linear, linear
-from tmlattice.diagnosis.response.others import KINDS, with_number
+from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.rounds import log_evidence, settle
 from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, small_errors
-from tmlattice.diagnosis.response.state import Apart, State, allow, bend
+from tmlattice.diagnosis.response.state import Candidate, State, allow, bend
 from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.stepwise import ROUGH, StepwiseFit, fit_chi2
-from tmlattice.diagnosis.response.suspected import Seen, Suspect, Weighed, suspects_of
-from tmlattice.diagnosis.response.validation import Chi2, Step, score
+from tmlattice.diagnosis.response.suspected import KINDS, Seen, Weighed, suspects_of, with_number
+from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause, find, rare
 from tmlattice.errors import TmlatticeError
-from tmlattice.inference.alternatives import linear_evidence
+from tmlattice.inference.alternatives import Detection, linear_evidence
 from tmlattice.inference.common_factors import MIN_CHI2
-from tmlattice.inference.judgement import Judgement
+from tmlattice.inference.judgement import BEYOND, SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
 from tmlattice.inference.scan import Scan
-from tmlattice.observe.orbit_response import Hypothesis
+from tmlattice.observe.orbit_response import Errors, Hypothesis
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import Split
 
-Array = NDArray[np.float64]
-
 log = logging.getLogger(__name__)
 
-ORBITS = (HorizontalOrbit.name, VerticalOrbit.name)
 FAULTS = 8
 """Most faults: more of them are distributed errors."""
 WORTH, HIDDEN = 15.0, 8.0
@@ -55,34 +52,10 @@ WORTH, HIDDEN = 15.0, 8.0
 family, and for other causes, which increase the scales of all patterns of an orbit."""
 TRIES = 3
 """Most candidates per step; one in a response of many readings."""
-NEAR, SHARE = 8.0, 0.1
-"""Log evidence by which an alternative may be behind and still be tried; and the error of the
-linear model, as a share of the statistic."""
-BEHIND = 2.0
-"""Log evidence by which an alternative must be ahead to replace an accepted cause."""
-LISTED = 24
-"""Most alternatives of a fault that are compared."""
-BEYOND = 1.5
-"""Ratio to the largest fault above which an amount is implausible."""
 LACKS = 2.0
 """Largest chi-square per reading of a plane, given distributed errors, for a search in any case."""
-WORSE = 1.02
-"""Largest ratio of held-out residuals with and without the faults."""
 MEMBERS = 16
 """Assumed number of orbit patterns, where there are none."""
-
-
-@dataclass(frozen=True, eq=False)
-class DetectedFaults:
-    """The detected faults.
-
-    Attributes:
-        state: distributed errors together with the faults.
-        faults: by falling statistic.
-    """
-
-    state: State
-    faults: tuple[Fault, ...]
 
 
 def detected_faults(
@@ -93,8 +66,8 @@ def detected_faults(
     most: int,
     judgement: Judgement,
     progress: Callable[[str], Any] = lambda stage: None,
-) -> DetectedFaults:
-    """Detect faults one after another, each given those before it.
+) -> tuple[tuple[Candidate, ...], list[Finding]]:
+    """Return the detected faults, one after another, each given those before it; and the findings.
 
     Args:
         data, split: the data, and the validation split.
@@ -119,9 +92,7 @@ def detected_faults(
             break
         seen_before.append(chosen)
     seen = search.seen(search.state)
-    errors = search.state.at.errors
-    faults = [as_turned(search.fault(seen, one), errors, data) for one in search.state.apart]
-    return DetectedFaults(search.state, tuple(sorted(faults, key=lambda fault: -fault.statistic)))
+    return search.state.apart, [search.finding(seen, one) for one in search.state.apart]
 
 
 class _Search:
@@ -141,25 +112,24 @@ class _Search:
         """Whether the residual far exceeds the noise, and no single cause explains most of it:
         model discrepancy could be detected as a fault."""
         planes = fit_chi2(self.state)[:2]
-        worst = max((0, 1), key=lambda plane: planes[plane].per_reading)
+        worst = max((0, 1), key=lambda plane: planes[plane].ratio)
         own = planes[worst]
-        if own.per_reading <= LACKS or self.state.apart:
+        if own.ratio**2 <= LACKS or self.state.apart:
             return False
         # by the noise alone: a large residual of a column reduces its weight
-        left = [self.left_beside(*leader)[worst].total for leader in self.leaders()]
-        return min(left, default=np.inf) > (own.total + own.readings) / 2
+        left = [self.left_beside(*leader)[worst] for leader in self.leaders()]
+        return min(left, default=np.inf) > (own.chi2 + own.freedom) / 2
 
-    def left_beside(
-        self, cause: Hypothesis, amount: float, information: Array
-    ) -> tuple[Chi2, Chi2, Chi2]:
-        """Chi-square with one more cause, all else unchanged; infinite without a closed orbit."""
+    def left_beside(self, cause: Hypothesis, amount: float, information: Array) -> list[float]:
+        """Chi-square of each plane with one more cause, all else unchanged; infinite without a
+        closed orbit."""
         state, suspect = _as_number(self.state, cause, information)
-        assert suspect.members is not None
         values = state.values[suspect.variable] + amount * suspect.members
         try:
-            return fit_chi2(state.moved({**state.values, suspect.variable: values}))
+            moved = state.moved({**state.values, suspect.variable: values})
         except TmlatticeError:
-            return (Chi2(np.inf, 1),) * 3
+            return [np.inf, np.inf]
+        return [own.chi2 for own in fit_chi2(moved)]
 
     def seen(self, state: State) -> Seen:
         """All suspects, linearised at the state."""
@@ -205,7 +175,8 @@ class _Search:
         worth = [HIDDEN if one.block is None else WORTH for one in seen.suspects]
         evidence[own.statistic < worth] = -np.inf
         first = int(np.argmax(evidence))
-        least = evidence[first] - NEAR - SHARE * own.statistic[first]
+        least = evidence[first] - self.judgement.window
+        least -= self.judgement.drift * own.statistic[first]
         order = [int(h) for h in np.argsort(-evidence) if evidence[h] > max(least, -np.inf)]
         found: dict[str, tuple[Hypothesis, float, Array]] = {}
         have = [one.cause for one in self.state.apart]
@@ -226,7 +197,7 @@ class _Search:
         """
         return _settled(_apart(_as_number(state, cause, information)[0], cause))
 
-    def better(self, state: State, one: Apart) -> State:
+    def better(self, state: State, one: Candidate) -> State:
         """The state with an alternative instead of a cause, if that explains more."""
         seen = self.seen(state)
         own = seen.beside(one.name)
@@ -235,7 +206,7 @@ class _Search:
         have = [other.cause for other in state.apart if other is not one]
         evidence[[h for h, s in enumerate(seen.suspects) if s.cause in have]] = -np.inf
         best = int(np.argmax(evidence))
-        if not evidence[best] > evidence[here] + BEHIND:
+        if not evidence[best] > evidence[here] + self.judgement.behind:
             return state
         other = self.put(_without(state, one), seen.suspects[best].cause, own.information[:, best])
         if other is None:
@@ -261,22 +232,22 @@ class _Search:
             state = self.better(fewer, fewer.apart[-1])
         return state
 
-    def members(self, state: State, one: Apart) -> int:
+    def members(self, state: State, one: Candidate) -> int:
         """Number of amounts that determine the statistic's scale, of the family or orbit
         patterns."""
         if one.variable not in (kind.variable for kind in KINDS):
             return max(len(one.members) - 1, 1)
-        orbit = [len(state.values[f.variable]) for f in state.of_block(one.block)
-                 if f.name in ORBITS]  # fmt: skip
+        orbit = [len(state.values[f.variable]) for f in state.of_block(one.block or 0)
+                 if isinstance(f, OrbitFamily)]  # fmt: skip
         return max(min(orbit, default=MEMBERS) - 1, 1)
 
-    def p_value(self, seen: Seen, statistic: float, one: Apart) -> float:
+    def p_value(self, seen: Seen, statistic: float, one: Candidate) -> float:
         """Probability that the largest of so many errors reaches this statistic by chance."""
         members = self.members(seen.state, one)
         own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), members))
         return min(1.0, own * len(self.hypotheses))
 
-    def clear(self, seen: Seen, one: Apart) -> bool:
+    def clear(self, seen: Seen, one: Candidate) -> bool:
         """Whether the cause is detected."""
         statistic, cause, _ = _shown(seen, one)
         if not abs(cause.amount) < BEYOND * find(cause.effect).largest:
@@ -285,25 +256,41 @@ class _Search:
             statistic > MIN_CHI2 and self.p_value(seen, statistic, one) < self.judgement.false_alarm
         )
 
-    def fault(self, seen: Seen, one: Apart) -> Fault:
+    def finding(self, seen: Seen, one: Candidate) -> Finding:
         """The fault with its amount, error and alternatives."""
         own = seen.beside(one.name)
         evidence = self.evidence(seen, own)
-        here = _place(seen, one)
-        order = [int(h) for h in np.argsort(-evidence)[:LISTED] if np.isfinite(evidence[h])]
-        order = [here, *(h for h in order if h != here)]
         statistic, cause, sigma = _shown(seen, one)
-        return Fault(
-            cause,
-            sigma,
-            statistic,
-            self.p_value(seen, statistic, one),
-            tuple(Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in order),
-            evidence[order],
-        )
+        cause, sigma = as_turned(cause, sigma, seen.state.at.errors, seen.state.data)
+        known = {one.cause, (cause.effect, cause.element)}
+        rivals = [int(h) for h in np.argsort(-evidence)[: self.judgement.alternatives]
+                  if np.isfinite(evidence[h]) and seen.suspects[h].cause not in known]  # fmt: skip
+        chance = np.exp(evidence[[_place(seen, one), *rivals]] - evidence.max())
+        causes = (Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in rivals)
+        detection = Detection(statistic, MIN_CHI2, self.p_value(seen, statistic, one))
+        return finding_of(
+            seen.state.data.ring, (cause, *causes), chance / chance.sum(), sigma, detection,
+            self.judgement.mass,
+        )  # fmt: skip
 
 
-def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Suspect]:
+def as_turned(
+    cause: Cause, sigma: float, errors: Errors, data: ResponseData
+) -> tuple[Cause, float]:
+    """Return a cause with its error, reported as a roll if the corrector kicks significantly in the
+    other plane: it has one number for each plane, and the kick that is missing in one is no
+    calibration error. A corrector without any kick is not rolled."""
+    if cause.effect != "corrector_calibration":
+        return cause, sigma
+    columns = [data.ring[own].name for own in data.measured.correctors]
+    column = columns.index(data.ring[cause.element or ""].name)
+    if not errors.turned[column] or abs(errors.roll[column]) < SIGNIFICANT * sigma:
+        return cause, sigma
+    roll = Cause("corrector_roll", cause.element, float(errors.angle[column]))
+    return roll, sigma / float(errors.kick[column])
+
+
+def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[State, Candidate]:
     """The state with a number for the cause, in the more sensitive block, and that number."""
     (suspect,) = suspects_of(state, [cause])
     if suspect.block is None:
@@ -314,20 +301,17 @@ def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[Sta
 
 def _apart(state: State, cause: Hypothesis) -> State:
     """The state with a separate prior for a number of the fit."""
-    (suspect,) = suspects_of(state, [cause])
-    assert suspect.block is not None
-    assert suspect.members is not None
-    own = Apart(cause, suspect.variable, suspect.block, suspect.members, find(cause[0]).largest)
-    return replace(state, apart=(*state.apart, own))
+    return replace(state, apart=(*state.apart, *suspects_of(state, [cause])))
 
 
-def _place(seen: Seen, one: Apart) -> int:
+def _place(seen: Seen, one: Candidate) -> int:
     return next(h for h, suspect in enumerate(seen.suspects) if suspect.cause == one.cause)
 
 
-def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
+def _shown(seen: Seen, one: Candidate) -> tuple[float, Cause, float]:
     """Statistic, amount and error of a cause, widened for contradicting BPMs and columns."""
     own, here = seen.beside(one.name), _place(seen, one)
+    assert one.block is not None
     it = seen.blocks[one.block]
     posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
     wider = doubt(seen.state, one, it.there, posterior)
@@ -339,15 +323,15 @@ def _shown(seen: Seen, one: Apart) -> tuple[float, Cause, float]:
     return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))
 
 
-def _scatter(there: Linear, sizes: Sequence[Group], one: Apart) -> float:
+def _scatter(there: Linear, sizes: Sequence[Group], one: Candidate) -> float:
     """rms of the amount by the distributed errors of its family."""
     along = np.zeros(len(there.start))
-    along[there.where[one.variable]] = one.members / float(one.members @ one.members)
+    along[there.where[one.variable]] = one.unit
     return float(np.sqrt(sum(np.sum((along @ group.basis * group.scale) ** 2)
                              for group in sizes if group.name != one.name)))  # fmt: skip
 
 
-def _without(state: State, one: Apart) -> State:
+def _without(state: State, one: Candidate) -> State:
     """The state without a cause, not converged: the next step takes its number back."""
     return replace(state, apart=tuple(other for other in state.apart if other is not one))
 
@@ -368,11 +352,9 @@ def _settled(state: State) -> State | None:
 
 def _possible(state: State) -> bool:
     """Whether each amount, with its family's part, is a plausible fault."""
-    amounts = [
-        float(state.values[one.variable] @ one.members / (one.members @ one.members))
-        for one in state.apart
-    ]
-    return all(abs(a) < BEYOND * one.wide for a, one in zip(amounts, state.apart, strict=True))
+    return all(
+        abs(float(state.values[one.variable] @ one.unit)) < BEYOND * one.wide for one in state.apart
+    )
 
 
 def _stepped(state: State) -> State:
@@ -388,13 +370,13 @@ def _stepped(state: State) -> State:
 
 
 # --- report ---------------------------------------------------------------------------------------
-def given_faults(fit: StepwiseFit, apart: Sequence[Apart]) -> StepwiseFit:
+def given_faults(fit: StepwiseFit, apart: Sequence[Candidate]) -> StepwiseFit:
     """Return the hierarchical fit with the faults' numbers free of their families, as a further
     step; unchanged where held-out residuals grow."""
     state = fit.state
     for one in apart:
         if one.variable in (kind.variable for kind in KINDS):
-            state = with_number(state, one.cause, one.block)
+            state = with_number(state, one.cause, one.block or 0)
         elif one.variable not in state.values:
             state = allow(state, [f for f in USUAL if f.variable == one.variable])
     own = {one.cause: one for one in apart}
@@ -403,10 +385,11 @@ def given_faults(fit: StepwiseFit, apart: Sequence[Apart]) -> StepwiseFit:
     settled = _settled(state)
     if settled is None:
         return fit
-    after = score(settled, settled.split.held)
-    before = fit.heldout[1]
-    if after.in_plane > WORSE * before.in_plane or after.coupling > WORSE * before.coupling:
-        return fit
     title = ", ".join(f"{effect} {place}" for effect, place in own)
-    steps = (*fit.steps, Step.scored(title, len(own), after))
-    return replace(fit, state=settled, steps=steps, heldout=(fit.heldout[0], after))
+    before, after = fit.steps[-1], score(settled, title, len(own))
+    if (
+        HELPS * after.heldout_rms_in_plane > before.heldout_rms_in_plane
+        or HELPS * after.heldout_rms_coupling > before.heldout_rms_coupling
+    ):
+        return fit
+    return replace(fit, state=settled, steps=(*fit.steps, after))

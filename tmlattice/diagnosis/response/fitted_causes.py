@@ -42,9 +42,13 @@ def fitted_causes(
             if row[0].amount != 0 or row[1] != 0:
                 own.append(row)
                 supports.append(support)
-        blocks.append(_covariance(own, _numbers(state, families.values(), there), known.covariance))
+        numbers = _numbers(state, families.values(), there)
+        blocks.append(_covariance(own, numbers, known.covariance))
         found += own
-        pairs += _correlated(state, families.values(), there, known.covariance)
+        first = 2 * state.data.shape[1] + state.data.shape[0]
+        ring = [i for i in numbers if i >= first]  # each is named by its first cause
+        causes = [next(iter(numbers[i])) for i in ring]
+        pairs += correlations_of(causes, known.covariance[np.ix_(ring, ring)])
         if block == 0:
             messages = _degenerate(state, there, posterior)
     return found, tuple(supports), messages, tuple(pairs), block_diag(*blocks)
@@ -64,24 +68,6 @@ def _covariance(rows: Sequence[StatedCause], numbers: "Hypotheses", covariance: 
     np.fill_diagonal(correlation, 1.0)
     sigma = np.array([own for _, own in rows])
     return np.asarray(sigma[:, None] * correlation * sigma)
-
-
-def _correlated(
-    state: State, families: Iterable[Family], there: Linear, covariance: Array
-) -> tuple[Correlation, ...]:
-    """Strongly correlated amounts of the magnets' families, each named by its first cause."""
-    amounts: list[Hypothesis] = []
-    numbers: list[int] = []
-    for family in families:
-        if family.per == "ring":
-            first = there.where[family.variable].start
-            for i, moves in enumerate(family.moves(state.data)):
-                if moves:
-                    amounts.append(next(iter(moves)))
-                    numbers.append(first + i)
-    if not numbers:
-        return ()
-    return correlations_of(amounts, covariance[np.ix_(numbers, numbers)])
 
 
 def with_support(

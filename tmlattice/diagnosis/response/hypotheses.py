@@ -1,6 +1,7 @@
 """Effects that may be missing from a fitted orbit response, as patterns of readings.
 
-To add one, write a function that returns its patterns at the fit, and add it to `HYPOTHESES`.
+To add one, write a function that returns its patterns at the fit, and add it to `HYPOTHESES`. What
+is a family of the fit is none: every fit tests it.
 """
 
 from collections.abc import Callable
@@ -10,8 +11,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from tmlattice.arrays import Array
-from tmlattice.diagnosis.families.dispersion import HorizontalKicks
-from tmlattice.diagnosis.families.fields import QuadrupoleGradient, between
+from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.state import State
 from tmlattice.effects import apply
 from tmlattice.lattice.alike import families
@@ -27,7 +27,7 @@ WAVES = 4
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class MissingEffect:
     """An effect that may be missing.
 
     Attributes:
@@ -72,70 +72,56 @@ def _orders(state: State) -> tuple[Array, Array]:
     return (up + down) / 2 - model.readings[state.data.at], (up - down) / 2 - linear
 
 
-def _one_sided(state: State) -> Hypothesis:
+def _one_sided(state: State) -> MissingEffect:
     second, _ = _orders(state)
-    return Hypothesis(
+    return MissingEffect(
         "one-sided steps", "share", "0: two-sided, 1 or -1: one-sided",
         _readings(state, second)[None], most=1.1,
     )  # fmt: skip
 
 
-def _third_order(state: State) -> Hypothesis:
+def _third_order(state: State) -> MissingEffect:
     third = _orders(state)[1]
     third[-1] = 0
-    return Hypothesis(
+    return MissingEffect(
         "third order of two-sided steps", "beyond the model's", "0; -1: none",
         _readings(state, third)[None] / 4, most=2.0,
     )  # fmt: skip
 
 
-def _corrector_energy(state: State) -> Hypothesis:
+def _corrector_energy(state: State) -> MissingEffect:
     model, names = state.at.model, state.data.measured.correctors
     own = model.rf_response() / model.rf_start[5]
     flat = model.response(names) - model.columns(names).start[:, 5, None, None] * own
     shift = state.at.orbits(model)
     shift[:-1] -= flat[:, state.data.at] * state.data.kicks[:-1, None, None]
     shift[-1] = 0
-    return Hypothesis(
+    return MissingEffect(
         "corrector's energy shift", "beyond the model's", "0; -1: the energy stays",
         _readings(state, shift)[None], most=1.1,
     )  # fmt: skip
 
 
-def _position(
-    state: State, which: str, names: Callable[[State], list[str]] | None = None
-) -> Hypothesis:
+def _position(state: State, by_family: bool) -> MissingEffect:
     """The position of the field of each corrector; or one for all whose names begin alike."""
-    jumps = _readings(state, state.at.jumps) * state.data.kicks[:, None]
-    rows = jumps[None]
-    if names is not None:
-        members = families([*names(state), "\0"])[1]
+    rows = (_readings(state, state.at.jumps) * state.data.kicks[:, None])[None]
+    if by_family:
+        members = families([*state.data.measured.correctors, "\0"])[1]
         rows = members.T[:, :, None] * rows
-    name = f"corrector's field displaced in s, {which}"
-    return Hypothesis(name, "m", "< 0.05 m", rows, own=names is None, most=0.05)
+    name = f"corrector's field displaced in s, {'by family' if by_family else 'each'}"
+    return MissingEffect(name, "m", "< 0.05 m", rows, own=not by_family, most=0.05)
 
 
-def _position_beside(state: State) -> Hypothesis | None:
-    if state.allows("corrector_position"):
-        return None  # the fit has it
-
-    def neighbours(own: State) -> list[str]:
-        measured = own.data.measured
-        return between(own.data.ring, measured.correctors, measured.planes)
-
-    return _position(state, "by the magnets next to it", neighbours)
-
-
-def _energy_drift(state: State) -> Hypothesis:
+def _energy_drift(state: State) -> MissingEffect:
     rf = _readings(state, state.at.beam)[-1]
     pattern = np.where((state.data.plane == 0)[:, None], rf, 0.0)
     pattern[-1] = 0
-    return Hypothesis(
+    return MissingEffect(
         "drift of the energy", "RF step", "< 1e-3", pattern[None], own=True, most=1e-3
     )
 
 
-def _orbit_drift(state: State) -> Hypothesis:
+def _orbit_drift(state: State) -> MissingEffect:
     """Closed orbits of random kicks between the readings of a step, different in each column."""
     orbits = _readings(state, state.at.orbits(state.at.model))
     waves = np.zeros((WAVES, *orbits.shape))
@@ -145,24 +131,24 @@ def _orbit_drift(state: State) -> Hypothesis:
         per_kick = np.nan_to_num(orbits[mine]) / state.data.kicks[mine, None]
         found = np.linalg.svd(per_kick, full_matrices=False)[2][:WAVES]
         waves[: len(found), mine] = found[:, None] * np.sqrt(found.shape[1])
-    return Hypothesis(
+    return MissingEffect(
         "drift of the orbit (betatron waves)", "m", "< 1e-5", waves, own=True, most=1e-5
     )
 
 
-def _tune_drift(state: State) -> Hypothesis:
+def _tune_drift(state: State) -> MissingEffect:
     total = np.zeros((2, len(state.data.plane), len(state.data.at)))
     single = QuadrupoleGradient()
     focusing = [int(state.data.ring[name].k1 < 0) for name in single.places(state.data)]
     np.add.at(total, focusing, single.rows(state.at, np.zeros(len(focusing))))
     total[:, -1] = 0
-    return Hypothesis(
+    return MissingEffect(
         "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4", total, own=True,
         most=1e-4,
     )  # fmt: skip
 
 
-def _in_time(drift: Hypothesis, effect: str, constant: bool) -> Hypothesis:
+def _in_time(drift: MissingEffect, effect: str, constant: bool) -> MissingEffect:
     """A smooth drift over the columns in the order of time.
 
     Args:
@@ -178,87 +164,55 @@ def _in_time(drift: Hypothesis, effect: str, constant: bool) -> Hypothesis:
     return replace(drift, effect=effect, patterns=rows.reshape(-1, *rows.shape[2:]), own=False)
 
 
-def _orbit_in_time(state: State) -> Hypothesis:
+def _orbit_in_time(state: State) -> MissingEffect:
     waves = _orbit_drift(state)
     planes = [(state.data.plane == p)[:, None] * waves.patterns for p in (0, 1)]
     each = replace(waves, patterns=np.concatenate(planes))
     return _in_time(each, "drift of the orbit in order of time", True)
 
 
-def _chromatic_in_time(state: State) -> Hypothesis:
+def _chromatic_in_time(state: State) -> MissingEffect:
     """A drift of the energy of all columns, which changes the tunes and the optics."""
     return _in_time(_chromatic(state), "drift of the beam's energy in order of time", False)
 
 
-def _hysteresis(state: State) -> Hypothesis:
+def _hysteresis(state: State) -> MissingEffect:
     """Hysteresis: a corrector's iron keeps a share of its step in later columns, of the last step
     alone or of all earlier ones."""
     last = np.zeros_like(state.at.read)
     last[1:-1] = state.at.read[:-2]
     rows = np.stack([state.data.pick(stays) for stays in (last, np.cumsum(last, axis=0))])
     rows[:, -1] = 0  # the RF's
-    return Hypothesis("hysteresis: a share of earlier steps", "share", "< 0.01", rows, most=0.01)
+    return MissingEffect("hysteresis: a share of earlier steps", "share", "< 0.01", rows, most=0.01)
 
 
-def _energy_spread(state: State) -> Hypothesis | None:
-    if state.allows("energy_spread"):
-        return None  # the fit has it
-    curved = state.at.curved.copy()
-    curved[-1] = 0
-    return Hypothesis(
-        "energy spread of the beam", "(1e-3)^2", "about 1", _readings(state, curved)[None], most=4.0
-    )
-
-
-def _energy_offset(state: State) -> Hypothesis | None:
-    return None if state.allows("energy_offset") else _chromatic(state)  # the fit has it
-
-
-def _chromatic(state: State) -> Hypothesis:
+def _chromatic(state: State) -> MissingEffect:
     """An energy offset of the beam, which changes the effect of quadrupoles and sextupoles."""
     scale = (1 + state.at.errors.calibration)[:, None, None] * DELTA
     slope = _readings(state, state.at.chromatic * scale)
-    return Hypothesis("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
+    return MissingEffect("energy offset of the beam", "1e-3", "< 5", slope[None], most=5.0)
 
 
-def _dispersion(state: State) -> Hypothesis | None:
-    """Dispersion by kicks, see `dispersion`; one amount per pattern."""
-    if state.allows("horizontal kicks"):
-        return None  # the fit has them
-    kicks = HorizontalKicks()
-    count = kicks.size(state.data)
-    if not count:
-        return None
-    rows = kicks.rows(state.at, np.zeros(count))
-    return Hypothesis("dispersion that no gradient makes (kicks)", "rad", "< 1e-3", rows, most=1e-3)
-
-
-def _nonlinear(state: State) -> Hypothesis:
+def _nonlinear(state: State) -> MissingEffect:
     """Cubic BPMs with two-sided steps: x^3 / 4 of the whole change."""
     cubes = state.data.pick(state.at.read) ** 3 / 4 / MILLIMETRE**2
     rows = np.stack([np.where((state.data.plane == p)[:, None], cubes, 0.0) for p in (0, 1)])
-    return Hypothesis("nonlinear BPMs (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
+    return MissingEffect("nonlinear BPMs (cubic)", "1/mm2", "< 1e-3", rows, most=1e-3)
 
 
-def _gradients(state: State, name: str, effect: str, kind: str, most: float) -> Hypothesis | None:
-    places = [e.name for e in state.data.ring.elements if e.kind == kind]
-    if not places:
-        return None
-    slopes = state.at.rows(effect, places, 0)
-    return Hypothesis(name, "1/m", f"< {most:g}", slopes, most=most)
-
-
-def _radiation(state: State) -> Hypothesis | None:
+def _radiation(state: State) -> MissingEffect | None:
     pairs = [
         (f"radiation_loss_{kind}s", None)
         for kind in ("bend", "wiggler")
         if any(e.kind == kind for e in state.data.ring.elements)
     ]
     rows = [_readings(state, slope) for slope in state.at.slopes(pairs)]
-    return Hypothesis("radiation in bends, wigglers", "expected loss", "1", np.array(rows), most=3)
+    return MissingEffect(
+        "radiation in bends, wigglers", "expected loss", "1", np.array(rows), most=3
+    )
 
 
-def _monitor_position(state: State) -> Hypothesis:
+def _monitor_position(state: State) -> MissingEffect:
     model = state.at.model
     columns = model.columns(state.data.measured.correctors)
     start = np.vstack([columns.start, model.rf_start])
@@ -272,10 +226,10 @@ def _monitor_position(state: State) -> Hypothesis:
     rows = np.zeros((len(state.data.at), *flat.shape))
     for i in range(len(rows)):
         rows[i, :, i] = flat[:, i]
-    return Hypothesis("BPMs displaced in s", "m", "< 0.01 m", rows, most=0.01)
+    return MissingEffect("BPMs displaced in s", "m", "< 0.01 m", rows, most=0.01)
 
 
-def _bend_gradient(state: State) -> Hypothesis:
+def _bend_gradient(state: State) -> MissingEffect:
     """Gradients of bends; magnets of one length are one type."""
     ring = state.at.model.ring
     bends = [i for i, e in enumerate(ring.elements) if e.kind == "bend"]
@@ -291,22 +245,22 @@ def _bend_gradient(state: State) -> Hypothesis:
         slope = (state.at.orbits(model) - state.at.orbits(state.at.model)) / BEND_GRADIENT
         scale = np.append(1 + state.at.errors.calibration[:-1], 1)[:, None, None]
         rows.append(_readings(state, slope * scale))
-    return Hypothesis("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
+    return MissingEffect("gradient of bends, by type", "1/m2", "< 1e-3", np.array(rows), most=1e-3)
 
 
-def _second_order_coupling(state: State) -> Hypothesis | None:
+def _second_order_coupling(state: State) -> MissingEffect | None:
     if not state.values.get("skew", np.zeros(1)).any():
         return None
     causes = [c for c in state.at.errors.ring if c.effect != "skew_gradient"]
     flat = state.at.model.changed_to(apply(state.data.ring, causes))
     change = state.at.orbits(state.at.model) - state.at.orbits(flat)
-    return Hypothesis(
+    return MissingEffect(
         "coupling to second order", "beyond the model's", "0; -1: none",
         _readings(state, change)[None], most=1.1,
     )  # fmt: skip
 
 
-HYPOTHESES: dict[str, Callable[[State], Hypothesis | None]] = {
+HYPOTHESES: dict[str, Callable[[State], MissingEffect | None]] = {
     "one_sided_steps": _one_sided,
     "third_order": _third_order,
     "energy_drift": _energy_drift,
@@ -322,25 +276,10 @@ HYPOTHESES: dict[str, Callable[[State], Hypothesis | None]] = {
     "chromatic_in_time": _chromatic_in_time,
     "hysteresis": _hysteresis,
     "corrector_energy": _corrector_energy,
-    "corrector_position_family": lambda state: _position(
-        state, "by family", lambda own: list(own.data.measured.correctors)
-    ),
-    "corrector_position_neighbours": _position_beside,
-    "corrector_position": lambda state: _position(state, "each"),
-    "energy_spread": _energy_spread,
-    "energy_offset": _energy_offset,
-    "dispersion": _dispersion,
+    "corrector_position_family": lambda state: _position(state, True),
+    "corrector_position": lambda state: _position(state, False),
     "monitor_nonlinearity": _nonlinear,
     "monitor_position": _monitor_position,
-    "wiggler_gradient": lambda state: _gradients(
-        state, "gradients of damping wigglers", "insertion_device_focusing", "wiggler", 3e-3
-    ),
-    "straight_gradient": lambda state: _gradients(
-        state, "gradients in straights (markers)", "gradient_absolute", "marker", 2e-3
-    ),
-    "sextupole_gradient": lambda state: _gradients(
-        state, "gradients at sextupoles (orbit)", "gradient_absolute", "sextupole", 2e-3
-    ),
     "bend_gradient": _bend_gradient,
     "radiation": _radiation,
     "second_order_coupling": _second_order_coupling,

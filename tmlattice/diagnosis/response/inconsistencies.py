@@ -17,8 +17,7 @@ import numpy as np
 from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.rf_by_others import rf_fitted
+from tmlattice.diagnosis.response.linear import linear, rf_fitted
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT

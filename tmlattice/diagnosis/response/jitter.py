@@ -16,17 +16,15 @@ known up to the phase of the betatron oscillation.
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.beam.kicks import orbits_of_kicks
-from tmlattice.diagnosis.response.independent import independent
 from tmlattice.diagnosis.response.missing_effects import FREE
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
-from tmlattice.diagnosis.response.weights import weight
+from tmlattice.diagnosis.response.weights import independent, weight
 from tmlattice.inference.judgement import DEFAULT, ENOUGH
 from tmlattice.inference.newton import AGAIN
 from tmlattice.inference.normal import amounts, common, times_precision
@@ -85,39 +83,29 @@ def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
         planes: to search.
     """
     still = replace(state, jitter=None)
-    x, y = (_in_plane(still, plane) if plane in planes else _nothing(state) for plane in (0, 1))
-    if not (x.places or y.places):
-        return None
-    orbits = np.zeros((2, max(len(x.places), len(y.places)), len(state.data.at)))
-    for plane, own in enumerate((x, y)):
-        orbits[plane, : len(own.places)] = own.orbits
-    return Jitter(orbits, (x.places, y.places))
+    orbits = np.zeros((2, MOST, len(state.data.at)))
+    places: list[tuple[str, ...]] = [(), ()]
+    for plane in planes:
+        found, places[plane] = _in_plane(still, plane)
+        orbits[plane, : len(found)] = found
+    most = max(len(own) for own in places)
+    return Jitter(orbits[:, :most], (places[0], places[1])) if most else None
 
 
-class _OfPlane(NamedTuple):
-    """Orbits [pattern, monitor] of one plane, and the magnets behind which a kick makes them."""
-
-    orbits: Array
-    places: tuple[str, ...]
-
-
-def _nothing(state: State) -> _OfPlane:
-    return _OfPlane(np.zeros((0, len(state.data.at))), ())
-
-
-def _in_plane(state: State, plane: int) -> _OfPlane:
-    """The jitter of one plane."""
+def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
+    """The orbits of one plane, [pattern, monitor], and the magnets behind which a kick makes
+    them."""
     data, at, model = state.data, state.at, state.at.model
-    nothing = _nothing(state)
+    none = np.zeros((0, len(data.at)))
     weights = weight(state, 1)
     read = (data.plane_of(1) == plane) & ((weights > 0).sum(axis=1) >= ENOUGH)
     read[-1] = False
     if not read.any() or not state.allows("corrector_roll"):
-        return nothing
+        return none, ()
     weights, left = weights[read], np.where(weights > 0, data.pick(at.left, 1), 0.0)[read]
     rolls = data.pick(at.seen(at.across), 1)[read]
     rolls *= FREE * _rms(left) / np.maximum(_rms(rolls), TINY)
-    without = rest = _rest(weights, left, _patterns(rolls, nothing.orbits))
+    without = rest = _rest(weights, left, _patterns(rolls, none))
     exits, rows = model.maps.at[data.at], model.reading_slopes[data.at, plane]
     layers = np.arange(len(model.maps.layers))
     orbits = orbits_of_kicks(model, layers, exits, rows, plane).T
@@ -133,10 +121,10 @@ def _in_plane(state: State, plane: int) -> _OfPlane:
     places = tuple(model.maps.layers[i] for i in which)
     before, after = np.median(_rms(without)), np.median(_rms(rest))
     if not before > 0:
-        return nothing
+        return none, ()
     log.info("plane %d: jitter from %s, residual %.3g of %.3g m", plane, places, after, before)
     share = 1 - float((after / before) ** 2)
-    return nothing if share < SHARE else _OfPlane(found, places)
+    return (none, ()) if share < SHARE else (found, places)
 
 
 def _weights(seen: Flags, rest: Array, least: Array) -> Array:

@@ -19,11 +19,13 @@ from scipy.linalg.lapack import dpotri
 from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array
-from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, Hypothesis
+from tmlattice.diagnosis.response.hypotheses import HYPOTHESES, MissingEffect
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.inference.judgement import ENOUGH
+from tmlattice.inference.normal import solve
+from tmlattice.inference.priors import Group
 
 Patterns: TypeAlias = Array | csr_array
 
@@ -38,12 +40,12 @@ class Weighed:
     """A hypothesis and its scores on held-out readings.
 
     Attributes:
-        effect, unit, expected: see `Hypothesis`.
+        effect, unit, expected: see `MissingEffect`.
         parameters: their number.
         amount: the parameter, or the rms of several.
         amount_sigma: its posterior rms, or the median one of several.
         heldout_rms_in_plane, heldout_rms_position: with it, m; see `Step`.
-        on_top_in_plane, on_top_position: with it and all accepted ones, m.
+        on_top_in_plane: with it and all accepted ones, m.
         evidence: gain of log evidence of the fitted readings with it alone: the misfit that it
             explains, less the cost of its parameters.
         control_in_plane: with as many random parameters instead, m; None unless columns have
@@ -62,7 +64,6 @@ class Weighed:
     heldout_rms_in_plane: float
     heldout_rms_position: float
     on_top_in_plane: float
-    on_top_position: float
     evidence: float
     control_in_plane: float | None
     judgement: str
@@ -89,7 +90,7 @@ def weigh(
     """
     fitted = Fitted(state)
     base = fitted.weigh([])
-    found: list[Hypothesis] = []
+    found: list[MissingEffect] = []
     for name in HYPOTHESES if wanted is None else wanted:
         progress(name)
         hypothesis = HYPOTHESES[name](state)
@@ -129,8 +130,8 @@ def weigh(
     }
     before = together
     take([i for i, answer in on_top.items() if i in helpful and _helps(found[i], answer, before)])
-    four = base.in_plane, base.position, together.in_plane, together.position
-    out = [Weighed("none", "", "", 0, 0.0, 0.0, *four, 0.0, None, "")]
+    rms = base.in_plane, base.position, together.in_plane
+    out = [Weighed("none", "", "", 0, 0.0, 0.0, *rms, 0.0, None, "")]
     for i, hypothesis in enumerate(found):
         given = together if i in chosen else on_top[i]
         if i in chosen:
@@ -140,32 +141,26 @@ def weigh(
         elif i not in helpful and _helps(hypothesis, alone[i], base):
             judgement = "as random ones do"
         else:
-            judgement = _refusal(hypothesis, alone[i], given, base, before)
+            best = min(alone[i].in_plane / base.in_plane, given.in_plane / before.in_plane)
+            sensible = best >= HELPS or _sensible(hypothesis, given)
+            judgement = "excluded" if sensible else "unphysical"
         amounts, sigma, in_plane, position, evidence = alone[i]
         out.append(
             Weighed(
                 hypothesis.effect, hypothesis.unit, hypothesis.expected, len(amounts),
                 _size(amounts), float(np.median(sigma)), in_plane, position, given.in_plane,
-                given.position, evidence, random[i], judgement,
+                evidence, random[i], judgement,
             )
         )  # fmt: skip
     return out
 
 
-def _refusal(
-    hypothesis: Hypothesis, alone: "Answer", given: "Answer", base: "Answer", before: "Answer"
-) -> str:
-    best = min(alone.in_plane / base.in_plane, given.in_plane / before.in_plane)
-    unphysical = best < HELPS and not _sensible(hypothesis, given)
-    return "unphysical" if unphysical else "excluded"
-
-
-def _helps(hypothesis: Hypothesis, answer: "Answer", before: "Answer") -> bool:
+def _helps(hypothesis: MissingEffect, answer: "Answer", before: "Answer") -> bool:
     gains = answer.in_plane < HELPS * before.in_plane and answer.evidence > before.evidence
     return gains and _sensible(hypothesis, answer)
 
 
-def control(hypothesis: Hypothesis) -> Hypothesis:
+def control(hypothesis: MissingEffect) -> MissingEffect:
     """Return random parameters of the same number, size and smoothness, unrelated to their columns.
 
     Parameters of single columns are estimated from half of a held-out corrector's BPMs, so any
@@ -184,7 +179,7 @@ def _size(amounts: Array) -> float:
     return float(np.sqrt(np.mean(amounts**2))) if len(amounts) > 1 else float(amounts[0])
 
 
-def _sensible(hypothesis: Hypothesis, answer: "Answer") -> bool:
+def _sensible(hypothesis: MissingEffect, answer: "Answer") -> bool:
     return abs(_size(answer.amounts)) < hypothesis.most
 
 
@@ -205,19 +200,13 @@ class Fitted:
     def __init__(self, state: State) -> None:
         state = replace(state, jitter=None)  # a hypothesis among the others here
         self.state, data = state, state.data
-        there = linear(state, 0)
-        normal, self.start = there.normal, there.start
-        self.slopes = there.by_ring
+        self.there = there = linear(state, 0)
         # a dummy without effect where no family was accepted
-        basis = np.zeros((len(self.start), 1))
-        basis = np.concatenate([basis, *(g.basis for g in there.groups)], axis=1)
-        prior = np.concatenate([np.ones(1), *(g.scale for g in there.groups)])
-        self.spread = basis * prior
-        A = self.spread.T @ normal.matrix @ self.spread
-        self.factor = cho_factor(A + np.eye(len(A)), lower=True)
-        self.vector = self.spread.T @ (normal.vector + normal.matrix @ self.start)
+        dummy = Group("none", np.zeros((len(there.start), 1)), 1.0)
+        found = solve(there.normal, (dummy, *there.groups), there.start, rounds=0)
+        self.spread, self.factor = found.spread, (found.factor, True)
+        self.vector = self.spread.T @ (there.normal.vector + there.normal.matrix @ there.start)
         self.weight = weight(state, 0)
-        self.by_monitor, self.by_column = there.by_monitor, there.by_column
         self.read = data.pick(state.at.read)
         # readings by the monitors' and the columns' own parameters, [reading, parameter]
         columns, monitors = self.weight.shape
@@ -226,41 +215,37 @@ class Fitted:
         by_column = 2 * monitors + reading // monitors
         self.own = csr_array(
             (
-                np.concatenate([self.by_monitor.ravel(), self.by_column.ravel()]),
+                np.concatenate([there.by_monitor.ravel(), there.by_column.ravel()]),
                 (np.tile(reading, 2), np.concatenate([by_monitor, by_column])),
             ),
             shape=(len(reading), 2 * monitors + columns),
         )
         self._parts: dict[int, _Part] = {}
         residual = np.where(self.weight > 0, data.pick(state.at.left), 0.0)
-        self.target = residual + self.change(self.start)
+        self.target = residual + self.change(there.start)
 
     def change(self, values: Array) -> Array:
         """Readings [column, monitor] for a change of the base parameters."""
-        data = self.state.data
-        m, c = 2 * len(data.at), len(data.plane)
-        out = values[:m].reshape(-1, 2)[:, data.plane].T * self.by_monitor
-        out = out + values[m : m + c, None] * self.by_column
-        if len(self.slopes):
-            out = out + np.tensordot(values[m + c :], self.slopes, 1)
-        return np.asarray(out)
+        return self.there.readings(self.state.data.plane, values)
 
     def across(self, flat: Patterns) -> Array:
         """J^T W H, [base parameter, pattern], of patterns [pattern, reading]."""
         weighted = _scaled(flat, self.weight.ravel())
-        ring = self.slopes.reshape(len(self.slopes), self.weight.size).T
+        ring = self.there.by_ring.reshape(-1, self.weight.size).T
         own = _dense(weighted @ self.own)
         return np.concatenate([own, _dense(weighted @ ring)], axis=1).T
 
-    def sees(self, hypothesis: Hypothesis) -> bool:
+    def sees(self, hypothesis: MissingEffect) -> bool:
         """Whether any fitted reading is sensitive to it."""
         return bool(hypothesis.patterns.any() and self._part(hypothesis).flat.shape[0])
 
-    def weigh(self, hypotheses: Sequence[Hypothesis]) -> Answer:
+    def weigh(self, hypotheses: Sequence[MissingEffect]) -> Answer:
         """The scores of these hypotheses together on held-out readings."""
         if not hypotheses:  # the same linear step as with one: the fit itself may still move
             moved = cho_solve(self.factor, self.vector)
-            in_plane, position = self._score(self.change(self.spread @ moved - self.start), None)
+            in_plane, position = self._score(
+                self.change(self.spread @ moved - self.there.start), None
+            )
             return Answer(np.zeros(0), np.zeros(0), in_plane, position, 0.0)
         parts = [self._part(hypothesis) for hypothesis in hypotheses]
         edge = np.cumsum([0, *(part.across.shape[1] for part in parts)])
@@ -292,7 +277,7 @@ class Fitted:
                 scale = float(np.sqrt(np.mean(amounts[mine] ** 2 + variance[mine])))
                 spread[mine] = min(scale, most[i])
         moved = cho_solve(self.factor, self.vector - B @ amounts)
-        change = self.change(self.spread @ moved - self.start)
+        change = self.change(self.spread @ moved - self.there.start)
         for i, (hypothesis, part) in enumerate(zip(hypotheses, parts, strict=True)):
             if not hypothesis.own:
                 change = change + (amounts[owner == i] @ part.flat).reshape(change.shape)
@@ -302,7 +287,7 @@ class Fitted:
         evidence = 0.5 * float(r @ amounts) - float(np.log(np.diag(root[0])).sum())
         return Answer(amounts[last], np.sqrt(variance[last]), rms, jumped, evidence)
 
-    def _part(self, hypothesis: Hypothesis) -> "_Part":
+    def _part(self, hypothesis: MissingEffect) -> "_Part":
         """Patterns to which fitted readings are sensitive."""
         key = id(hypothesis)
         if key not in self._parts:
@@ -337,7 +322,7 @@ class Fitted:
 class _Part:
     """A hypothesis as derivatives of readings, and its products with the fit."""
 
-    hypothesis: Hypothesis
+    hypothesis: MissingEffect
     flat: Patterns  # [pattern, reading]
     across: Array
 

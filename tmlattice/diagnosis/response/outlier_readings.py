@@ -23,6 +23,9 @@ from tmlattice.observe.response_data import ResponseData
 
 NAMED = 3
 """Most BPMs, and correctors, named in a message."""
+DISPERSION = "quadrupole_gradient"
+"""The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
+many times all others, and would bias the BPM gains."""
 OFTEN = 2
 """Outliers of one BPM or corrector from which on it is named."""
 
@@ -106,61 +109,43 @@ def _most(*tables: Counter[str]) -> str:
     return f"; most at {', '.join(most)}" if most else ""
 
 
-def robust(state: State) -> State:
-    """Return the state with a weight of its own for each reading."""
-    return replace(state, share=np.ones((2, *state.data.shape)))
-
-
-def rf_shares(state: State, block: int, left: Array) -> Array:
-    """Return factors on the weights of the RF's orbit, [block, monitor].
-
-    This orbit is read once: a few outliers (zeros where nothing was read, for example) would be
-    fitted by kicks and an energy offset.
-
-    Args:
-        state: of the fit.
-        block: 0 in-plane, 1 coupling.
-        left: residuals, m, NaN where nothing is fitted, [monitor].
-    """
-    own = np.ones((2, len(left))) if state.rf_share is None else state.rf_share.copy()
-    if np.isfinite(left).sum() >= FEW:
-        typical = float(chi2.typical(left))
-        pull = np.nan_to_num(np.abs(left) / np.maximum(state.data.noise_of(block)[-1], typical))
-        own[block] = (SIGNIFICANT / np.maximum(pull, SIGNIFICANT)) ** 4
-    return own
-
-
 def shares(state: State, block: int, left: Array) -> Array:
-    """Return factors on the weights of the correctors' readings, [block, column, monitor].
+    """Return factors on the weights of the readings, [block, column, monitor].
+
+    The RF's orbit is read once: a few outliers (zeros where nothing was read, for example) would be
+    fitted by kicks and an energy offset. Those of correctors count only in the last fit.
 
     Args:
         state: of the fit.
         block: 0 in-plane, 1 coupling.
-        left: residuals, m, NaN where nothing is fitted, [column except the RF, monitor].
+        left: residuals, m, NaN where nothing is fitted, [column, monitor].
     """
-    assert state.share is not None
     out = state.share.copy()
-    pull = np.nan_to_num(np.abs(_pulls(state, block, left)))
-    out[block, :-1] = (SIGNIFICANT / np.maximum(pull, SIGNIFICANT)) ** 2
+    times = SIGNIFICANT / np.maximum(np.abs(_pulls(state, block, left)), SIGNIFICANT)
+    times = np.where(np.isfinite(left), times, 1.0)
+    if state.robust:
+        out[block, :-1] = times[:-1] ** 2
+    if state.allows(DISPERSION) and np.isfinite(left[-1]).sum() >= FEW:
+        out[block, -1] = times[-1] ** 4
     return out
 
 
 def _pulls(state: State, block: int, left: Array) -> Array:
     """Residuals in units of the column's typical one, or of the noise if that is larger."""
     typical = chi2.typical(left, axis=1)
-    return np.asarray(left / np.fmax(state.data.noise_of(block)[:-1], typical[:, None]))
+    return np.asarray(left / np.fmax(state.data.noise_of(block), typical[:, None]))
 
 
 def outlier_readings(state: State) -> list[str]:
     """Return messages about the outliers of a fit; none without any."""
-    if state.share is None:
+    if not state.robust:
         return []
     messages = _odd_rf(state)
     measured, monitors, correctors = state.data.measured, Counter[str](), Counter[str]()
     count = total = 0
     for block in (0, 1):
         left = np.where(state.fitted[:, None] & state.good, state.data.pick(state.at.left, block),
-                        np.nan)[:-1]  # fmt: skip
+                        np.nan)  # fmt: skip
         out = np.nan_to_num(np.abs(_pulls(state, block, left))) > SIGNIFICANT
         count, total = count + int(out.sum()), total + int(np.isfinite(left).sum())
         monitors.update(measured.monitors[i] for i in np.nonzero(out)[1])
@@ -176,9 +161,7 @@ def outlier_readings(state: State) -> list[str]:
 
 def _odd_rf(state: State) -> list[str]:
     """A message about outliers of the RF's orbit."""
-    if state.rf_share is None:
-        return []
-    odd = np.flatnonzero((state.rf_share < 1).any(axis=0) & state.good)
+    odd = np.flatnonzero((state.share[:, -1] < 1).any(axis=0) & state.good)
     if not len(odd):
         return []
     names = first_of([state.data.measured.monitors[i] for i in odd])

@@ -19,8 +19,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import (
     dispersion_beside,
@@ -58,17 +58,15 @@ from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.stepwise import (
     StepwiseFit,
-    all_families,
     fit_chi2,
-    needed_families,
+    fit_steps,
 )
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
 from tmlattice.effects import Cause, apply, find, names
 from tmlattice.errors import MeasurementError
-from tmlattice.inference import chi2
-from tmlattice.inference.judgement import DEFAULT, Judgement
+from tmlattice.inference.judgement import DEFAULT, ENOUGH, SIGNIFICANT, Judgement
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
@@ -78,12 +76,8 @@ from tmlattice.observe.response_problem import single_causes
 from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
 
-Array = NDArray[np.float64]
-
 PATTERNS = 8
 """Number of the strongest patterns of the residual."""
-TYPICAL = 6
-"""Fewest columns of a plane for the typical one."""
 LARGE = 60_000
 """Most readings for the search for single faults among distributed errors, which refits all."""
 TOO_LARGE = (
@@ -191,22 +185,19 @@ def _families(
 ) -> tuple[StepwiseFit, OrbitResponse, list[Label]]:
     """The hierarchical fit of the corrected measurement, that measurement, and all labels.
 
-    Swaps are corrected, and rejected channels are removed, by the design, by the fit of all
-    families, and by that of the needed ones, until there are no new ones."""
+    Swaps are corrected, and rejected channels are removed, by the design, then by the fit, until
+    there are no new ones."""
     known: list[Label] = []
     while True:
         data = response_data(ring, measured)
         split = split_columns(data, holdout, np.random.default_rng(seed))
         found = _wrong(begin(data, split), known, of_design=True)
         if not found:
-            started = all_families(data, split, trials, progress)
-            swapped = [own for own in started.labels if own.kind == "swapped correctors"]
-            found = [*new(swapped, known), *_wrong(started.state, known)]
+            fit = fit_steps(data, split, trials, most, progress)
+            swapped = [own for own in fit.labels if own.kind == "swapped correctors"]
+            found = [*new(swapped, known), *_wrong(fit.state, known)]
             if not found:
-                fit = needed_families(started, most, progress)
-                found = _wrong(fit.state, known)
-            if not found:
-                return fit, measured, [*known, *started.labels]
+                return fit, measured, [*known, *fit.labels]
         known += found
         measured = corrected(measured, found)
 
@@ -219,7 +210,7 @@ def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> lis
     names = [own.elements[0] for own in gone if own.kind == "rejected BPM"]
     good = state.good & ~np.isin(state.data.measured.monitors, names)
     there = replace(state, good=good)
-    far = of_design and (strange(there, TYPICAL) > FAR or first_guess(there) is not None)
+    far = of_design and (strange(there, ENOUGH) > FAR or first_guess(there) is not None)
     return new([*([] if far else swaps(state, gone)), *swapped_planes(state)], known) or gone
 
 
@@ -239,11 +230,11 @@ def _faults(
              if own.kind == "swapped planes"]  # fmt: skip
     hypotheses = single_causes(state.data, effects)
     if hypotheses and state.data.measured.response.size <= LARGE:
-        alone = detected_faults(
+        apart, alone = detected_faults(
             state.data, state.split, state, hypotheses, most, judgement, progress
         )
-        fit = given_faults(fit, alone.state.apart) if alone.faults else fit
-        found += [fault.finding(ring, judgement) for fault in alone.faults]
+        fit = given_faults(fit, apart) if apart else fit
+        found += alone
     of_labels = (own.finding(ring) for own in labels)
     found = [*strongest_first(found)[:most], *(own for own in of_labels if own is not None)]
     return fit, strongest_first(found)
@@ -354,8 +345,8 @@ def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> 
 def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
     """`none` if the design's residual is noise, of fitted and held-out readings, in-plane, coupling
     and RF; else `distributed`."""
-    messages = (*fit_chi2(fit.design), *fit.heldout[0].chi2)
-    chances = [chi2.sf(own.total, own.readings) for own in messages if own.readings]
+    blocks = (*fit_chi2(fit.design), *fit.steps[0].compared)
+    chances = [own.p_value for own in blocks if own.freedom]
     return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
@@ -379,10 +370,10 @@ def _gap(fit: StepwiseFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
     # in units of each reading's noise: the planes differ in it
     before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
-    seen = fit.heldout[0].chi2[0]  # a gap below five sigma of the noise is not significant
-    there = before > 0 and seen.total - seen.readings > 5 * np.sqrt(2 * seen.readings)
+    seen = fit.steps[0].compared[0]  # a gap below this many sigma of the noise is none
+    there = before > 0 and seen.chi2 - seen.freedom > SIGNIFICANT * np.sqrt(2 * seen.freedom)
     explained = 1 - after / before if there and len(misfits) > 1 else None
-    return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, seen.readings)
+    return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, int(seen.freedom))
 
 
 def _patterns(fit: StepwiseFit) -> dict[str, Any]:

@@ -89,11 +89,8 @@ class _Sum:
         data = state.data
         self.left = data.pick(state.at.left, block)
         # outliers count in the fit, and here, as if their noise were larger
-        share = np.ones_like(self.left) if state.share is None else state.share[block].copy()
-        if state.rf_share is not None:
-            share[-1] *= state.rf_share[block]
         with np.errstate(divide="ignore"):
-            self.noise = data.noise_of(block) / np.sqrt(share)
+            self.noise = data.noise_of(block) / np.sqrt(state.share[block])
         self.square, self.readings = 0.0, 0
         size = 0 if found is None or more is None else len(found.prior) + more.shape[1]
         self.vector, self.matrix = np.zeros(size), np.eye(size)

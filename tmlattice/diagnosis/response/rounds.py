@@ -9,18 +9,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import log_scale, look, weighed, weight
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.normal import Posterior, solve
 from tmlattice.inference.priors import Group
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
@@ -31,27 +27,20 @@ GAIN = 3e-3
 EACH = 4
 """Iterations of EM for the prior scales in a round."""
 LEARN = 10
-"""Iterations of EM for the evidence: prior scales of absent errors fall slowly."""
+"""Iterations of EM for prior scales alone: those of absent errors fall slowly."""
 RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
-"""Repetitions of a diverged round; divisor of the step bounds then; their growth, and its limit."""
+"""Repetitions of a diverged round, and of a step that crosses lower bounds; divisor of the step
+bounds of a diverged round; their growth, and its limit."""
 CORRECTED, CORRECTS = 6, 1e-3
 """Corrections of a step by the residuals at its end, with the derivatives at its start; and the
 relative fall of the cost required for another one. Correlated numbers follow a curved valley of the
 cost, which its tangent leaves."""
-HELD = 4
-"""Iterations that fix numbers at their lower bounds and solve for the rest."""
 
 
-class Moved(NamedTuple):
-    """A state after a round, and the cost before and after it."""
-
-    state: State
-    before: float
-    after: float
-
-
-def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Moved:
-    """Solve the readings of one block, and move.
+def one_round(
+    state: State, block: int, there: Linear, bold: float = 1.0
+) -> tuple[State, float, float]:
+    """Solve the readings of one block, and move. Return the state, and the cost before and after.
 
     Args:
         state: the start.
@@ -72,7 +61,7 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         )
         return float(np.sum(left * weighed(state, block, left))) + penalty
 
-    best, aim = Moved(learnt, cost(state), np.inf), found.values
+    best, last, aim = learnt, np.inf, found.values
     for _ in range(CORRECTED + 1):
         values = {name: np.maximum(aim[at], there.lowest[at]) for name, at in there.where.items()}
         then = learnt.moved({**state.values, **values})
@@ -80,10 +69,10 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
             after = cost(then)
         except UnstableRingError:  # diverged: no closed orbit
             break
-        last = best.after
+        gained = after <= (1 - CORRECTS) * last
         if after <= last:
-            best = best._replace(state=then, after=after)
-        if after > (1 - CORRECTS) * last:
+            best, last = then, after
+        if not gained:
             break
         # the score there, with the derivatives of the start
         moved = np.zeros_like(there.start)
@@ -96,13 +85,13 @@ def one_round(state: State, block: int, there: Linear, bold: float = 1.0) -> Mov
         further = aim - before
         if further @ there.normal.matrix @ further < CORRECTS * after:
             break  # linear enough
-    return best
+    return best, cost(state), last
 
 
 def bounded_step(there: Linear, bold: float) -> Posterior:
     """The bounded step, with numbers fixed at their lower bounds where it would cross them."""
     groups, trust = there.groups, bold * there.trust
-    for _ in range(HELD):
+    for _ in range(RETRIES):
         found = solve(there.normal, groups, there.start, trust, rounds=EACH)
         low = found.values < there.lowest
         if not low.any():
@@ -179,15 +168,15 @@ def settle(
             there = linear(state, block)
             state = replace(state, kept={**state.kept, **there.kept})
             for _ in range(RETRIES):
-                moved = one_round(state, block, there, bold[block])
-                if moved.after <= moved.before:
+                moved, before, after = one_round(state, block, there, bold[block])
+                if after <= before:
                     break
                 bold[block] /= ASTRAY
-            if moved.after > moved.before:
+            if after > before:
                 continue
             bold[block] = min(BOLDER * bold[block], BOLDEST)
-            gained = max(gained, (moved.before - moved.after) / max(moved.after, 1e-300))
-            state = moved.state
+            gained = max(gained, (before - after) / max(after, 1e-300))
+            state = moved
             for seen in (0, 1):
                 if state.of_block(seen):
                     state = look(state, seen)

@@ -33,7 +33,7 @@ from tmlattice.diagnosis.families.steps import (
     MonitorRoll,
 )
 from tmlattice.diagnosis.response.linear import Linear
-from tmlattice.diagnosis.response.rounds import log_evidence, settle
+from tmlattice.diagnosis.response.rounds import LEARN, log_evidence, settle
 from tmlattice.diagnosis.response.state import State, allow, begin, bend, jump
 from tmlattice.diagnosis.response.stepwise import ROUGH, fit_chi2
 from tmlattice.effects import find
@@ -53,8 +53,6 @@ USUAL: tuple[Family, ...] = (
 """Families of every ring."""
 ANEW = 20_000
 """Most readings for a second fit, from the design, because the given one may be of a wrong ring."""
-SIZES = 12
-"""Rounds of EM for the prior scales."""
 SHARED = {
     "vertical_focusing": "vertical_focusing",
     "quadrupole_gradient of families": "quadrupole_gradient",
@@ -87,7 +85,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
             continue
         found.append((log_evidence(state, state.good), state))
         log.info("distributed errors: evidence %.1f", found[-1][0])
-        if all(own.per_reading < MISSING for own in fit_chi2(state)[:2]):
+        if all(own.ratio**2 < MISSING for own in fit_chi2(state)[:2]):
             break
     return max(found, key=lambda one: one[0])[1] if found else continued
 
@@ -130,7 +128,7 @@ def sizes_in(there: Linear) -> tuple[Group, ...]:
     """Return the priors of a fit with scales from all numbers but each family's largest."""
     groups = [replace(group, each=None, freedom=np.inf) for group in there.groups]
     pull = there.normal.vector + there.normal.matrix @ there.start
-    for _ in range(SIZES):
+    for _ in range(LEARN):
         found = solve(there.normal, groups, there.start, rounds=0)
         scale = np.concatenate([group.scale for group in groups])
         amounts = found.covariance @ (found.spread.T @ pull)

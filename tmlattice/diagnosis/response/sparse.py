@@ -19,7 +19,7 @@ from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import StepwiseFit
 from tmlattice.diagnosis.response.undetermined import Blur, Undetermined
-from tmlattice.diagnosis.response.validation import Step, score
+from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect
@@ -28,6 +28,7 @@ from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection, leading
 from tmlattice.inference.judgement import BEYOND, Judgement
 from tmlattice.inference.newton import AGAIN, ITERATIONS, Fit, fit
+from tmlattice.inference.problem import Problem
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Identified, Search, explain
 from tmlattice.observe.orbit_response import Hypothesis, Predicted
@@ -82,17 +83,6 @@ class SparseFit:
     noise: bool
 
 
-@dataclass(frozen=True)
-class _Search(Search):
-    """A search for one cause first, and for more where one is not sufficient.
-
-    Attributes:
-        stated: chi-square that the stated noise leaves at most.
-    """
-
-    stated: float = -np.inf
-
-
 def sparse_fit(
     data: ResponseData,
     split: Split,
@@ -131,17 +121,19 @@ def sparse_fit(
     before = fit(problem, (), problem.first)
     count = int(problem.used.sum())
     gap = max(before.chi2 - count, 1.0)
-    stated = float(chi2.isf(judgement.noise[1], count))
-    enough = max(stated, min(MISSING * count, count + REST * gap))
-    search = _Search(
-        problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress,
-        stated=stated,
-    )  # fmt: skip
+    enough = max(_noise_alone(problem), min(MISSING * count, count + REST * gap))
+    search = Search(
+        problem, hypotheses, 1, unnamed=False, enough=enough, seed=seed, progress=progress
+    )
     try:
         found = _explained(search, problem, before, gap)
     except UnstableRingError:  # the sparse solution stores no beam
         found = None
-    if open_ is not None and open_.root.size and open_.size(problem) <= AT_ONCE:
+    if (
+        open_ is not None
+        and open_.root.size
+        and len(open_.hypotheses) * problem.used.size <= AT_ONCE
+    ):
         found = _among_open(search, problem, before, found, open_)
     if found is None:
         return None
@@ -155,13 +147,13 @@ def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bo
     if sparse.fit.p_value < judgement.noise[0] <= fit.p_value:
         return True
     state = sparse.fit.state
-    of_all = fit.heldout[1]
-    of_few = score(replace(state, good=fit.state.good), state.split.held)
-    gained = np.log([of_all.in_plane / of_few.in_plane, of_all.coupling / of_few.coupling])
+    of_all, of_few = fit.steps[-1], score(replace(state, good=fit.state.good), "sparse")
+    gained = np.log([of_all.heldout_rms_in_plane / of_few.heldout_rms_in_plane,
+                     of_all.heldout_rms_coupling / of_few.heldout_rms_coupling])  # fmt: skip
     return bool(np.nansum(gained) < np.log(HELPS))
 
 
-def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> Explanation | None:
+def _explained(search: Search, problem: Response, before: Fit, gap: float) -> Explanation | None:
     """The sparse solution in the known ring; None where there is none."""
     if _hopeless(problem, search.hypotheses, before, MOST, search.enough):
         return None
@@ -175,17 +167,22 @@ def _explained(search: _Search, problem: Response, before: Fit, gap: float) -> E
     return None if found.fit.chi2 > search.enough else _and_more(search, before, found)
 
 
-def _and_more(search: _Search, before: Fit, found: Explanation) -> Explanation:
+def _and_more(search: Search, before: Fit, found: Explanation) -> Explanation:
     """The solution with further causes, if the residual together is noise of the stated size."""
     try:
         more = explain(replace(search, most=MOST, enough=-np.inf), before, found)
     except UnstableRingError:  # one of them stores no beam
         return found
-    return more if more.fit.chi2 <= search.stated else found
+    return more if more.fit.chi2 <= _noise_alone(search.problem) else found
+
+
+def _noise_alone(problem: Problem) -> float:
+    """Chi-square that the stated noise leaves at most."""
+    return float(chi2.isf(problem.judgement.noise[1], int(problem.valid.sum())))
 
 
 def _among_open(
-    search: _Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
+    search: Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
 ) -> Explanation | None:
     """The solution given undetermined errors of the ring, if more probable; else `found`."""
     seen = found.first if found else scan(
@@ -232,7 +229,7 @@ def _among_open(
     return more if several else one
 
 
-def _unsure(search: _Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
+def _unsure(search: Search, blur: Blur, found: Explanation) -> tuple[Explanation, float]:
     """The search repeated given undetermined errors; its log evidence, -inf if it fails."""
     evidence = -np.inf
     for _ in range(AGAIN):
@@ -304,16 +301,15 @@ def _result(
         replace(found, full=False), findings, p_value, False, judgement
     )
     design = begin(data, split)
-    steps = [Step.scored("design", 0, score(design, split.held))]
+    steps = [score(design, "design")]
     state = design
     for i, cause in enumerate(causes, 1):
         state = replace(design, at=base.with_causes(causes[:i]))
         name = f"{cause.effect} {cause.element or ''}".rstrip()
-        steps.append(Step.scored(name, 1, score(state, split.held)))
-    heldout = (score(design, split.held), score(state, split.held))
+        steps.append(score(state, name, 1))
     covariance = found.fit.covariance
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    stepwise = StepwiseFit(design, state, tuple(steps), (), heldout)
+    stepwise = StepwiseFit(design, state, tuple(steps), ())
     fitted_causes = list(zip(causes, errors, strict=True))
     expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
     noise = expected and stepwise.p_value >= judgement.noise[0]

@@ -12,11 +12,12 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.families.family import Family
+from tmlattice.effects import find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW
 from tmlattice.inference.priors import SCALE_SPREAD, Group
-from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
 
@@ -27,28 +28,36 @@ ALONE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Apart:
-    """A single fault as numbers of one variable, with a prior of its own: it does not change the
-    scale of their family.
+class Candidate:
+    """A candidate for a single fault. Once detected, its numbers have a prior of their own, so that
+    it does not change the scale of their family.
 
     Attributes:
         cause: effect and place.
-        variable: of the numbers.
-        block: 0 in-plane, 1 coupling.
-        members: the numbers for a unit of the cause's amount, [number].
-        wide: prior rms of the amount.
+        block: 0 in-plane, 1 coupling; None: both, by its signature.
+        variable: of its numbers.
+        members: the numbers for a unit of its amount, [number].
     """
 
-    cause: tuple[str, str | None]
-    variable: str
-    block: int
-    members: Array
-    wide: float
+    cause: Hypothesis
+    block: int | None = None
+    variable: str = ""
+    members: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def name(self) -> str:
         """The name of its prior."""
         return f"alone: {self.cause[0]} {self.cause[1]}"
+
+    @property
+    def wide(self) -> float:
+        """Prior rms of its amount."""
+        return find(self.cause[0]).largest
+
+    @property
+    def unit(self) -> Array:
+        """Its amount is the product of its numbers and this, [number]."""
+        return np.asarray(self.members / (self.members @ self.members))
 
 
 class Kept(NamedTuple):
@@ -75,9 +84,9 @@ class State:
         groups: the families' priors with learnt scales, by name.
         exploring: the inner validation correctors are not fitted, and select families.
         kept: derivatives by the ring's variables, used until the ring has moved.
-        share: factors on the weights, [block, column, monitor]; None: all 1.
-        rf_share: factors on the weights of the RF's readings, [block, monitor]; None: all 1.
-        apart: single faults.
+        share: factors on the weights, less for outliers, [block, column, monitor].
+        robust: whether outliers among the correctors' readings have less weight, too.
+        apart: detected single faults.
         independent: effective sample size as a share of the readings, see `independent`, [block,
             plane that is read]; None: all 1.
         jitter: orbits of beam jitter, of typical amplitude, m, [plane that is read, pattern,
@@ -91,15 +100,15 @@ class State:
     split: Split
     at: Predicted
     lacking: Array
+    share: Array
     good: Flags
     families: tuple[Family, ...] = ()
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
     exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
-    share: Array | None = None
-    rf_share: Array | None = None
-    apart: tuple[Apart, ...] = ()
+    robust: bool = False
+    apart: tuple[Candidate, ...] = ()
     independent: Array | None = None
     jitter: Array | None = None
     guessed: float = SCALE_SPREAD
@@ -138,8 +147,9 @@ def begin(data: ResponseData, split: Split) -> State:
     gap = data.pick(at.left)[~split.held]
     size = float(chi2.typical(gap))
     return State(
-        data, split, at, np.full((2, data.shape[0]), size), np.ones(data.shape[1], dtype=bool)
-    )
+        data, split, at, lacking=np.full((2, data.shape[0]), size),
+        share=np.ones((2, *data.shape)), good=np.ones(data.shape[1], dtype=bool),
+    )  # fmt: skip
 
 
 def bend(state: State) -> State:
@@ -252,7 +262,7 @@ def jump(state: State, beyond: float | None = None) -> State:
 
 def rms_of(parts: Iterable[Array]) -> float:
     """Return the rms of all entries; NaN without any."""
-    values = np.concatenate(list(parts))
+    values = np.concatenate([np.zeros(0), *parts])
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.response.linear import Linear, linear
-from tmlattice.diagnosis.response.state import Apart, State, allow
+from tmlattice.diagnosis.response.state import Candidate, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import errors
 from tmlattice.inference.errors import MAX_MEMBERS, LinearFit, Rows, cluster_robust_errors, moments
@@ -77,7 +77,7 @@ def of_sizes(state: State, block: int, there: Linear) -> Array:
     return more[: len(there.start)]  # without the rejected families
 
 
-def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> float:
+def doubt(state: State, one: Candidate, there: Linear, posterior: Posterior) -> float:
     """Return the factor by which the variance of a single fault's amount grows by columns or BPMs
     that contradict all others.
 
@@ -90,6 +90,7 @@ def doubt(state: State, one: Apart, there: Linear, posterior: Posterior) -> floa
     along = one.wide * posterior.spread @ posterior.covariance[:, [at]]
     variance = one.wide**2 * posterior.covariance[[at], at]
     found = LinearFit(there.normal.matrix, posterior.whole, along, variance)
+    assert one.block is not None
     (sigma,) = _widened(state, one.block, there, posterior, found)
     return float(sigma**2 / variance[0])
 
@@ -100,9 +101,7 @@ def _widened(
     data = state.data
     rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.by_ring)
     weights = weight(state, block)
-    left = np.where(weights > 0, data.pick(state.at.left, block), 0.0)
-    moved = posterior.values - there.start  # rounds end before full precision
-    for column in np.flatnonzero(weights.any(axis=1)):
-        seen = np.flatnonzero(weights[column])
-        left[column, seen] -= rows.times(np.full(len(seen), column), seen, moved[:, None])[:, 0]
+    # rounds end before full precision
+    moved = there.readings(rows.plane, posterior.values - there.start)
+    left = np.where(weights > 0, data.pick(state.at.left, block) - moved, 0.0)
     return cluster_robust_errors(rows, weights, left, found, taken(state, block))

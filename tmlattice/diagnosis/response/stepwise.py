@@ -14,20 +14,24 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.assessment import Block, combined_p_value
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
 from tmlattice.diagnosis.response.labels import Label, label_messages
-from tmlattice.diagnosis.response.linear import Linear, linear
-from tmlattice.diagnosis.response.outlier_readings import gross, robust, told_gross
+from tmlattice.diagnosis.response.linear import Linear, linear, rf_by_others
+from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.outlier_steps import outlier_steps, rejected, without_readings
 from tmlattice.diagnosis.response.remainder import remainder
-from tmlattice.diagnosis.response.rf_by_others import rf_by_others
-from tmlattice.diagnosis.response.rounds import Evidence, evidence_of, linear_evidence, settle
-from tmlattice.diagnosis.response.set_aside import taken_back
+from tmlattice.diagnosis.response.rounds import (
+    Evidence,
+    evidence_of,
+    linear_evidence,
+    log_evidence,
+    settle,
+)
 from tmlattice.diagnosis.response.state import (
     State,
     allow,
@@ -38,8 +42,6 @@ from tmlattice.diagnosis.response.state import (
 )
 from tmlattice.diagnosis.response.validation import (
     WORTH,
-    Chi2,
-    Score,
     Step,
     against,
     in_favour,
@@ -47,13 +49,12 @@ from tmlattice.diagnosis.response.validation import (
     lost,
     score,
 )
+from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.errors import TmlatticeError
+from tmlattice.inference.judgement import GROSS
 from tmlattice.inference.normal import Posterior
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.split import Split
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 log = logging.getLogger(__name__)
 
@@ -72,19 +73,16 @@ FIRST, ROUGH = 4, 0.03
 required for another one."""
 
 
-def fit_chi2(state: State) -> tuple[Chi2, Chi2, Chi2]:
-    """Return chi-square of the fitted readings by their noise alone: in-plane, coupling, RF."""
-    data = state.data
-    out = []
-    use = ~state.split.held
-    for block in (0, 1):
-        pull = data.pick(state.at.left, block) / data.noise_of(block)
-        squares = (pull[:-1][use[:-1]][:, state.good]) ** 2
-        out.append(Chi2(float(np.nansum(squares)), int(np.isfinite(squares).sum())))
-        if block == 0:
-            rf = pull[-1][state.split.half[-1] & state.good] ** 2
-    out.append(Chi2(float(np.nansum(rf)), int(np.isfinite(rf).sum())))
-    return out[0], out[1], out[2]
+def fit_chi2(state: State) -> tuple[Block, ...]:
+    """Return the fitted readings by their noise alone: in-plane, coupling, RF."""
+    data, fitted = state.data, ~state.split.held[:-1]
+    pulls = [data.pick(state.at.left, block) / data.noise_of(block) for block in (0, 1)]
+    own = [pull[:-1][fitted][:, state.good] for pull in pulls]
+    own.append(pulls[0][-1][state.split.half[-1] & state.good])
+    return tuple(
+        Block(name, float(np.nansum(pull**2)), int(np.isfinite(pull).sum()))
+        for name, pull in zip(("in-plane", "coupling", "RF"), own, strict=True)
+    )
 
 
 # --- the steps ------------------------------------------------------------------------------------
@@ -96,7 +94,6 @@ class StepwiseFit:
         design, state: before and after.
         steps: accepted; the first is the design's, the last the result's.
         rejected_steps: did not improve the fit.
-        heldout: validation scores of the design and of the result.
         messages: about rejected readings, implausible families and beam jitter.
         labels: of rejected steps.
     """
@@ -105,7 +102,6 @@ class StepwiseFit:
     state: State
     steps: tuple[Step, ...]
     rejected_steps: tuple[Step, ...]
-    heldout: tuple[Score, Score]
     messages: tuple[str, ...] = ()
     labels: tuple[Label, ...] = ()
 
@@ -129,49 +125,13 @@ def fit_steps(
 ) -> StepwiseFit:
     """Return the fit of all families that are needed, to all correctors except the held-out ones.
 
-    Args:
-        data, split, trials, progress: see `all_families`.
-        most: most accepted steps.
-    """
-    return needed_families(all_families(data, split, trials, progress), most, progress)
-
-
-@dataclass(frozen=True, eq=False)
-class AllFamilies:
-    """The fit of all families, before the unneeded ones are removed.
-
-    Attributes:
-        design, state: before and after, without rejected readings.
-        stages: the state after each trial was added, with these readings.
-        rejected: readings, [column, monitor, plane that is read].
-        labels: of outlier steps.
-        messages: about rejected readings.
-        doubts: about implausible families.
-    """
-
-    design: State
-    state: State
-    stages: dict[Trial, State]
-    rejected: Flags
-    labels: tuple[Label, ...]
-    messages: tuple[str, ...]
-    doubts: tuple[str, ...]
-
-
-def all_families(
-    data: ResponseData,
-    split: Split,
-    trials: Sequence[Trial] = STEPS,
-    progress: Callable[[str], Any] = lambda stage: None,
-) -> AllFamilies:
-    """Return the fit of all families, without outliers.
-
     Families need one another: BPM gains improve nothing before the gradients, for example. So all
-    are fitted together, and each is tested by the loss without it, with the others fitted again.
+    are fitted together, without outliers, and each is tested by the loss without it.
 
     Args:
         data, split: the data, and the validation split.
         trials: families, in the order in which they are added.
+        most: most accepted steps.
         progress: called with each step's name.
     """
     design = begin(data, split)
@@ -182,49 +142,34 @@ def all_families(
         more, labels = _outliers(state)
         single = single | more
     progress("all together")
-    state, doubts = _together(without_readings(state, single | rejected(state, labels)), stages)
+    state, notes = _together(without_readings(state, single | rejected(state, labels)), stages)
     log.info("effective sample size per reading: %s", state.independent)
     more, later = _outliers(state)  # typical residuals are smaller now
     single, labels = single | more, [*labels, *later]
     odd = single | rejected(state, labels)
-    return AllFamilies(
-        without_readings(design, odd), without_readings(state, odd), stages, odd, tuple(labels),
-        (*told_gross(data, single, "the fit"), *label_messages(labels)), tuple(doubts),
-    )  # fmt: skip
-
-
-def needed_families(
-    started: AllFamilies, most: int, progress: Callable[[str], Any] = lambda stage: None
-) -> StepwiseFit:
-    """Return the fit of the families that are needed.
-
-    Args:
-        started: the fit of all families.
-        most: most accepted steps.
-        progress: called with each step's name.
-    """
-    design, labels = started.design, started.labels
-    state, moving = _beside_jitter(started.state, progress)
-    split = state.split
-    before = score(design, split.held)
+    design, state = (without_readings(own, odd) for own in (design, state))
+    notes = [*told_gross(data, single, "the fit"), *label_messages(labels), *notes]
+    state, moving = _beside_jitter(state, progress)
+    before = score(design, "design")
     steps = {
-        trial: Step.scored(
-            _title(trial), sum(family.count(state.data) for family in trial.families),
-            score(without_readings(own, started.rejected), split.held),
+        trial: score(
+            without_readings(own, odd),
+            _title(trial),
+            sum(family.count(state.data) for family in trial.families),
         )
-        for trial, own in started.stages.items()
-    }  # fmt: skip
-    started.stages.clear()  # of many readings, they are large
+        for trial, own in stages.items()
+    }
+    stages.clear()  # of many readings, they are large
     state, gone, others = _needed(state, steps, most, progress)
     rejected_steps = [replace(steps.pop(own), kept=False) for own in gone]
-    notes = [*started.messages, *started.doubts, *others]
+    notes += others
     validated = inner(state)
     enough = int(np.sum(validated.columns[:, 0, 1] > 0)) >= ENOUGH
     worse = -lost(inner(replace(design, jitter=state.jitter)), validated)[0]
     nothing = StepwiseFit(
-        design, design, (Step.scored("design", 0, before),),
+        design, design, (before,),
         (*rejected_steps, *(replace(step, kept=False) for step in steps.values())),
-        (before, before), tuple(notes), labels,
+        tuple(notes), tuple(labels),
     )  # fmt: skip
     if enough and worse > SPOILT:  # together they worsen the validation
         return nothing
@@ -234,7 +179,7 @@ def needed_families(
     if moving is not None:
         moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
-    state = taken_back(settle(robust(state)))
+    state = taken_back(settle(replace(state, robust=True)))
     for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since
         notes += _doubts(state, trial)
         state = _without(state, trial)
@@ -246,12 +191,11 @@ def needed_families(
             "lattice may be too far from the ring, and no effect is reported"
         )
         return replace(nothing, messages=(*nothing.messages, diverged))
-    after = score(state, split.held)
-    kept = [Step.scored("design", 0, before), *steps.values()]
-    kept[-1] = Step.scored(kept[-1].effect, kept[-1].parameters, after)
+    kept = [before, *steps.values()]
+    kept[-1] = score(state, kept[-1].effect, kept[-1].parameters)
     notes += [] if moving is None else [moving.sentence]
     return StepwiseFit(
-        design, state, tuple(kept), tuple(rejected_steps), (before, after), tuple(notes), labels
+        design, state, tuple(kept), tuple(rejected_steps), tuple(notes), tuple(labels)
     )
 
 
@@ -328,6 +272,33 @@ def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
             return settled, doubts
         doubts += _doubts(settled, doubted[-1])
         state = forbid(state, doubted[-1].families)
+
+
+def taken_back(state: State) -> State:
+    """Return the converged state with the rejected neighbours that agree with the fit.
+
+    Sound BPMs next to a magnet with a large error contradict all others, and without them the error
+    cannot be found. A broken BPM has no rejected neighbours.
+    """
+    aside = ~state.good & good_monitors(state, bad=GROSS)
+    together = aside & (np.roll(aside, 1) | np.roll(aside, -1))
+    if not together.any():
+        return state
+    good = state.good | together
+    trial = settle(replace(state, good=good), look_at_monitors=False)
+    sound = good_monitors(trial) & good_monitors(trial, 1)
+    back = together & sound
+    lost = log_evidence(state, state.good, state.independent) - log_evidence(
+        trial, state.good, state.independent
+    )
+    orbits = state.data.pick(state.data.orbits)[state.fitted]
+    readings = int(np.isfinite(orbits[:, back]).sum())
+    # each regained reading may cost a standard error
+    log.info("rejected neighbours: %s, sound: %s; evidence of the others falls by %.1f",
+             np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
+    if not back.any() or (state.good & ~sound).any() or lost > readings / 2:
+        return state
+    return settle(replace(trial, good=state.good | back))
 
 
 def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:

@@ -3,50 +3,95 @@
 >>> seen = Seen(state, suspects_of(state, single_causes(state.data)))
 
 A cause that is one number of a family (a quadrupole's gradient, a gain, a roll), or a sum of some
-(a supply), is in the normal equations already. Others are compared by their signatures; the usual
-errors of their effect, of which the fit has no family, reduce their statistics.
+(a supply), is in the normal equations already. Others (a misaligned sextupole, a device) are
+compared by their signatures; the usual errors of their effect, of which the fit has no family,
+reduce their statistics. Once detected, they are numbers, too (`with_number`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
 from tmlattice.arrays import REDUNDANT, Array
+from tmlattice.diagnosis.families.family import RingFamily
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient, SkewGradient
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
-from tmlattice.diagnosis.response.others import KINDS
 from tmlattice.diagnosis.response.small_errors import sizes_in
-from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.state import Candidate, State
 from tmlattice.diagnosis.response.weights import weighed, weight
 from tmlattice.effects import RingEffect, find
 from tmlattice.effects.quadrupoles import FamilyGradient
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import Group
 from tmlattice.observe.orbit_response import Hypothesis
+from tmlattice.observe.response_data import ResponseData
 
 AFFORDABLE = 4e9
 """Most products of signatures and derivatives; above it only numbers of families are compared."""
 
 
+# --- causes without a family ----------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
-class Suspect:
-    """One candidate for a fault.
+class _Others(RingFamily):
+    """Causes of one number each; their priors are those of single faults.
 
     Attributes:
-        cause: effect and place.
-        block: 0 in-plane, 1 coupling; None: both, by its signature.
-        variable: of its numbers.
-        members: the numbers for a unit of its amount, [number].
+        causes: effect and place.
     """
 
-    cause: Hypothesis
-    block: int | None = None
-    variable: str = ""
-    members: Array | None = None
+    causes: tuple[Hypothesis, ...] = ()
+
+    trust, effects = 0.03, ()
+    name: ClassVar[str]
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """None: each number has the prior of its single fault."""
+        return []
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """Each number is in units of its effect's largest fault."""
+        return [{cause: find(cause[0]).largest} for cause in self.causes]
 
 
-def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Suspect]:
+class OthersInPlane(_Others):
+    """Causes whose amount the plane of the kick determines."""
+
+    name, block, variable = "others in-plane", 0, "others in-plane"
+
+
+class OthersAcross(_Others):
+    """Causes whose amount the other plane determines."""
+
+    name, block, variable = "others across", 1, "others across"
+
+
+KINDS: tuple[Any, ...] = (OthersInPlane, OthersAcross)
+
+
+def with_number(state: State, cause: Hypothesis, block: int) -> State:
+    """The state with one more number, at zero."""
+    kind = KINDS[block]
+    have = next((f.causes for f in state.families if isinstance(f, kind)), ())
+    if cause in have:
+        return state
+    families = [f for f in state.families if not isinstance(f, kind)]
+    values = np.append(state.values.get(kind.variable, np.zeros(0)), 0.0)
+    apart = tuple(
+        replace(one, members=np.append(one.members, 0.0)) if one.variable == kind.variable else one
+        for one in state.apart
+    )
+    return replace(
+        state,
+        apart=apart,
+        families=(*families, kind((*have, cause))),
+        values={**state.values, kind.variable: values},
+    )
+
+
+# --- candidates -----------------------------------------------------------------------------------
+def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Candidate]:
     """Return the suspects of causes that the readings may determine."""
     numbers = _numbers(state)
     found, signed = [], []
@@ -55,9 +100,9 @@ def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Suspect]:
             block, variable, at, share = numbers[cause]
             members = np.zeros(len(state.values[variable]))
             members[at] = share
-            found.append(Suspect(cause, block, variable, members))
+            found.append(Candidate(cause, block, variable, members))
         elif cause[1] is not None and isinstance(find(cause[0]), RingEffect):
-            signed.append(Suspect(cause))
+            signed.append(Candidate(cause))
     size = sum(len(values) for values in state.values.values())
     if len(signed) * state.data.orbits.size * size <= AFFORDABLE:
         found += signed
@@ -165,7 +210,7 @@ class Seen:
         suspects: to be compared.
     """
 
-    def __init__(self, state: State, suspects: Sequence[Suspect]) -> None:
+    def __init__(self, state: State, suspects: Sequence[Candidate]) -> None:
         self.state, self.suspects = state, suspects
         alone = ["", *(kind.variable for kind in KINDS)]
         self.scatter = np.array([(find(one.cause[0]).background or 0.0) * (one.variable in alone)

@@ -3,7 +3,7 @@
 A change between two measurements is fitted in the machine of the first one, whose errors have
 uncertainties. Their effect on the readings cancels in the difference, but their effect on the
 change does not: it scales with the change. Amounts, alternatives and statistics include it, for one
-change (`inference.among.Blurred`) and for many (`linear.with_numbers`).
+change (`Blur`) and for many (`linear.with_numbers`).
 """
 
 from collections.abc import Sequence
@@ -35,10 +35,6 @@ class Undetermined:
 
     hypotheses: tuple[Hypothesis, ...]
     root: Array
-
-    def size(self, problem: Response) -> int:
-        """The largest dimension of the covariance."""
-        return len(self.hypotheses) * problem.used.size
 
 
 ORBITS = (

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
+from tmlattice.diagnosis.assessment import Block
 from tmlattice.diagnosis.records import HIDDEN
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 
@@ -22,31 +23,6 @@ FLOOR = np.array([0.1, 0.1, 1.0])
 readings without noise (simulated ones) a smaller residual is no improvement."""
 WORTH = 0.05
 """Least fall of the score that rejects jitter."""
-
-
-class Chi2(NamedTuple):
-    """A sum of squares in units of the noise, with the number of readings."""
-
-    total: float
-    readings: int
-
-    @property
-    def per_reading(self) -> float:
-        """Chi-square per reading; 1 is noise."""
-        return self.total / max(self.readings, 1)
-
-
-@dataclass(frozen=True)
-class Score:
-    """Validation scores: rms in m, see `Step`; chi-square in-plane, coupling, RF."""
-
-    in_plane: float
-    coupling: float
-    chi2_per_dof: float
-    dispersion: float
-    position: float
-    roll: float
-    chi2: tuple[Chi2, Chi2, Chi2]
 
 
 @dataclass(frozen=True)
@@ -63,6 +39,7 @@ class Step:
         heldout_chi2_per_dof: in-plane, by the readings' noise.
         dispersion_rms: residual of the RF's orbit in x at BPMs that are not fitted, m.
         kept: whether it was accepted; the scores of a rejected step are its own.
+        compared: held-out readings in-plane, coupling and RF, by their noise.
     """
 
     effect: str
@@ -74,14 +51,7 @@ class Step:
     heldout_rms_position: float = float("nan")
     heldout_rms_roll: float = float("nan")
     kept: bool = field(default=True, metadata=HIDDEN)
-
-    @classmethod
-    def scored(cls, effect: str, parameters: int, s: Score) -> "Step":
-        """Return a step with its validation scores."""
-        return cls(
-            effect, parameters, s.in_plane, s.coupling, s.chi2_per_dof, s.dispersion, s.position,
-            s.roll,
-        )  # fmt: skip
+    compared: tuple[Block, ...] = field(default=(), metadata=HIDDEN)
 
 
 class _Missed(NamedTuple):
@@ -170,26 +140,28 @@ def _missed(
                    of_rf**2 / variance[-1, scored], scored)  # fmt: skip
 
 
-def score(state: State, validation: Flags) -> Score:
+def score(state: State, effect: str, parameters: int = 0) -> Step:
     """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
     Args:
-        state: to validate.
-        validation: the held-out correctors, [column].
+        state: to validate on its held-out correctors.
+        effect, parameters: of the step.
     """
-    missed = _missed(state, validation)
+    missed = _missed(state, state.split.held)
     own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
-    return Score(
-        in_plane=rms_of(missed.inside),
-        coupling=rms_of(missed.outside),
-        chi2_per_dof=float(np.mean(own)),
-        dispersion=rms_of([missed.rf]),
-        position=rms_of(missed.jumped),
-        roll=rms_of(missed.rolled) if missed.rolled else float("nan"),
-        chi2=(
-            Chi2(float(np.sum(own / np.concatenate(missed.spread))), len(own)),
-            Chi2(float(np.sum(others)), len(others)),
-            Chi2(float(np.sum(missed.rf_squares)), len(missed.rf)),
+    return Step(
+        effect,
+        parameters,
+        heldout_rms_in_plane=rms_of(missed.inside),
+        heldout_rms_coupling=rms_of(missed.outside),
+        heldout_chi2_per_dof=float(np.mean(own)),
+        dispersion_rms=rms_of([missed.rf]),
+        heldout_rms_position=rms_of(missed.jumped),
+        heldout_rms_roll=rms_of(missed.rolled),
+        compared=(
+            Block("in-plane", float(np.sum(own / np.concatenate(missed.spread))), len(own)),
+            Block("coupling", float(np.sum(others)), len(others)),
+            Block("RF", float(np.sum(missed.rf_squares)), len(missed.rf)),
         ),
     )
 

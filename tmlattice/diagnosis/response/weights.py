@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from tmlattice.arrays import REDUNDANT, TINY, Array, Flags
-from tmlattice.diagnosis.response.independent import independent
-from tmlattice.diagnosis.response.outlier_readings import rf_shares, shares
+from tmlattice.diagnosis.response.outlier_readings import DISPERSION, shares
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW, OUTLIERS, SIGNIFICANT
@@ -22,11 +21,11 @@ LEAST = 0.2
 """Least model discrepancy, and least noise given jitter, as a share of the noise."""
 BLIND = 0.2
 """Gain below which a BPM does not read the beam."""
-DISPERSION = "quadrupole_gradient"
-"""The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
-many times all others, and would bias the BPM gains."""
 COUPLING = "skew_gradient"
 """The family that determines the readings in the other plane."""
+
+CLIPPED = 3.0
+"""Limit of a residual, in units of the typical one: an outlier is no common pattern."""
 
 
 def weight(state: State, block: int) -> Array:
@@ -38,12 +37,7 @@ def weight(state: State, block: int) -> Array:
     if state.exploring:
         use[-1] &= ~split.inner_rf
     variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
-    count = np.array(np.broadcast_to(counts(state, block), use.shape))
-    if state.share is not None:
-        count *= state.share[block]
-    if state.rf_share is not None:
-        count[-1] *= state.rf_share[block]
-    return np.where(use, count / variance, 0.0)
+    return np.where(use, counts(state, block) * state.share[block] / variance, 0.0)
 
 
 def taken(state: State, block: int) -> Array | None:
@@ -102,22 +96,19 @@ def look(state: State, block: int) -> State:
     use = weight(state, block) > 0
     left = np.where(use, data.pick(state.at.left, block), np.nan)
     left, alone = _without_jitter(state, block, left)
-    if state.share is not None:
-        state = replace(state, share=shares(state, block, left[:-1]))
+    share = shares(state, block, left)
     typical = float(chi2.typical(left[:-1, state.good]))
     noise = float(np.median(data.noise))
-    share = 1.0 if state.share is None else state.share[block]
-    shared = TYPICAL * typical**2 + np.nansum(share * left**2, axis=1)
+    shared = TYPICAL * typical**2 + np.nansum(share[block] * left**2, axis=1)
     squares = shared / (TYPICAL + use.sum(axis=1))
     if state.allows(DISPERSION):
         squares[-1] = typical**2  # the RF counts like a typical column
-        state = replace(state, rf_share=rf_shares(state, block, left[-1]))
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
     good = good_monitors(state, block)
     if block:
         good &= state.good
-    return _independent(replace(state, lacking=lacking, good=good), block, left, alone)
+    return _independent(replace(state, lacking=lacking, share=share, good=good), block, left, alone)
 
 
 def _independent(state: State, block: int, left: Array, noise: Array) -> State:
@@ -125,12 +116,44 @@ def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     are betatron oscillations, too."""
     if state.independent is None or not state.allows(DISPERSION):
         return state
-    own, shares = state.independent.copy(), state.share
-    read = left[:-1] if shares is None else left[:-1] * np.sqrt(shares[block, :-1])
+    own = state.independent.copy()
+    read = left[:-1] * np.sqrt(state.share[block, :-1])
     for p in (0, 1):
         rows = state.data.plane_of(block)[:-1] == p
         own[block, p] = independent(read[rows], noise[:-1][rows])
     return replace(state, independent=own)
+
+
+def independent(left: Array, noise: Array) -> float:
+    """Return the effective sample size as a share of the readings; 1 if the residual is noise.
+
+    Model discrepancy is not white: it is a few betatron oscillations, common to many columns and
+    BPMs. If each residual counted as independent, evidence and errors would be overconfident. White
+    noise spreads over all singular vectors of the residual, betatron oscillations over few. The
+    participation ratio of the squared singular values counts them, relative to its expectation for
+    white noise. (For C x M Gaussian numbers the squared singular values s have E sum s = C M and E
+    sum s^2 = C M (C + M + 1).)
+
+    Args:
+        left: residuals of a fit, m, NaN where nothing was read, [column, monitor].
+        noise: rms noise of each reading, m, [column, monitor].
+    """
+    seen = np.isfinite(left)
+    left, noise = np.where(seen, left, 0.0), np.where(seen, noise, 0.0)
+    rows, columns = seen.any(axis=1), seen.any(axis=0)
+    left, noise, seen = (own[rows][:, columns] for own in (left, noise, seen))
+    C, M = left.shape
+    if min(C, M) < FEW or not left.any():
+        return 1.0
+    lacking = max(1 - float(np.sum(noise**2) / np.sum(left**2)), 0.0)
+    # a column or BPM with large residuals is no common pattern either
+    for axis in (1, 0, 1):
+        typical = np.sum(left**2, axis=axis, keepdims=True) / seen.sum(axis=axis, keepdims=True)
+        left = left / np.sqrt(np.maximum(typical, TINY))
+    squares = np.linalg.svd(np.clip(left, -CLIPPED, CLIPPED), compute_uv=False) ** 2
+    white = C * M / (C + M + 1)
+    share = min(float(squares.sum() ** 2 / np.sum(squares**2)) / white, 1.0)
+    return float(1 / (1 + lacking * (1 / share - 1)))
 
 
 def good_monitors(state: State, block: int = 0, bad: float = SIGNIFICANT) -> Flags:
