@@ -486,7 +486,7 @@ def lines(ring: str, name: str, said: dict[str, Any], base: dict[str, Any]) -> l
     if "traceback" in said:
         return [head + "TRACEBACK", said["traceback"]]
     if "error" in said:
-        return [head + f"refused: {said['error']}"]
+        return [head + f"no result: {said['error']}"]
     figures = []
     for own, usual in zip(said["heldout"], base.get("heldout", 3 * [np.nan]), strict=True):
         figures.append(f"{own:.2f} ({own / usual:.2f})")
@@ -539,6 +539,13 @@ def main() -> None:
                       flush=True)  # fmt: skip
                 if options.json:
                     options.json.write_text(json.dumps(every, indent=1), encoding="utf-8")
+    print("\n| ring | variant | verdict | held out in plane, relative to the measured one |\n"
+          "|---|---|---|---|")  # fmt: skip
+    for ring, rows in every.items():
+        whole = rows.get("untouched", {}).get("heldout", [np.nan])[0]
+        for name, row in rows.items():
+            ratio = row.get("heldout", [np.nan])[0] / whole
+            print(f"| {ring} | {name} | {row.get('verdict', 'no result')} | {ratio:.2f} |")
 
 
 if __name__ == "__main__":
