@@ -86,7 +86,7 @@ def place(small_ring, tmp_path_factory):
     return place
 
 
-@pytest.mark.parametrize(("page", "outputs"), [("physicist", 5), ("operator", 1)])
+@pytest.mark.parametrize(("page", "outputs"), [("physicist", 7), ("operator", 1)])
 def test_a_tutorial_prints_what_it_shows_and_finds_the_truth(
     page, outputs, simulated, tmp_path, monkeypatch  # noqa: F811
 ):  # fmt: skip
