@@ -3,8 +3,6 @@
 - one training step (forward, reverse, Adam) against a plain torch loop over 1519 pairs of
   parameters with torch's autograd and Adam;
 - one turn of one and of 1000 particles against AT's default tracking of the same ring;
-- symplectic layers against the truncated ones, one and 64 particles at 3 mm, and how far the mean
-  action of a 3 mm particle drifts in 5000 turns;
 - the maps of the whole ring, and a fit of 1000 epochs.
 
 Compilation is done before anything is timed. Medians; the machine's load shows in the spread.
@@ -82,16 +80,6 @@ def default_at(ring):
     return lattice
 
 
-def drift(network, turns=5000):
-    """Relative change of the mean action of a 3 mm particle in x, and of one in y, from the first
-    tenth of the turns to the last."""
-    states = network.track([[3e-3, 0, 0, 0], [0, 0, 3e-3, 0]], turns)
-    optics = tmlattice.one_turn_optics(network)
-    tenth = turns // 10
-    action = [np.abs(optics.normalised(states[plane])[:, plane]) ** 2 for plane in range(2)]
-    return [abs(own[-tenth:].mean() / own[1 : tenth + 1].mean() - 1) for own in action]
-
-
 def main():
     torch.set_num_threads(1)
     ring = tmlattice.load_ring("petra3")
@@ -123,24 +111,10 @@ def main():
             name = f"AT, one turn of {particles}{', keep_lattice' if keep else ''}"
             rows.append((name, theirs, "compiled chain", mine))
 
-    symplectic = network.symplectic()
-    for particles, turns in ((1, 300), (64, 60)):
-        states = np.outer(np.linspace(0.1, 1.0, particles), [3e-3, 0, 3e-3, 0])
-        times = [
-            median_time(lambda n=n, s=states, t=turns: n.track(s, t), 10) / turns
-            for n in (symplectic, network)
-        ]
-        rows.append(
-            (f"symplectic layers, one turn of {particles}", times[0], "truncated", times[1])
-        )
-
     print(f"maps of the whole ring: {median_time(lambda: ring_maps(ring), 5):.3f} s")
     measurement = tmlattice.Measurement(launch.numpy(), target.numpy()[:, None], network.monitors)
     fit = tmlattice.fine_tune(network, measurement, launch_sigma=0.0, patience=None, progress=False)
     print(f"fit of {len(fit.loss)} epochs with the symplectic penalty: {fit.seconds:.2f} s")
-    for name, one in (("symplectic", symplectic), ("truncated", network)):
-        print(f"{name} layers, drift of the action in 5000 turns, x / y: "
-              f"{' / '.join(f'{own:.1e}' for own in drift(one))}")  # fmt: skip
     print(f"at {at.__version__}, torch {torch.__version__}, numpy {np.__version__}\n")
     print("| what | ms | compared with | ms | ratio |\n|---|---|---|---|---|")
     for name, slow, other, fast in rows:
