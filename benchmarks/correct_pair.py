@@ -1,11 +1,11 @@
-"""LNLS, 14 quadrupole supplies changed on purpose: are the settings from before given back?
+"""LNLS, 14 quadrupole supplies changed on purpose: found, and corrected.
 
 `TMLATTICE_DATA=... python benchmarks/correct_pair.py`
 
 The pair `lnls_2014-07-17_before` and `_after` is imported, the change diagnosed, and "after"
 corrected towards "before" with the 14 supplies as knobs, in ampere by their excitation curves.
-Printed for each supply: the change that is asked for, the change back in the control system's
-record, and how far the asked strength is from the negative of the diagnosed change, in its errors.
+The table has how many changed supplies are found, and compares the settings with the changes back
+in the control system's record and with the diagnosed changes.
 """
 
 import json
@@ -59,22 +59,30 @@ def main() -> None:
         for knob in default_knobs(ring, ["supplies"]) if knob.name.upper() in currents["after"]
     ]  # fmt: skip
     correction = correct(diagnosis, knobs=knobs)
-    print(correction.words)
     rows = []
-    print(f"{'supply':8s}{'asked, A':>10s}{'record, A':>11s}{'pull':>7s}")
-    for setting in sorted(correction.settings, key=lambda own: own.knob.name):
-        knob = setting.knob
-        amount, sigma = diagnosis.error("family_gradient", knob.name)
+    for setting in correction.settings:
+        amount, sigma = diagnosis.error("family_gradient", setting.knob.name)
         pull = (setting.amount - (1 / (1 + amount) - 1)) / sigma
-        back = currents["before"][knob.name.upper()]
-        rows.append((knob.amount(back), setting.amount, pull))
-        print(f"{knob.name:8s}{setting.new - knob.present:+10.3f}{back - knob.present:+11.3f}"
-              f"{pull:+7.2f}")  # fmt: skip
+        back = setting.knob.amount(currents["before"][setting.knob.name.upper()])
+        rows.append((back, setting.amount, pull))
     record, asked, pull = np.array(rows).T
-    print(f"{len(rows)} supplies; signs as in the record: {np.sum(record * asked > 0)}; asked over "
-          f"recorded change of strength: {asked @ record / (record @ record):.3f}; pulls from the "
-          f"diagnosed changes: rms {np.sqrt(np.mean(pull**2)):.2f}, largest "
-          f"{np.abs(pull).max():.2f}")  # fmt: skip
+    known = {knob.name for knob in knobs}
+    statistic = [f.amount / f.amount_sigma for f in diagnosis.findings if f.element in known]
+    statistic = np.abs(statistic)
+    print("| quantity | result |\n|---|---|")
+    print(f"| changed supplies that are found | {len(statistic)} of {len(knobs)}, at "
+          f"{statistic.min():.1f} to {statistic.max():.1f} standard errors |")  # fmt: skip
+    print(f"| other findings | {len(diagnosis.findings) - len(statistic)} |")
+    print(f"| settings with the sign of the record | {np.sum(record * asked > 0)} of {len(rows)} |")
+    print("| setting over the recorded change of strength | "
+          f"{asked @ record / (record @ record):.2f} |")  # fmt: skip
+    print(f"| setting minus the diagnosed change, in standard errors, largest | "
+          f"{np.abs(pull).max():.2f} |")  # fmt: skip
+    for name, words, factor, unit in (("beta_beating", "beta beating", 100, "%"),
+                                      ("dispersion", "dispersion error", 1e3, "mm")):  # fmt: skip
+        now, (then, low, high) = correction.before[name][0][0], correction.after[name][0]
+        print(f"| {words} in x, rms: now, expected | {factor * now:.3g} {unit}, "
+              f"{factor * then:.2g} ± {factor * (high - low) / 2:.1g} {unit} |")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -299,7 +299,7 @@ def main():
             cases(name, known[name], Path(data), Path(place), options)
             for name in options.rings or known
         ]
-    print("\n| ring | found | others | pulls, rms | refused |\n|---|---|---|---|---|")
+    print("\n| ring | found | others | pulls, rms | no result |\n|---|---|---|---|---|")
     print("\n".join(rows))
 
 

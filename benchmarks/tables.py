@@ -75,7 +75,7 @@ def against(machines, other):
 
 def of_corrections(machines):
     """Each study of `correct.py`: sums of squares in tolerances, medians over its machines."""
-    yield ["study", "code", "machines", "refused", "before", "after", "oracle", "SVD", "LOCO",
+    yield ["study", "code", "machines", "nothing set", "before", "after", "oracle", "SVD", "LOCO",
            "rms over the oracle's, median (worst)", "not worse than before",
            "LOCO: better, equal, worse", "68 % intervals: now", "expected"]  # fmt: skip
     for study in sorted({tuple(one["study"]) for one in machines}):
@@ -147,12 +147,15 @@ def of_healthy(rows):
             done = [r for r in own if r["verdict"] not in ("no beam", "refused", "traceback")]
             others = Counter(r["verdict"] for r in own if r not in done)
             cells = [f"{sum(map(false_alarm, done))} of {len(done)}"] if done else []
-            line.append(", ".join(cells + [f"{n} {verdict}" for verdict, n in others.items()]))
+            words = {"refused": "not diagnosed"}
+            cells += [f"{n} {words.get(verdict, verdict)}" for verdict, n in others.items()]
+            line.append(", ".join(cells))
         yield line
 
 
 def of_turns(rows):
-    """Counts of `turns_amplitude.py` by ring, beam, fault, amplitude, of what was not refused."""
+    """Counts of `turns_amplitude.py` by ring, beam, fault and amplitude, of amplitudes
+    that the maps describe."""
     rows = [{"particles": 1} | row for row in rows]
     amplitudes = sorted({row["amplitude"] for row in rows})
     yield ["ring", "particles", "quadrupole", *(f"{1e3 * own:g} mm" for own in amplitudes)]
@@ -167,7 +170,7 @@ def of_turns(rows):
             done = [r for r in own if r["verdict"] not in ("refused", "error")]
             count = sum(r["right"] if fault else r["verdict"] != "none" for r in done)
             cells = [f"{count} of {len(done)}"] if done else []
-            cells += [f"{len(own) - len(done)} refused"] if len(done) < len(own) else []
+            cells += [f"{len(own) - len(done)} above the limit"] if len(done) < len(own) else []
             line.append(", ".join(cells))
         yield line
 

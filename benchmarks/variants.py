@@ -394,19 +394,19 @@ def sextupoles_off(case: Case, rng: Rng) -> Case:
 
 
 VARIANTS: dict[str, Callable[[Case, Rng], Case]] = {
-    "untouched": lambda case, rng: case,
+    "unaltered": lambda case, rng: case,
     "half of the correctors": half_correctors,
     "eight correctors": few_correctors,
-    "half of the monitors": half_monitors,
+    "half of the BPMs": half_monitors,
     "x alone": one_plane("x"),
     "y alone": one_plane("y"),
     "in-plane readings alone": in_plane_alone,
-    "every other monitor without y": no_response_of_a_plane,
+    "every other BPM without y": no_response_of_a_plane,
     "no RF step": no_rf,
     "no noise": no_noise,
     "noise / 3": noise_times(1 / 3),
     "noise x 10": noise_times(10.0),
-    "noise 0 of three monitors": noise_zero_of_some,
+    "noise 0 of three BPMs": noise_zero_of_some,
     "y reversed": reversed_plane,
     "planes swapped": planes_swapped,
     "mm": millimetres,
@@ -417,18 +417,18 @@ VARIANTS: dict[str, Callable[[Case, Rng], Case]] = {
     "RF step reversed": rf_reversed,
     "RF step x 2": rf_times(2.0),
     "RF frequency in MHz": rf_frequency,
-    "monitors exchanged": monitors_exchanged,
-    "monitors dead": monitors_dead,
-    "monitors of noise": monitors_noise,
-    "monitors reversed": monitors_reversed,
-    "monitor's planes swapped": monitor_planes_swapped,
-    "spikes": spikes,
+    "BPMs swapped": monitors_exchanged,
+    "BPMs dead": monitors_dead,
+    "BPMs of noise": monitors_noise,
+    "BPMs reversed": monitors_reversed,
+    "planes of a BPM swapped": monitor_planes_swapped,
+    "outliers": spikes,
     "readings missing": readings_missing,
     "corrector dead": corrector_dead,
     "corrector silent": corrector_silent,
     "corrector reversed": corrector_reversed,
-    "correctors exchanged": correctors_exchanged,
-    "correctors exchanged far": correctors_exchanged_far,
+    "correctors swapped": correctors_exchanged,
+    "correctors swapped far": correctors_exchanged_far,
     "corrector twice": corrector_twice,
     "scrambled": scrambled,
     "started elsewhere": started_elsewhere,
@@ -486,7 +486,7 @@ def lines(ring: str, name: str, said: dict[str, Any], base: dict[str, Any]) -> l
     if "traceback" in said:
         return [head + "TRACEBACK", said["traceback"]]
     if "error" in said:
-        return [head + f"refused: {said['error']}"]
+        return [head + f"no result: {said['error']}"]
     figures = []
     for own, usual in zip(said["heldout"], base.get("heldout", 3 * [np.nan]), strict=True):
         figures.append(f"{own:.2f} ({own / usual:.2f})")
@@ -535,10 +535,17 @@ def main() -> None:
             for name in options.variant or VARIANTS:
                 make = partial(VARIANTS[name], case, np.random.default_rng(options.seed))
                 rows[name] = tried(make, options.seed)
-                print(*lines(ring, name, rows[name], rows.get("untouched", {})), sep="\n",
+                print(*lines(ring, name, rows[name], rows.get("unaltered", {})), sep="\n",
                       flush=True)  # fmt: skip
                 if options.json:
                     options.json.write_text(json.dumps(every, indent=1), encoding="utf-8")
+    print("\n| ring | variant | verdict | held out in plane, relative to the measured one |\n"
+          "|---|---|---|---|")  # fmt: skip
+    for ring, rows in every.items():
+        whole = rows.get("unaltered", {}).get("heldout", [np.nan])[0]
+        for name, row in rows.items():
+            ratio = row.get("heldout", [np.nan])[0] / whole
+            print(f"| {ring} | {name} | {row.get('verdict', 'no result')} | {ratio:.2f} |")
 
 
 if __name__ == "__main__":

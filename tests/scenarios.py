@@ -554,7 +554,7 @@ RESPONSES = (
         small=GRADIENTS,
         found=(),
         verdicts=MANY,
-        fewer=None,
+        lasts=True,
     ),
 )
 

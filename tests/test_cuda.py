@@ -26,8 +26,8 @@ from tmlattice import TaylorNetwork, load_ring
 from tmlattice.network import cuda
 from tmlattice.network.reference import packed, plain_pass
 
-cuda._parts = lambda launch, layers: [slice(0, 3), slice(3, len(launch))]
-cuda._multiprocessors = lambda tensor: 1
+cuda.parts = lambda launch, layers: [slice(0, 3), slice(3, len(launch))]
+cuda.multiprocessors = lambda tensor: 1
 cuda.CONFIGURATION["track"]["UNROLL"] = 2
 torch.manual_seed(1)
 network = TaylorNetwork.from_ring(load_ring(sys.argv[1]), int(sys.argv[2]))
@@ -36,7 +36,9 @@ weights = [w.detach() for w in network.parameters()]
 for w in weights:
     w[1:] += 0.01 * torch.randn_like(w[1:])  # the first magnet stays linear
 launch = 0.1 * torch.randn(5, n, dtype=torch.float64)
-sweep = cuda.TritonSweep(network._read_outs, network._first_monitor)
+maps = network.maps
+read_outs = packed(*map(torch.from_numpy, (maps.R0, maps.R1, maps.R2)))
+sweep = cuda.TritonSweep(read_outs, torch.from_numpy(maps.start))
 
 
 def differ(got, expected):

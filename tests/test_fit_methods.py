@@ -1,9 +1,7 @@
 """`map` and `sparse`: against faults that are known, dense algebra, and their own stated errors."""
 
-import re
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -72,21 +70,6 @@ def test_launches_are_as_exact_as_the_measurement_states(small_ring, small_netwo
         np.testing.assert_allclose(fit.launches, off, atol=2e-6)
     with pytest.warns(UserWarning, match="the launches are not those stated.*give launch_sigma"):
         fine_tune(small_network, replace(honest, launch_sigma=0.1 * sigma), **options)
-
-
-def test_the_tutorial_names_its_magnet_and_the_tunes(petra3):
-    page = Path(__file__).parent.parent / "docs" / "tutorials" / "machine_learning.md"
-    code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S))
-    names = {}
-    exec(code, names)
-    fit, weak = names["fit"], names["weak"]
-    assert set(fit.changes) == {weak.element}
-    amount, error = fit.changes[weak.element]
-    assert abs(amount - weak.amount) < 4 * error < 0.02
-    assert f"{weak.element}: {100 * amount:.1f} ± {100 * error:.1f} %" in code
-    true = matrix_tunes(ring_matrix(perturbed_ring(petra3, weak.element, weak.amount)))
-    assert (np.abs(fit.tunes - true) < 4 * fit.tune_sigma).all()
-    assert fit.chi2 < 1.3
 
 
 def test_sparse_states_how_far_explanations_are_apart(small_ring, small_network):

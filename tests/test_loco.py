@@ -8,12 +8,7 @@ import pytest
 import scipy.io
 from at.load.utils import element_from_dict
 from numpy.testing import assert_allclose
-from test_import import (  # noqa: F401  (a fixture)
-    ENERGY,
-    design,
-    elements,
-    simulated,
-)
+from test_import import ENERGY, brought, design, elements, simulated  # noqa: F401  (fixtures)
 
 from tmlattice.errors import MeasurementError
 from tmlattice.importers import Options, bring_in
@@ -21,15 +16,6 @@ from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.optics import ring_tunes
 
 pytestmark = pytest.mark.usefixtures("forked_readers")
-
-
-@pytest.fixture
-def bring(tmp_path):
-    def bring(variables, **options):
-        scipy.io.savemat(tmp_path / "simulated.loco.mat", variables)
-        return bring_in([tmp_path / "simulated.loco.mat"], Options(**options))
-
-    return bring
 
 
 def struct_array(elements):
@@ -149,12 +135,12 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_other_forms_are_the_usual_one(simulated, bring, form):  # noqa: F811
-    usual = bring(simulated)
+def test_other_forms_are_the_usual_one(simulated, brought, form):  # noqa: F811
+    usual = brought(simulated)
     change, said = FORMS[form]
     variables = copy.deepcopy(simulated)
     change(variables)
-    found = bring(variables)
+    found = brought(variables)
     assert any(said in sentence for sentence in found.assumed), found.assumed
     if form != "M turned":  # of fewer correctors
         assert [e.name for e in found.ring.elements] == [e.name for e in usual.ring.elements]
@@ -170,13 +156,13 @@ def test_other_forms_are_the_usual_one(simulated, bring, form):  # noqa: F811
     assert found.ring.energy == pytest.approx(usual.ring.energy)
 
 
-def test_what_is_not_measured_is_left_out_and_said(simulated, bring):  # noqa: F811
+def test_what_is_not_measured_is_left_out_and_said(simulated, brought):  # noqa: F811
     variables = copy.deepcopy(simulated)
     data = variables["LocoMeasData"]
     data["Eta"], data["BPMSTD"] = 0 * data["Eta"], data["BPMSTD"][:7]
     variables["CMData"]["HCMKicks"][3] = np.nan
     of_good_ones(variables)
-    found = bring(variables)
+    found = brought(variables)
     assert found.measurement.rf is None
     assert found.measurement.noise is None
     assert len(found.measurement.correctors) == 30
@@ -188,12 +174,12 @@ def test_what_is_not_measured_is_left_out_and_said(simulated, bring):  # noqa: F
         assert any(said in sentence for sentence in found.assumed), found.assumed
 
 
-def test_zeros_that_no_bpm_reads_are_not_measured(simulated, bring):  # noqa: F811
+def test_zeros_that_no_bpm_reads_are_not_measured(simulated, brought):  # noqa: F811
     """A block that was not recorded, a corrector, and the vertical dispersion."""
     variables = copy.deepcopy(simulated)
     data = variables["LocoMeasData"]
     data["M"][:16, 16:] = data["M"][:, 3] = data["Eta"][16:] = 0.0
-    found = bring(variables)
+    found = brought(variables)
     assert any("were not measured" in sentence for sentence in found.assumed)
     unread = np.isnan(found.measurement.response)
     vertical = np.array(found.measurement.planes) == "y"
@@ -203,10 +189,10 @@ def test_zeros_that_no_bpm_reads_are_not_measured(simulated, bring):  # noqa: F8
     assert np.isnan(found.measurement.rf.orbit).sum(axis=0).tolist() == [0, 16]
 
 
-def test_weights_are_no_noise(simulated, bring):  # noqa: F811
+def test_weights_are_no_noise(simulated, brought):  # noqa: F811
     variables = copy.deepcopy(simulated)
     variables["LocoMeasData"]["BPMSTD"] = np.ones(32)
-    found = bring(variables)
+    found = brought(variables)
     assert found.measurement.noise is None
     assert any("it holds weights" in sentence for sentence in found.assumed)
 
@@ -225,14 +211,14 @@ def cells(things):
 
 
 @pytest.mark.parametrize("at_iteration", [0, 1, 2])
-def test_every_parameter_of_a_fit_is_as_before_it(simulated, bring, at_iteration):  # noqa: F811
+def test_every_parameter_of_a_fit_is_as_before_it(simulated, brought, at_iteration):  # noqa: F811
     """Gradients, rolls, and skew gradients of a later iteration; saved after any of them."""
     variables = copy.deepcopy(simulated)
     lattice = variables["RINGData"]["Lattice"]
     for element in lattice:
         if element["FamName"] == "BEND":
             element.update(R1=np.eye(6), R2=np.eye(6))
-    usual = bring(variables)
+    usual = brought(variables)
     places = {name: [i for i, e in enumerate(lattice) if e["FamName"] == name]
               for name in ("QF", "BEND", "SF")}  # fmt: skip
     steps = []
@@ -256,33 +242,32 @@ def test_every_parameter_of_a_fit_is_as_before_it(simulated, bring, at_iteration
     roll = np.kron(np.array([[cosine, sine], [-sine, cosine]]), np.eye(2))
     for i in places["BEND"]:
         lattice[i]["R1"][:4, :4], lattice[i]["R2"][:4, :4] = roll, roll.T
-    found = bring({**variables, "FitParameters": cells(steps)})
+    found = brought({**variables, "FitParameters": cells(steps)})
     assert found.ring.model == "model before the fit"
     assert found.ring.elements == usual.ring.elements
-    fitted = bring({**variables, "FitParameters": cells(steps)}, iteration="last").ring
+    fitted = brought({**variables, "FitParameters": cells(steps)}, iteration="last").ring
     assert fitted["qf::0"].k1 == pytest.approx(1 + 0.01 * at_iteration)
 
 
-def test_an_energy_that_no_file_states_is_assumed_and_can_be_named(simulated, bring):  # noqa: F811
+def test_an_energy_that_no_file_states_is_assumed_and_can_be_named(simulated, brought):  # noqa: F811
     variables = copy.deepcopy(simulated)
     energy_of_globval(variables)
     del variables["GLOBVAL"]
-    found = bring(variables)
+    found = brought(variables)
     assert found.ring.energy == pytest.approx(3.0)
     assert any("no energy is stated" in sentence for sentence in found.assumed)
-    assert bring(variables, energy=1.5).ring.energy == pytest.approx(1.5)
+    assert brought(variables, energy=1.5).ring.energy == pytest.approx(1.5)
 
 
 # --- lattices of LOCO files as laboratories have them: the model answers as the machine does ------
 @pytest.fixture
-def with_change(tmp_path, simulated):  # noqa: F811
+def with_change(simulated, brought):  # noqa: F811
     """The file with something changed, brought in."""
 
     def with_change(change):
         variables = copy.deepcopy(simulated)
         change(variables)
-        scipy.io.savemat(tmp_path / "simulated.loco.mat", variables)
-        return bring_in([tmp_path / "simulated.loco.mat"], Options())
+        return brought(variables)
 
     return with_change
 

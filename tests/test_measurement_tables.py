@@ -100,12 +100,6 @@ def test_millimetres_taken_for_metres_are_refused(tmp_path, ring_data):
     np.testing.assert_allclose(m.readings, 1e-3 * ring_data, rtol=1e-7)
 
 
-def test_a_turn_by_turn_files_unit_can_be_said(tmp_path, ring_data):
-    written(tmp_path / "b.sdds", ring_data, "lhc")
-    m = read_measurement(tmp_path / "b.sdds", turn_by_turn="lhc", unit="mm")
-    np.testing.assert_allclose(m.readings, 1e-3 * ring_data, rtol=1e-7)
-
-
 def test_more_turns_than_a_file_states_are_read(tmp_path, ring_data, monkeypatch):
     """As of the SPS: 201 columns where 200 turns are stated; monitors of one plane each."""
     import turn_by_turn as tbt

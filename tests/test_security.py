@@ -68,7 +68,6 @@ def open_folder():
 def kept(open_folder, monkeypatch):
     """A named cache folder with the entries of a ring, and their values."""
     monkeypatch.setenv("TMLATTICE_CACHE", str(open_folder))
-    cache._warn.cache_clear()
     ring = load_ring(SMALL)
     return open_folder / "tmlattice", ring, ring_maps(ring).W1
 
@@ -248,8 +247,8 @@ def test_names_of_temporary_files_cannot_be_known_before(tmp_path):
 COMPILED = (
     "import os, sys, tmlattice.beam.sweeps as sweeps\n"
     "from tmlattice.compiled import numba\n"
-    "kernel = next(k for k in vars(sweeps).values() if hasattr(k, '_cache'))\n"
-    "print(numba.config.CACHE_DIR or '-', kernel._cache.cache_path)\n"
+    "kernel = next(k for k in vars(sweeps).values() if hasattr(k, 'stats'))\n"
+    "print(numba.config.CACHE_DIR or '-', kernel.stats.cache_path)\n"
 )
 
 

@@ -9,36 +9,30 @@ pool of the compiler is needed: forked and spawned workers, and several callers 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from itertools import pairwise
 
 from tmlattice.compiled import numba
 
-_pool: ThreadPoolExecutor | None = None
 
-
-def _forget_pool() -> None:
-    global _pool
-    _pool = None
+@cache
+def pool(threads: int) -> ThreadPoolExecutor:
+    """Return the process's pool of this many threads."""
+    return ThreadPoolExecutor(threads, "tmlattice")
 
 
 if hasattr(os, "register_at_fork"):  # a forked child has no threads: it makes a new pool
-    os.register_at_fork(after_in_child=_forget_pool)
-
-
-def _threads() -> int:
-    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    os.register_at_fork(after_in_child=pool.cache_clear)
 
 
 def share(kernel: Callable[..., None], count: int, *arguments: object) -> None:
     """Call `kernel(first, last, *arguments)` for ranges that cover 0 to count."""
-    global _pool
-    threads = min(_threads(), count)
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    threads = min(most, count)
     if threads < 2:
         kernel(0, count, *arguments)
         return
-    if _pool is None:
-        _pool = ThreadPoolExecutor(_threads(), "tmlattice")
     edges = [count * part // threads for part in range(threads + 1)]
-    jobs = [_pool.submit(kernel, first, last, *arguments) for first, last in pairwise(edges)]
+    jobs = [pool(most).submit(kernel, first, last, *arguments) for first, last in pairwise(edges)]
     for job in jobs:
         job.result()

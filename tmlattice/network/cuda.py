@@ -45,12 +45,13 @@ def _programs(states: Tensor, kernel: str) -> tuple[tuple[int], dict[str, int]]:
     trajectories for the card's schedulers, four on each multiprocessor."""
     options = dict(CONFIGURATION[kernel])
     batch = states.shape[-1]
-    while options["BLOCK"] > 32 and batch < 4 * _multiprocessors(states) * options["BLOCK"]:
+    while options["BLOCK"] > 32 and batch < 4 * multiprocessors(states) * options["BLOCK"]:
         options["BLOCK"] //= 2
     return (_ceil(batch, options["BLOCK"]),), options
 
 
-def _multiprocessors(tensor: Tensor) -> int:
+def multiprocessors(tensor: Tensor) -> int:
+    """Return how many the card of this tensor has."""
     return torch.cuda.get_device_properties(tensor.device).multi_processor_count
 
 
@@ -98,7 +99,7 @@ class TritonSweep:
         curved = _curved(w)
         by_launch = torch.empty_like(launch)
         total = torch.zeros_like(w)
-        for part in _parts(launch, len(w)):
+        for part in parts(launch, len(w)):
             states = launch.new_empty(len(w) + 1, launch.shape[1], part.stop - part.start)
             states[0] = launch[part].T
             self.fill(w, curved, states)
@@ -140,7 +141,7 @@ class TritonSweep:
             )  # fmt: skip
 
 
-def _parts(launch: Tensor, layers: int) -> Iterator[slice]:
+def parts(launch: Tensor, layers: int) -> Iterator[slice]:
     """Equal parts of the trajectories, few enough for a quarter of the card's memory."""
     batch, n = launch.shape
     room = torch.cuda.get_device_properties(launch.device).total_memory // 4
