@@ -65,9 +65,10 @@ NO_STATEMENT = frozenset({
     "shrink", "sxfwrite", "delete", "tabstring", "setbeta", "nlens", "fill_knob", "threader",
     "set", "error", "beta0", "coption", "deselect", "distribution", "etable", "getdisp", "getkick",
     "getorbit", "renamefile", "rviewer", "save_state", "sddsin", "sddsout", "select_ptc_normal",
-    "saveline", "real", "int",
+    "saveline", "real", "int", "constraint", "weight", "gweight", "global", "vary",
 })  # fmt: skip
-"""Statements that leave the ring as it is, as do all that begin with PTC_."""
+"""Statements that leave the ring as it is, as do all that begin with PTC_; those of MATCH stand for
+nothing without it."""
 NOT_RUN = {
     "system": "SYSTEM is not run",
     "makethin": "MAKETHIN is not carried out: magnets stay thick",
@@ -513,9 +514,12 @@ class _Reader:
         if word == "sequence":
             return self._begin(name, given)
         if word not in KEYWORDS and word not in self.elements:
-            if word in NO_STATEMENT or word in ("beam", "select", "call", "use", *REFUSED):
+            if word in NO_STATEMENT or word in _COMMANDS or word in REFUSED:
+                self.macros[name] = ([], rest)  # EXEC carries it out again
                 return self._command(rest)
             raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
+        if self._open is not None and name in self.elements:
+            return self._place_again(name, given)
         if word == name:
             self.warnings.append(f"'{name}: {name}' leaves the element as it is, as in MAD-X")
             return None
@@ -607,6 +611,8 @@ class _Reader:
             case "call":
                 return self._call(given)
             case "option":
+                if "reset" in given and compiled(given["reset"].text)(self):
+                    self.rbarc = self.thin_focusing = True
                 for option, name in (("rbarc", "rbarc"), ("thin_foc", "thin_focusing")):
                     if option in given:
                         setattr(self, name, bool(compiled(given[option].text)(self)))
@@ -636,16 +642,8 @@ class _Reader:
                 return self._extract(given)
         if self._edited is not None and word in _EDITS:
             return getattr(self, f"_{word}")(given)  # type: ignore[no-any-return]
-        if word in self.elements or word in self.sequences or word in KEYWORDS:
-            if word in self.elements:
-                self._update(self.elements[word], given)
-            elif "at" not in given:
-                return self._set(word, given)
-            if self._open is not None and "at" in given:
-                return self._place(word, given)
-            if self._open is not None and word in self.elements and not given:
-                raise LatticeError(f"'{plain(word, 60)}' has no AT in its sequence")
-            return None
+        if self._open is not None and (word in self.elements or word in self.sequences):
+            return self._place_again(word, given)
         return self._set(word, given)
 
     def _call(self, given: dict[str, Given]) -> None:
@@ -703,7 +701,7 @@ class _Reader:
         if "l" not in given:
             raise LatticeError(f"SEQUENCE '{name}' has no length; give it L")
         for word in ("next_sequ", "add_pass"):
-            if word in given and unquoted(given[word].text) not in ("", "0"):
+            if word in given and unquoted(given[word].text).lower() not in ("", "0", "none"):
                 raise LatticeError(f"{word.upper()} of a sequence is not read")
         self._open = _Sequence(name, self._evaluate(given["l"]))
         if "refer" in given:
@@ -720,6 +718,14 @@ class _Reader:
         origin = unquoted(given["from"].text).lower() if "from" in given else ""
         at = self._evaluate(given["at"])
         self._open.nodes.append(_Node(name, at, origin, count=self._open.counted(name)))
+
+    def _place_again(self, name: str, given: dict[str, Given]) -> None:
+        """Place what is defined already: MAD-X leaves its attributes as they are."""
+        if "at" not in given:
+            raise LatticeError(f"'{plain(name, 60)}' has no AT in its sequence")
+        if given.keys() - (WORDS | NO_EFFECT - {"l"}):
+            self.report.left_out("attributes given in the sequence (as in MAD-X)", name)
+        self._place(name, given)
 
     def _length(self, name: str, nested: bool = False) -> float:
         """Of an element (along the arc) or a sequence, m."""
@@ -901,6 +907,7 @@ class _Reader:
         name = unquoted(given["element"].text).lower()
         if "class" in given and name not in self.elements:
             self._define(name, given["class"].text, Statement("", 0))
+        self._is_element(name)
         reference = _REFERENCE.get(edited.refer, 0.0)
         length = self._length(name)
         at = float(compiled(given["at"].text)(self)) + self._offset(name, reference)
@@ -911,6 +918,11 @@ class _Reader:
         count = edited.counted
         self._put([*slots, *(_Slot(name, at + s, length, count(name)) for s in origins)])
 
+    def _is_element(self, name: str) -> None:
+        """Raises a LatticeError otherwise: MAD-X puts no sequence into another here."""
+        if name not in self.elements:
+            raise LatticeError(f"'{plain(name, 60)}' is no element; SEQEDIT puts in elements only")
+
     def _remove(self, given: dict[str, Given]) -> None:
         _, slots = self._opened()
         gone = {id(slot) for slot in self._found(given, slots)}
@@ -919,6 +931,7 @@ class _Reader:
     def _replace(self, given: dict[str, Given]) -> None:
         edited, slots = self._opened()
         new = unquoted(given["by"].text).lower()
+        self._is_element(new)
         old = {id(slot) for slot in self._targets(given, slots)}
         length = self._length(new)
         self._put([
@@ -1049,6 +1062,7 @@ _NOT_IN_TWISS: dict[str, tuple[str, ...]] = {
 """What MAD-X's TWISS leaves out of thick magnets: it is for PTC and MAKETHIN."""
 _REFERENCE = {"entry": 0.5, "exit": -0.5}
 """From the point that REFER names to the centre, in lengths of the element."""
+_COMMANDS = ("beam", "resbeam", "select", "call", "use", "option", "exec", *NOT_RUN)
 _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
 _ENTRY = re.compile(r"rm([1-6])([1-6])")
 _ATTRIBUTES = (WORDS | NO_EFFECT).union(*MODELLED.values()) - {"at", "from"}
