@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -122,7 +122,8 @@ class _Definition:
 class _Node:
     """An element's place in a sequence; `at` is that of its reference point, or of its centre.
 
-    `count` is k of NAME[k], which stays when others of the name are removed.
+    `count` is k of NAME[k], which stays when others of the name are removed; `moved` are the
+    shifts that hold at this place only.
     """
 
     name: str
@@ -130,6 +131,7 @@ class _Node:
     origin: str = ""
     centred: bool = False
     count: int = 1
+    moved: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -155,6 +157,7 @@ class _Slot:
     centre: float
     length: float
     count: int = 1
+    moved: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_madx(
@@ -343,7 +346,7 @@ class _Reader:
         self._edited: _Sequence | None = None
         self._selected: list[dict[str, str]] = []
         self._unfound = set[str]()
-        self._made: dict[tuple[str, float], Part] = {}
+        self._made: dict[tuple[Any, ...], Part] = {}
         self._files: list[Path] = []
         self._count = 0
         self._work = 0
@@ -471,12 +474,13 @@ class _Reader:
     def _assign(self, name: str, given: Given, whole: bool) -> None:
         if name in self._constants:
             return  # MAD-X keeps them
-        evaluate = compiled(unquoted(given.text.strip()))
+        expression = compiled(unquoted(given.text.strip()))
+        evaluate: Evaluate = (lambda names: math.trunc(expression(names))) if whole else expression
         try:
             value = evaluate if given.deferred else evaluate(self)
         except Undetermined as error:  # of no consequence where nothing asks for it
             value = _raising(error)
-        self.variables[name] = math.trunc(value) if whole and not callable(value) else value
+        self.variables[name] = value
 
     def _block(self, text: str, word: str) -> None:
         head, _, body = text.partition("{")
@@ -711,21 +715,27 @@ class _Reader:
         self.sequences[name] = self._open
         self._known_as(name)
 
-    def _place(self, name: str, given: dict[str, Given]) -> None:
+    def _place(
+        self, name: str, given: dict[str, Given], moved: Mapping[str, Any] | None = None
+    ) -> None:
         """An element's place in the sequence that is open."""
         if self._open is None or "at" not in given:
             return
         origin = unquoted(given["from"].text).lower() if "from" in given else ""
         at = self._evaluate(given["at"])
-        self._open.nodes.append(_Node(name, at, origin, count=self._open.counted(name)))
+        count = self._open.counted(name)
+        self._open.nodes.append(_Node(name, at, origin, count=count, moved=moved or {}))
 
     def _place_again(self, name: str, given: dict[str, Given]) -> None:
-        """Place what is defined already: MAD-X leaves its attributes as they are."""
+        """Place what is defined already: of its attributes MAD-X changes shifts, at this place."""
         if "at" not in given:
             raise LatticeError(f"'{plain(name, 60)}' has no AT in its sequence")
-        if given.keys() - (WORDS | NO_EFFECT - {"l"}):
+        moved = {k: v for k, v in given.items() if k in _SHIFTS and name in self.elements}
+        if given.keys() - moved.keys() - (WORDS | NO_EFFECT - {"l"}):
             self.report.left_out("attributes given in the sequence (as in MAD-X)", name)
-        self._place(name, given)
+        own = _Definition(name, "", {}, "")
+        self._update(own, moved)
+        self._place(name, given, own.values)
 
     def _length(self, name: str, nested: bool = False) -> float:
         """Of an element (along the arc) or a sequence, m."""
@@ -776,7 +786,8 @@ class _Reader:
 
         self.work(len(sequence.nodes))
         own = [
-            _Slot(n.name, centre(n), self._length(n.name, nested), n.count) for n in sequence.nodes
+            _Slot(n.name, centre(n), self._length(n.name, nested), n.count, n.moved)
+            for n in sequence.nodes
         ]
         return sorted(own, key=lambda slot: slot.centre)
 
@@ -820,7 +831,8 @@ class _Reader:
         assert self._edited is not None
         ordered = sorted(slots, key=lambda slot: slot.centre)
         self._edited.nodes = [
-            _Node(s.name, _constant(s.centre), centred=True, count=s.count) for s in ordered
+            _Node(s.name, _constant(s.centre), centred=True, count=s.count, moved=s.moved)
+            for s in ordered
         ]
 
     def _extract(self, given: dict[str, Given]) -> None:
@@ -837,7 +849,7 @@ class _Reader:
             raise LatticeError("EXTRACT is not from a marker to a marker behind it")
         made = _Sequence(new, _constant(end - begin), counts=self.sequences[named].counts.copy())
         made.nodes = [
-            _Node(s.name, _constant(s.centre - begin), centred=True, count=s.count)
+            _Node(s.name, _constant(s.centre - begin), centred=True, count=s.count, moved=s.moved)
             for s in slots[slots.index(ends[0]) : slots.index(ends[1]) + 1]
         ]
         self.sequences[new] = made
@@ -940,7 +952,7 @@ class _Reader:
         ])  # fmt: skip
 
     def _move(self, given: dict[str, Given]) -> None:
-        """MAD-X counts from where REFER has an element, also with BY."""
+        """MAD-X counts from where REFER has an element, also with BY, and drops its shifts here."""
         edited, slots = self._opened()
         moved = {id(slot) for slot in self._found(given, slots)}
         way = float(compiled(given["to" if "to" in given else "by"].text)(self))
@@ -948,7 +960,9 @@ class _Reader:
             way += self._targets({"element": Given(given["from"].text)}, slots)[0].centre
         share = _REFERENCE.get(edited.refer, 0.0)
         self._put([
-            replace(s, centre=way + self._offset(s.name, share) + ("by" in given) * s.centre)
+            replace(
+                s, centre=way + self._offset(s.name, share) + ("by" in given) * s.centre, moved={}
+            )
             if id(s) in moved else s for s in slots
         ])  # fmt: skip
 
@@ -1004,22 +1018,28 @@ class _Reader:
         self, sequence: _Sequence, beam: Beam, circumference: float
     ) -> list[Part | float]:
         placed = [
-            (self._part(slot.name, slot.length, beam, circumference), slot.name,
+            (self._part(slot.name, slot.length, beam, circumference, slot.moved), slot.name,
              slot.centre - slot.length / 2, slot.length)
             for slot in self._flat(sequence)
         ]  # fmt: skip
         end = self._length(sequence.name)
         return with_gaps(placed, f"the sequence '{sequence.name}'", end, ROUNDING, SHORTEST_GAP)
 
-    def _part(self, name: str, length: float, beam: Beam, circumference: float) -> Part:
+    def _part(
+        self, name: str, length: float, beam: Beam, circumference: float,
+        moved: Mapping[str, Any] | None = None,
+    ) -> Part:  # fmt: skip
         if name not in self.elements:
             raise LatticeError(f"no element '{plain(name, 60)}' is defined")
-        if (name, length) not in self._made:
+        key = (name, length, *(moved or {}).items())
+        if key not in self._made:
             definition = self.elements[name]
-            self._made[name, length] = self._new_part(definition, length, beam, circumference)
+            if moved:
+                definition = replace(definition, values=definition.values | dict(moved))
+            self._made[key] = self._new_part(definition, length, beam, circumference)
             if abs(length - self._element_length(definition)) > 1e-12:
                 self.report.left_out("the later L or ANGLE (as in MAD-X)", name)
-        return self._made[name, length]
+        return self._made[key]
 
     def _new_part(
         self, definition: _Definition, length: float, beam: Beam, circumference: float
@@ -1062,6 +1082,7 @@ _NOT_IN_TWISS: dict[str, tuple[str, ...]] = {
 """What MAD-X's TWISS leaves out of thick magnets: it is for PTC and MAKETHIN."""
 _REFERENCE = {"entry": 0.5, "exit": -0.5}
 """From the point that REFER names to the centre, in lengths of the element."""
+_SHIFTS = SHIFTS | {"dtheta", "dphi"}
 _COMMANDS = ("beam", "resbeam", "select", "call", "use", "option", "exec", *NOT_RUN)
 _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
 _ENTRY = re.compile(r"rm([1-6])([1-6])")
