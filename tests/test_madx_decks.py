@@ -65,6 +65,11 @@ REFUSED = {
         PLAIN + "seqedit, sequence=ring; replace, element=cell[2], by=cell; endedit;",
         "'cell' is no element; SEQEDIT puts in elements only",
     ),
+    "list": (PLAIN.replace("k1=1.1", "k1={1.1}"), r"K1 of QUADRUPOLE 'qf' \(line 4 .* is a list"),
+    "thin bend": (
+        with_element("m: multipole, ksl={0.01}, angle=0.01, at=4.95;"),
+        r"ANGLE of MULTIPOLE 'm', which bends vertically by its KSL \(line 8",
+    ),
     "no place": (PLAIN.replace("qf, at=0.3;", "qf, at=0.3; qf;"), "'qf' has no AT in its sequence"),
     "range": (PLAIN + "use, sequence=ring, range=qf/qd;", "USE with a RANGE takes a part"),
     "beam-beam": (with_element("b: beambeam, charge=1, at=4.95;"), "BEAMBEAM 'b' .* by its CHARGE"),

@@ -388,7 +388,7 @@ class _Reader:
             return float(value[0] if isinstance(value, tuple) else value)
         if owner in self.sequences and name == "l":
             return self._valued(self.sequences[owner].length, owner)
-        raise LatticeError(f"'{owner}->{name}': no element '{owner}' is defined")
+        raise Undetermined(f"'{owner}->{name}': no element '{owner}' is defined")
 
     def _value(self, definition: _Definition, attribute: str) -> Any:
         value = definition.values.get(attribute, 0.0)
@@ -511,8 +511,9 @@ class _Reader:
             self._known_as(name)
             return
         head, *items = split(rest)
-        if not items and " " in head:
-            head, *items = head.split(" ", 1)
+        if " " in head:
+            head, first = head.split(" ", 1)
+            items.insert(0, first)
         given = attributes(items)
         word = unquoted(head).lower()
         if word == "sequence":
@@ -1059,8 +1060,16 @@ class _Reader:
                 own["freq"] = 1e-6 * float(own["harmon"]) * speed / circumference
             case "matrix":
                 own = _with_matrix(own)
-            case "multipole" if not self.thin_focusing:
-                own["lrad"] = 0.0
+            case "multipole":
+                if not own.get("angle"):  # KNL[0] bends the design, also with ANGLE=0
+                    own.pop("angle", None)
+                elif np.ravel(own.get("ksl", ()))[:1].any():
+                    raise LatticeError(
+                        f"ANGLE of MULTIPOLE '{plain(definition.name, 60)}', which bends "
+                        f"vertically by its KSL ({definition.where}), is not modelled; set it to 0"
+                    )
+                if not self.thin_focusing:
+                    own["lrad"] = 0.0
         for attribute in (*_NOT_IN_TWISS.get(keyword, ()), *(SHIFTS if self._in_line else ())):
             if np.any(own.pop(attribute, 0.0)):
                 where = "a LINE" if attribute in SHIFTS else "MAD-X's TWISS"

@@ -47,7 +47,13 @@ class Part:
 
     def number(self, attribute: str) -> float:
         """An attribute's value; 0 where it has none."""
-        return float(self.values.get(attribute) or 0.0)
+        value = self.values.get(attribute) or 0.0
+        if isinstance(value, tuple):
+            raise LatticeError(
+                f"{attribute.upper()} of {self.keyword.upper()} '{plain(self.name, 60)}' "
+                f"({self.where}) is a list; give a number"
+            )
+        return float(value)
 
     def list(self, attribute: str) -> Array:
         """Values of an attribute that is a list."""
