@@ -60,6 +60,17 @@ REFUSED = {
     "correct": (PLAIN + "correct, flag=ring;", "CORRECT sets correctors"),
     "random": (PLAIN + "qf, k1=1.1 + 1e-3*gauss();", r"GAUSS\(\) is random"),
     "result": (PLAIN + "qf, k1=table(twiss, qf, k1l);", r"TABLE\(\) reads a result"),
+    "two signs": (PLAIN + "x = 2*-0.5;", r"'2\*-0.5' has two signs in a row, which MAD-X does not"),
+    "replace by a sequence": (
+        PLAIN + "seqedit, sequence=ring; replace, element=cell[2], by=cell; endedit;",
+        "'cell' is no element; SEQEDIT puts in elements only",
+    ),
+    "list": (PLAIN.replace("k1=1.1", "k1={1.1}"), r"K1 of QUADRUPOLE 'qf' \(line 4 .* is a list"),
+    "thin bend": (
+        with_element("m: multipole, ksl={0.01}, angle=0.01, at=4.95;"),
+        r"ANGLE of MULTIPOLE 'm', which bends vertically by its KSL \(line 8",
+    ),
+    "no place": (PLAIN.replace("qf, at=0.3;", "qf, at=0.3; qf;"), "'qf' has no AT in its sequence"),
     "range": (PLAIN + "use, sequence=ring, range=qf/qd;", "USE with a RANGE takes a part"),
     "beam-beam": (with_element("b: beambeam, charge=1, at=4.95;"), "BEAMBEAM 'b' .* by its CHARGE"),
     "beam-beam by default": (with_element("b: beambeam, at=4.95;"), "BEAMBEAM 'b' .* by its"),
@@ -141,6 +152,10 @@ WARNED = {
         r"MAD-X's TWISS gives half the angle in faces \(BV=-1\) of bb \(1\)",
     ),
     "exciter": (with_element("h: hkicker, sinkick=1, at=4.95;"), r"SINKICK of h \(1\)"),
+    "attributes in the sequence": (
+        PLAIN.replace("qf, at=0.3;", "qf, at=0.3, k1=1.15;"),
+        r"left out.*attributes given in the sequence \(as in MAD-X\) of qf \(1\)",
+    ),
     "later length": (PLAIN + "qf, l=0.5;", r"left out.*the later L or ANGLE .* of qf \(1\)"),
 }
 

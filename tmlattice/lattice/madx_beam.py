@@ -9,7 +9,7 @@ from tmlattice.lattice.madx_language import CONSTANTS
 PARTICLES: dict[str, tuple[str, float]] = {
     "positron": ("emass", 1.0), "electron": ("emass", -1.0),
     "proton": ("pmass", 1.0), "antiproton": ("pmass", -1.0),
-    "posmuon": ("mumass", 1.0), "negmuon": ("mumass", -1.0),
+    "posmuon": ("mumass", 1.0), "negmuon": ("mumass", -1.0), "ion": ("nmass", 1.0),
 }  # fmt: skip
 """Rest mass (a constant of MAD-X) and charge, of the particles that MAD-X knows."""
 ENERGIES = ("energy", "pc", "gamma", "beta", "brho")

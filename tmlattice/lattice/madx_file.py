@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -65,9 +65,10 @@ NO_STATEMENT = frozenset({
     "shrink", "sxfwrite", "delete", "tabstring", "setbeta", "nlens", "fill_knob", "threader",
     "set", "error", "beta0", "coption", "deselect", "distribution", "etable", "getdisp", "getkick",
     "getorbit", "renamefile", "rviewer", "save_state", "sddsin", "sddsout", "select_ptc_normal",
-    "saveline", "real", "int",
+    "saveline", "real", "int", "constraint", "weight", "gweight", "global", "vary",
 })  # fmt: skip
-"""Statements that leave the ring as it is, as do all that begin with PTC_."""
+"""Statements that leave the ring as it is, as do all that begin with PTC_; those of MATCH stand for
+nothing without it."""
 NOT_RUN = {
     "system": "SYSTEM is not run",
     "makethin": "MAKETHIN is not carried out: magnets stay thick",
@@ -121,7 +122,8 @@ class _Definition:
 class _Node:
     """An element's place in a sequence; `at` is that of its reference point, or of its centre.
 
-    `count` is k of NAME[k], which stays when others of the name are removed.
+    `count` is k of NAME[k], which stays when others of the name are removed; `moved` are the
+    shifts that hold at this place only.
     """
 
     name: str
@@ -129,6 +131,7 @@ class _Node:
     origin: str = ""
     centred: bool = False
     count: int = 1
+    moved: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -154,6 +157,7 @@ class _Slot:
     centre: float
     length: float
     count: int = 1
+    moved: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_madx(
@@ -342,7 +346,7 @@ class _Reader:
         self._edited: _Sequence | None = None
         self._selected: list[dict[str, str]] = []
         self._unfound = set[str]()
-        self._made: dict[tuple[str, float], Part] = {}
+        self._made: dict[tuple[Any, ...], Part] = {}
         self._files: list[Path] = []
         self._count = 0
         self._work = 0
@@ -384,7 +388,7 @@ class _Reader:
             return float(value[0] if isinstance(value, tuple) else value)
         if owner in self.sequences and name == "l":
             return self._valued(self.sequences[owner].length, owner)
-        raise LatticeError(f"'{owner}->{name}': no element '{owner}' is defined")
+        raise Undetermined(f"'{owner}->{name}': no element '{owner}' is defined")
 
     def _value(self, definition: _Definition, attribute: str) -> Any:
         value = definition.values.get(attribute, 0.0)
@@ -470,12 +474,13 @@ class _Reader:
     def _assign(self, name: str, given: Given, whole: bool) -> None:
         if name in self._constants:
             return  # MAD-X keeps them
-        evaluate = compiled(unquoted(given.text.strip()))
+        expression = compiled(unquoted(given.text.strip()))
+        evaluate: Evaluate = (lambda names: math.trunc(expression(names))) if whole else expression
         try:
             value = evaluate if given.deferred else evaluate(self)
         except Undetermined as error:  # of no consequence where nothing asks for it
             value = _raising(error)
-        self.variables[name] = math.trunc(value) if whole and not callable(value) else value
+        self.variables[name] = value
 
     def _block(self, text: str, word: str) -> None:
         head, _, body = text.partition("{")
@@ -506,16 +511,20 @@ class _Reader:
             self._known_as(name)
             return
         head, *items = split(rest)
-        if not items and " " in head:
-            head, *items = head.split(" ", 1)
+        if " " in head:
+            head, first = head.split(" ", 1)
+            items.insert(0, first)
         given = attributes(items)
         word = unquoted(head).lower()
         if word == "sequence":
             return self._begin(name, given)
         if word not in KEYWORDS and word not in self.elements:
-            if word in NO_STATEMENT or word in ("beam", "select", "call", "use", *REFUSED):
+            if word in NO_STATEMENT or word in _COMMANDS or word in REFUSED:
+                self.macros[name] = ([], rest)  # EXEC carries it out again
                 return self._command(rest)
             raise LatticeError(f"no element or command '{plain(word, 60)}' is known")
+        if self._open is not None and name in self.elements:
+            return self._place_again(name, given)
         if word == name:
             self.warnings.append(f"'{name}: {name}' leaves the element as it is, as in MAD-X")
             return None
@@ -607,6 +616,8 @@ class _Reader:
             case "call":
                 return self._call(given)
             case "option":
+                if "reset" in given and compiled(given["reset"].text)(self):
+                    self.rbarc = self.thin_focusing = True
                 for option, name in (("rbarc", "rbarc"), ("thin_foc", "thin_focusing")):
                     if option in given:
                         setattr(self, name, bool(compiled(given[option].text)(self)))
@@ -636,16 +647,8 @@ class _Reader:
                 return self._extract(given)
         if self._edited is not None and word in _EDITS:
             return getattr(self, f"_{word}")(given)  # type: ignore[no-any-return]
-        if word in self.elements or word in self.sequences or word in KEYWORDS:
-            if word in self.elements:
-                self._update(self.elements[word], given)
-            elif "at" not in given:
-                return self._set(word, given)
-            if self._open is not None and "at" in given:
-                return self._place(word, given)
-            if self._open is not None and word in self.elements and not given:
-                raise LatticeError(f"'{plain(word, 60)}' has no AT in its sequence")
-            return None
+        if self._open is not None and (word in self.elements or word in self.sequences):
+            return self._place_again(word, given)
         return self._set(word, given)
 
     def _call(self, given: dict[str, Given]) -> None:
@@ -703,7 +706,7 @@ class _Reader:
         if "l" not in given:
             raise LatticeError(f"SEQUENCE '{name}' has no length; give it L")
         for word in ("next_sequ", "add_pass"):
-            if word in given and unquoted(given[word].text) not in ("", "0"):
+            if word in given and unquoted(given[word].text).lower() not in ("", "0", "none"):
                 raise LatticeError(f"{word.upper()} of a sequence is not read")
         self._open = _Sequence(name, self._evaluate(given["l"]))
         if "refer" in given:
@@ -713,13 +716,27 @@ class _Reader:
         self.sequences[name] = self._open
         self._known_as(name)
 
-    def _place(self, name: str, given: dict[str, Given]) -> None:
+    def _place(
+        self, name: str, given: dict[str, Given], moved: Mapping[str, Any] | None = None
+    ) -> None:
         """An element's place in the sequence that is open."""
         if self._open is None or "at" not in given:
             return
         origin = unquoted(given["from"].text).lower() if "from" in given else ""
         at = self._evaluate(given["at"])
-        self._open.nodes.append(_Node(name, at, origin, count=self._open.counted(name)))
+        count = self._open.counted(name)
+        self._open.nodes.append(_Node(name, at, origin, count=count, moved=moved or {}))
+
+    def _place_again(self, name: str, given: dict[str, Given]) -> None:
+        """Place what is defined already: of its attributes MAD-X changes shifts, at this place."""
+        if "at" not in given:
+            raise LatticeError(f"'{plain(name, 60)}' has no AT in its sequence")
+        moved = {k: v for k, v in given.items() if k in _SHIFTS and name in self.elements}
+        if given.keys() - moved.keys() - (WORDS | NO_EFFECT - {"l"}):
+            self.report.left_out("attributes given in the sequence (as in MAD-X)", name)
+        own = _Definition(name, "", {}, "")
+        self._update(own, moved)
+        self._place(name, given, own.values)
 
     def _length(self, name: str, nested: bool = False) -> float:
         """Of an element (along the arc) or a sequence, m."""
@@ -770,7 +787,8 @@ class _Reader:
 
         self.work(len(sequence.nodes))
         own = [
-            _Slot(n.name, centre(n), self._length(n.name, nested), n.count) for n in sequence.nodes
+            _Slot(n.name, centre(n), self._length(n.name, nested), n.count, n.moved)
+            for n in sequence.nodes
         ]
         return sorted(own, key=lambda slot: slot.centre)
 
@@ -814,7 +832,8 @@ class _Reader:
         assert self._edited is not None
         ordered = sorted(slots, key=lambda slot: slot.centre)
         self._edited.nodes = [
-            _Node(s.name, _constant(s.centre), centred=True, count=s.count) for s in ordered
+            _Node(s.name, _constant(s.centre), centred=True, count=s.count, moved=s.moved)
+            for s in ordered
         ]
 
     def _extract(self, given: dict[str, Given]) -> None:
@@ -831,7 +850,7 @@ class _Reader:
             raise LatticeError("EXTRACT is not from a marker to a marker behind it")
         made = _Sequence(new, _constant(end - begin), counts=self.sequences[named].counts.copy())
         made.nodes = [
-            _Node(s.name, _constant(s.centre - begin), centred=True, count=s.count)
+            _Node(s.name, _constant(s.centre - begin), centred=True, count=s.count, moved=s.moved)
             for s in slots[slots.index(ends[0]) : slots.index(ends[1]) + 1]
         ]
         self.sequences[new] = made
@@ -901,6 +920,7 @@ class _Reader:
         name = unquoted(given["element"].text).lower()
         if "class" in given and name not in self.elements:
             self._define(name, given["class"].text, Statement("", 0))
+        self._is_element(name)
         reference = _REFERENCE.get(edited.refer, 0.0)
         length = self._length(name)
         at = float(compiled(given["at"].text)(self)) + self._offset(name, reference)
@@ -911,6 +931,11 @@ class _Reader:
         count = edited.counted
         self._put([*slots, *(_Slot(name, at + s, length, count(name)) for s in origins)])
 
+    def _is_element(self, name: str) -> None:
+        """Raises a LatticeError otherwise: MAD-X puts no sequence into another here."""
+        if name not in self.elements:
+            raise LatticeError(f"'{plain(name, 60)}' is no element; SEQEDIT puts in elements only")
+
     def _remove(self, given: dict[str, Given]) -> None:
         _, slots = self._opened()
         gone = {id(slot) for slot in self._found(given, slots)}
@@ -919,6 +944,7 @@ class _Reader:
     def _replace(self, given: dict[str, Given]) -> None:
         edited, slots = self._opened()
         new = unquoted(given["by"].text).lower()
+        self._is_element(new)
         old = {id(slot) for slot in self._targets(given, slots)}
         length = self._length(new)
         self._put([
@@ -927,7 +953,7 @@ class _Reader:
         ])  # fmt: skip
 
     def _move(self, given: dict[str, Given]) -> None:
-        """MAD-X counts from where REFER has an element, also with BY."""
+        """MAD-X counts from where REFER has an element, also with BY, and drops its shifts here."""
         edited, slots = self._opened()
         moved = {id(slot) for slot in self._found(given, slots)}
         way = float(compiled(given["to" if "to" in given else "by"].text)(self))
@@ -935,7 +961,9 @@ class _Reader:
             way += self._targets({"element": Given(given["from"].text)}, slots)[0].centre
         share = _REFERENCE.get(edited.refer, 0.0)
         self._put([
-            replace(s, centre=way + self._offset(s.name, share) + ("by" in given) * s.centre)
+            replace(
+                s, centre=way + self._offset(s.name, share) + ("by" in given) * s.centre, moved={}
+            )
             if id(s) in moved else s for s in slots
         ])  # fmt: skip
 
@@ -991,22 +1019,28 @@ class _Reader:
         self, sequence: _Sequence, beam: Beam, circumference: float
     ) -> list[Part | float]:
         placed = [
-            (self._part(slot.name, slot.length, beam, circumference), slot.name,
+            (self._part(slot.name, slot.length, beam, circumference, slot.moved), slot.name,
              slot.centre - slot.length / 2, slot.length)
             for slot in self._flat(sequence)
         ]  # fmt: skip
         end = self._length(sequence.name)
         return with_gaps(placed, f"the sequence '{sequence.name}'", end, ROUNDING, SHORTEST_GAP)
 
-    def _part(self, name: str, length: float, beam: Beam, circumference: float) -> Part:
+    def _part(
+        self, name: str, length: float, beam: Beam, circumference: float,
+        moved: Mapping[str, Any] | None = None,
+    ) -> Part:  # fmt: skip
         if name not in self.elements:
             raise LatticeError(f"no element '{plain(name, 60)}' is defined")
-        if (name, length) not in self._made:
+        key = (name, length, *(moved or {}).items())
+        if key not in self._made:
             definition = self.elements[name]
-            self._made[name, length] = self._new_part(definition, length, beam, circumference)
+            if moved:
+                definition = replace(definition, values=definition.values | dict(moved))
+            self._made[key] = self._new_part(definition, length, beam, circumference)
             if abs(length - self._element_length(definition)) > 1e-12:
                 self.report.left_out("the later L or ANGLE (as in MAD-X)", name)
-        return self._made[name, length]
+        return self._made[key]
 
     def _new_part(
         self, definition: _Definition, length: float, beam: Beam, circumference: float
@@ -1026,8 +1060,16 @@ class _Reader:
                 own["freq"] = 1e-6 * float(own["harmon"]) * speed / circumference
             case "matrix":
                 own = _with_matrix(own)
-            case "multipole" if not self.thin_focusing:
-                own["lrad"] = 0.0
+            case "multipole":
+                if not own.get("angle"):  # KNL[0] bends the design, also with ANGLE=0
+                    own.pop("angle", None)
+                elif np.ravel(own.get("ksl", ()))[:1].any():
+                    raise LatticeError(
+                        f"ANGLE of MULTIPOLE '{plain(definition.name, 60)}', which bends "
+                        f"vertically by its KSL ({definition.where}), is not modelled; set it to 0"
+                    )
+                if not self.thin_focusing:
+                    own["lrad"] = 0.0
         for attribute in (*_NOT_IN_TWISS.get(keyword, ()), *(SHIFTS if self._in_line else ())):
             if np.any(own.pop(attribute, 0.0)):
                 where = "a LINE" if attribute in SHIFTS else "MAD-X's TWISS"
@@ -1049,6 +1091,8 @@ _NOT_IN_TWISS: dict[str, tuple[str, ...]] = {
 """What MAD-X's TWISS leaves out of thick magnets: it is for PTC and MAKETHIN."""
 _REFERENCE = {"entry": 0.5, "exit": -0.5}
 """From the point that REFER names to the centre, in lengths of the element."""
+_SHIFTS = SHIFTS | {"dtheta", "dphi"}
+_COMMANDS = ("beam", "resbeam", "select", "call", "use", "option", "exec", *NOT_RUN)
 _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
 _ENTRY = re.compile(r"rm([1-6])([1-6])")
 _ATTRIBUTES = (WORDS | NO_EFFECT).union(*MODELLED.values()) - {"at", "from"}

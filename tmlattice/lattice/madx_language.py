@@ -24,7 +24,7 @@ CONSTANTS: dict[str, float] = {
     "e": math.e, "amu0": 4e-7 * math.pi, "emass": ELECTRON_GEV, "mumass": 0.1056583755,
     "nmass": 0.93956542052, "pmass": PROTON_GEV, "umass": 0.93149410242, "clight": 299792458.0,
     "qelect": 1.602176634e-19, "hbar": 6.582119569e-25, "erad": 2.8179403262e-15,
-    "prad": 1.5346982672e-18, "true": 1.0, "false": 0.0,
+    "prad": 1.5346982672e-18, "true": 1.0, "false": 0.0, "version": 50902.0,
 }  # fmt: skip
 """As MAD-X 5.09 defines them (masses in GeV, lengths in m)."""
 
@@ -138,11 +138,14 @@ class _Parser:
 
     def _expression(self, level: int = 0) -> Evaluate:
         """What is bound together more tightly than a level."""
-        minus = False
-        while sign := self._take("+", "-"):
-            minus ^= sign == "-"
+        sign = self._take("+", "-")
+        if sign and (level or self._next() in ("+", "-")):
+            raise LatticeError(
+                f"'{self._text[:60].strip()}' has two signs in a row, which MAD-X does not read; "
+                "use brackets"
+            )
         left = self._chain(self._atom(), max(level, SIGNED))
-        return self._chain((lambda names: -left(names)) if minus else left, level)
+        return self._chain((lambda names: -left(names)) if sign == "-" else left, level)
 
     def _chain(self, left: Evaluate, level: int) -> Evaluate:
         """What operations make of it that bind more tightly than a level, from the left."""

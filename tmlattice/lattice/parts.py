@@ -47,7 +47,13 @@ class Part:
 
     def number(self, attribute: str) -> float:
         """An attribute's value; 0 where it has none."""
-        return float(self.values.get(attribute) or 0.0)
+        value = self.values.get(attribute) or 0.0
+        if isinstance(value, tuple):
+            raise LatticeError(
+                f"{attribute.upper()} of {self.keyword.upper()} '{plain(self.name, 60)}' "
+                f"({self.where}) is a list; give a number"
+            )
+        return float(value)
 
     def list(self, attribute: str) -> Array:
         """Values of an attribute that is a list."""
@@ -99,12 +105,13 @@ _ASSUMED = {"charge": 1.0}
 """What MAD-X takes where such an attribute is not given, if that is not zero."""
 
 NO_EFFECT = frozenset({
-    "l", "at", "from", "type", "name", "apertype", "aperture", "aper_offset", "aper_tol", "aper_vx",
-    "aper_vy", "xsize", "ysize", "slot_id", "assembly_id", "mech_sep", "v_pos", "calib", "polarity",
-    "comments", "comment", "kmax", "kmin", "nst", "method", "model", "exact", "fringe",
-    "bend_fringe", "thick", "magnet", "lrad", "lag", "harmon", "shunt", "tfill", "betrf", "pg",
-    "n_bessel", "no_cavity_totalpath", "add_angle", "f_factor", "slice", "sigx", "sigy",
-    "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq", "entrance",
+    "l", "at", "from", "type", "name", "apertype", "aperture", "aper_offset", "aper_tol",
+    "aper_tilt", "aper_vx", "aper_vy", "xsize", "ysize", "slot_id", "assembly_id", "mech_sep",
+    "v_pos", "calib", "polarity", "comments", "comment", "kmax", "kmin", "nst", "method", "model",
+    "exact", "fringe", "bend_fringe", "thick", "magnet", "lrad", "lag", "harmon", "shunt", "tfill",
+    "betrf", "pg", "n_bessel", "no_cavity_totalpath", "add_angle", "f_factor", "slice", "sigx",
+    "sigy", "f1", "f2", "fcsr", "slice_straight", "frngmax", "rot_start", "nbin", "binmax",
+    "time_var", "reference", "range", "shape", "refpos", "rfcavity_totalpath", "freq", "entrance",
 })  # fmt: skip
 """Attributes without effect on the optics, of any keyword."""
 NONLINEAR = frozenset({"k4", "k4s", "k5", "k5s", "k6", "k7", "k8", "pnl", "psl", "rad", "tm",
