@@ -123,6 +123,11 @@ class DistributedErrors:
             self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], MAX_SHARE)
         )
 
+    def square(self, amounts: Array) -> float:
+        """Return -2 log density of amounts over that of the mean."""
+        x = (amounts - self.amounts) / self.rms
+        return float(x @ x + self.share / (1 - self.share) @ (self.seen @ x) ** 2)
+
     @property
     def errors(self) -> Array:
         """Standard deviations, [error]."""
@@ -587,12 +592,16 @@ class Posterior:
         amounts: most probable amounts, [error].
         visible: errors with a signature.
         spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
+        nuisances: fitted.
+        chi2: where it is linearised.
     """
 
     before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
     visible: Indices = field(repr=False)
     spread: Array = field(repr=False)
+    nuisances: Array = field(repr=False)
+    chi2: float
 
     @property
     def sizes(self) -> dict[str, float]:
@@ -625,64 +634,127 @@ class Sums:
     some: Array
 
 
+@dataclass(frozen=True)
+class _Linearised:
+    """The problem at some amounts of the errors.
+
+    Attributes:
+        at: these amounts, [error].
+        point: of the nuisances alone.
+        sums: slopes there.
+        keep: rows of `Sums.some`.
+    """
+
+    at: Array
+    point: Point
+    sums: Sums
+    keep: Indices
+
+    @classmethod
+    def of(cls, known: DistributedErrors, inner: Problem, point: Point, at: Array) -> "_Linearised":
+        keep = sampled_rows(len(point.residual))
+        return cls(at, point, sums_at(inner, point, known, at, keep), keep)
+
+    def chi2(self, amounts: Array) -> float:
+        """Chi-square that is expected with other amounts."""
+        change = amounts - self.at
+        return self.point.chi2 - float(change @ (2 * self.sums.inner - self.sums.gram @ change))
+
+    def scaled(self, known: DistributedErrors, unsure: float = np.inf) -> DistributedErrors:
+        """Return the errors with estimated scales; see `posterior`."""
+        assert self.point.projection is not None
+        _, belongs = families_of(known)
+        scales = components_of_rows(
+            self.point.residual[self.keep] + (self.at - known.amounts) @ self.sums.some,
+            self.point.projection.matrix()[self.keep],
+            known.correlated(known.rms[:, None] * self.sums.some), belongs, prior=known.scales,
+        )  # fmt: skip
+        least = np.where(scales.error[belongs] < unsure, 0.0, known.rms)
+        rms = np.maximum(known.rms * scales.scale[belongs], least)
+        return replace(known, rms=rms, scales=scales.covariance)
+
+
 def posterior(
     problem: Problem,
     known: DistributedErrors,
     *,
-    learn: bool = True,
+    linearised_at: Array,
     unsure: float = np.inf,
-    linearised_at: Array | None = None,
 ) -> Posterior:
-    """Return the posterior of distributed errors, linearised at the most probable amounts.
+    """Return the posterior of distributed errors, linearised at the most probable amounts, by whole
+    Newton steps; the scales are estimated at the last of them.
 
     Args:
         problem: of the design.
         known: prior, with initial scales.
-        learn: estimate the scales; else they stay.
+        linearised_at: first point of linearisation, [error].
         unsure: relative error of an estimated scale from which it is not below its initial one.
-        linearised_at: first point of linearisation, [error]; None: the prior's mean.
 
     Raises:
         UnstableRingError: no beam is stored with the most probable errors.
     """
-    amounts = stored = known.amounts if linearised_at is None else linearised_at
-    nuisances, expected = problem.first, np.inf
-    for step in range(ROUNDS):
-        inner, there, amounts = linearise(problem, known, amounts, stored, (), nuisances)
-        if step > (linearised_at is None) and abs(there.chi2 - expected) < LINEAR:
+    there = linearise(problem, known, linearised_at, linearised_at, (), problem.first)
+    for _ in range(ROUNDS):
+        here = _Linearised.of(known, *there)
+        amounts = _posterior_at(known, here).amounts
+        there = linearise(problem, known, amounts, here.at, (), here.point.nuisances)
+        if abs(there[1].chi2 - here.chi2(amounts)) < LINEAR:
             break
-        point, stored, nuisances = there, amounts, there.nuisances
-        keep = sampled_rows(len(point.residual))
-        sums = sums_at(inner, point, known, stored, keep)
-        amounts = _posterior_at(known, stored, sums).amounts
-        change = amounts - stored
-        expected = point.chi2 - float(change @ (2 * sums.inner - sums.gram @ change))
-    if learn:
-        assert point.projection is not None
-        _, belongs = families_of(known)
-        found = components_of_rows(
-            point.residual[keep] + (stored - known.amounts) @ sums.some,
-            point.projection.matrix()[keep],
-            known.correlated(known.rms[:, None] * sums.some), belongs, prior=known.scales,
-        )  # fmt: skip
-        least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
-        rms = np.maximum(known.rms * found.scale[belongs], least)
-        known = replace(known, rms=rms, scales=found.covariance)
-    return _posterior_at(known, stored, sums)
+    return _posterior_at(here.scaled(known, unsure), here)
 
 
-def _posterior_at(known: DistributedErrors, at: Array, sums: Sums) -> Posterior:
-    """The posterior of errors linearised at some amounts."""
+def damped_posterior(
+    problem: Problem,
+    known: DistributedErrors,
+    amounts: Array,
+    nuisances: Array,
+    learn: bool = False,
+) -> Posterior:
+    """Return the posterior where the readings may be far from linear in the errors: a part of each
+    step, as large as lowers chi-square and prior.
+
+    Args:
+        problem: of the design.
+        known: prior.
+        amounts, nuisances: first guess, [error] and as `Problem.first`.
+        learn: estimate the scales at the first guess; else they stay.
+
+    Raises:
+        UnstableRingError: no beam at the first guess.
+    """
+    here = _Linearised.of(known, *linearise(problem, known, amounts, amounts, (), nuisances))
+    known = here.scaled(known) if learn else known
+    for _ in range(ROUNDS):
+        found = _posterior_at(known, here)
+        least = here.point.chi2 + known.square(here.at)
+        for share in STEP_SHARES:
+            wanted = here.at + share * (found.amounts - here.at)
+            there = linearise(problem, known, wanted, here.at, (), here.point.nuisances)
+            _, point, at = there
+            if at is wanted and share == 1 and abs(point.chi2 - here.chi2(at)) < LINEAR:
+                return found
+            if point.chi2 + known.square(at) < least:
+                break
+        else:
+            break
+        here = _Linearised.of(known, *there)
+    return replace(_posterior_at(known, here), amounts=here.at)
+
+
+def _posterior_at(known: DistributedErrors, here: _Linearised) -> Posterior:
+    """The posterior of linearised errors."""
+    sums = here.sums
     spread = known.correlated(known.correlated(known.rms[:, None] * sums.gram * known.rms).T)
     visible = np.flatnonzero(np.diag(spread) > 0)
     spread = spread[np.ix_(visible, visible)]
-    pull = known.correlated(known.rms * (sums.inner + sums.gram @ (at - known.amounts)))
+    pull = known.correlated(known.rms * (sums.inner + sums.gram @ (here.at - known.amounts)))
     most_probable = np.zeros(len(pull))
     rounding = len(visible) * np.finfo(float).eps * np.diag(spread).max(initial=0.0)
     ridge = (1 + rounding) * np.eye(len(visible))
     factor = cho_factor(spread + ridge, overwrite_a=True, check_finite=False)
     most_probable[visible] = cho_solve(factor, pull[visible], check_finite=False)
-    return Posterior(known, known.amounts_at(most_probable), visible, spread)
+    amounts = known.amounts_at(most_probable)
+    return Posterior(known, amounts, visible, spread, here.point.nuisances, here.point.chi2)
 
 
 def sums_at(
