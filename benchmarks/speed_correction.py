@@ -1,8 +1,8 @@
 """Time of `tmlattice correct` for PETRA III: `python benchmarks/speed_correction.py`.
 
-The estimated ring has one quadrupole wrong by 2 % and, in one run, the posterior of all usual errors
-at their places: a tenth of their usual sizes, of which 1500 random directions have lost 97 % of
-their variance. Times are of the whole process with start, import, reading and the written report;
+The estimated ring has one quadrupole wrong by 2 % and, in one run, the posterior of all usual
+errors at their places: a tenth of their usual sizes, of which 1500 random directions have lost
+97 % of their variance. Times are of the whole process with start, import, reading and the report;
 compiled sweeps and the maps of the design are cached.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from tmlattice import load_ring
 from tmlattice.correction import default_knobs
-from tmlattice.diagnosis.twin import ESTIMATED, known_document, knowledge_file
+from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
 from tmlattice.effects import Cause, apply, background_rms, find
 from tmlattice.files import write_json
 from tmlattice.inference.distributed import DistributedErrors
