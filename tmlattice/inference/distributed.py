@@ -681,9 +681,8 @@ def posterior(
     linearised_at: Array,
     unsure: float = np.inf,
 ) -> Posterior:
-    """Return the posterior of distributed errors, linearised at the most probable amounts.
-
-    Whole Newton steps come first, then the scales, and with them damped steps.
+    """Return the posterior of distributed errors, linearised at the most probable amounts, by whole
+    Newton steps; the scales are estimated at the last of them.
 
     Args:
         problem: of the design.
@@ -701,7 +700,7 @@ def posterior(
         there = linearise(problem, known, amounts, here.at, (), here.point.nuisances)
         if abs(there[1].chi2 - here.chi2(amounts)) < LINEAR:
             break
-    return _damped(problem, here.scaled(known, unsure), here)
+    return _posterior_at(here.scaled(known, unsure), here)
 
 
 def damped_posterior(
@@ -724,11 +723,7 @@ def damped_posterior(
         UnstableRingError: no beam at the first guess.
     """
     here = _Linearised.of(known, *linearise(problem, known, amounts, amounts, (), nuisances))
-    return _damped(problem, here.scaled(known) if learn else known, here)
-
-
-def _damped(problem: Problem, known: DistributedErrors, here: _Linearised) -> Posterior:
-    """The posterior after steps, each shortened until it lowers chi-square and prior."""
+    known = here.scaled(known) if learn else known
     for _ in range(ROUNDS):
         found = _posterior_at(known, here)
         least = here.point.chi2 + known.square(here.at)
