@@ -144,8 +144,7 @@ def estimate_of_turns(
     for measured in measurements:
         data = of_measurement(ring, measured)
         known = given_losses(ring, _given_readings(ring, data, known), data)
-        changed = data.settings[-1].items()
-        kicks = {name: own["kick"] for name, own in changed if "kick" in own}
+        kicks = {n: own["kick"] for n, own in data.settings[-1].items() if "kick" in own}
     estimate = Estimate(ring, ring, known or DistributedErrors.usual([], {}))
     settings, causes = ring, []
     for name, kick in kicks.items():

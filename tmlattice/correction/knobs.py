@@ -38,7 +38,7 @@ class Kind:
         strength: OCELOT's attribute that it sets, as in snippets.
         unit: of the strength.
         relative: whether the effect's amount is the relative change of the strength.
-        family: the effect of several magnets on one supply.
+        family: the effect on several magnets of one supply.
         error: default relative error of a change: calibration and hysteresis of quadrupoles are
             known to a per cent, a corrector's to the usual size of its error.
     """
@@ -47,21 +47,18 @@ class Kind:
     strength: str
     unit: str
     relative: bool
-    error: float = 0.01
     family: str = ""
+    error: float = 0.01
 
 
+CALIBRATED = find("corrector_calibration").background or 0.0
 KINDS: dict[str, Kind] = {
-    "quadrupole": Kind("quadrupole_gradient", "k1", "1/m2", True, family="family_gradient"),
+    "quadrupole": Kind("quadrupole_gradient", "k1", "1/m2", True, "family_gradient"),
     "skew_quadrupole": Kind("skew_gradient", "k1sl", "1/m", False),
-    "sextupole": Kind("sextupole_strength", "k2", "1/m3", True, family="family_sextupole"),
-    "hcorrector": Kind(
-        "corrector_kick_x", "kick", "rad", False, find("corrector_calibration").background or 0.0
-    ),
-    "vcorrector": Kind(
-        "corrector_kick_y", "kick", "rad", False, find("corrector_calibration").background or 0.0
-    ),
-    "rf": Kind(None, "frequency", "Hz", True, 0.0),
+    "sextupole": Kind("sextupole_strength", "k2", "1/m3", True, "family_sextupole"),
+    "hcorrector": Kind("corrector_kick_x", "kick", "rad", False, error=CALIBRATED),
+    "vcorrector": Kind("corrector_kick_y", "kick", "rad", False, error=CALIBRATED),
+    "rf": Kind(None, "frequency", "Hz", True, error=0.0),
 }
 
 
@@ -173,9 +170,8 @@ def chosen_knobs(
         orbit = {"closed_orbit", "first_turn"} & set(targets)
         optics = [] if set(targets) <= orbit else ["supplies", "skew_quadrupoles"]
         knobs = [*optics, *["correctors"] * bool(orbit)]
-    devices = [own for own in knobs if isinstance(own, Knob)]
     kinds = [own for own in knobs if isinstance(own, str)]
-    every = devices + (default_knobs(ring, kinds) if kinds else [])
+    every = [*(own for own in knobs if isinstance(own, Knob)), *default_knobs(ring, kinds)]
     check_distinct("the knobs", every)
     return [within_range(own, ring) for own in every]
 
@@ -397,11 +393,9 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
     name = str(given.pop("knob", "")).strip()
     where = f"{path}: knob '{plain(name, 40)}'"
     if not name or (strange := set(given) - set(COLUMNS)):
-        what = (
-            f"{path}: a row without a knob"
-            if not name
-            else f"{where}: unknown column {plain(str(min(map(str, strange))), 40)}"
-        )
+        what = f"{path}: a row without a knob"
+        if name:
+            what = f"{where}: unknown column {plain(str(min(map(str, strange))), 40)}"
         raise MeasurementError(f"{what}; the columns are {', '.join(COLUMNS)}")
     members = given.pop("members", ())
     names = members.split() if isinstance(members, str) else list(members)
