@@ -26,9 +26,7 @@ from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.knobs import KINDS
 from tmlattice.correction.targets import TARGETS, THREADING, Weighted
 from tmlattice.effects import Cause, apply, background_rms, find
-from tmlattice.errors import UnstableRingError
-from tmlattice.inference.distributed import DistributedErrors, damped_posterior, families_of
-from tmlattice.inference.judgement import SIGNIFICANT
+from tmlattice.inference.distributed import DistributedErrors, families_of, posterior
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.variance_components import prior_covariance
 from tmlattice.lattice import Element, Ring
@@ -42,8 +40,6 @@ TURNS = 2
 LOST = 0.1
 """m; reading of a lost beam. It is beyond any aperture, so that the first readings outside of one
 still show the beam's direction."""
-FITS = 12
-"""Posteriors at most, each with readings that the one before it made reachable."""
 UNREAD = 2
 """Readings at the end of a shot, at least, that a lost beam lacks: one alone may be a dead BPM."""
 SURPRISE = 2.0
@@ -166,33 +162,12 @@ def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> 
         kinds = [name.removesuffix("_x").removesuffix("_y") for name in families_of(known)[0]]
         known = replace(known, scales=prior_covariance(kinds))
     known = known.extended(seen)
-    amounts, nuisances, found = known.amounts, problem.first, None
-    used, low, high = 0, 0, data.valid.shape[1]
-    most = high
-    for _ in range(FITS):
-        own = zip(known.hypotheses, amounts.tolist(), strict=True)
-        there = problem.with_fixed([Cause(*h, amount) for h, amount in own if amount])
-        kept = data.valid & np.isfinite(there.model.readings(nuisances, there.fixed))
-        kept[:, most:] = False
-        count = int(kept.sum())
-        if count <= used:
-            break
-        read, end = problem.without(~kept), int(np.flatnonzero(kept.any(axis=(0, 2)))[-1]) + 1
-        try:
-            tried = damped_posterior(read, known, amounts, nuisances)
-            explained = tried.chi2 < SIGNIFICANT**2 * count
-        except UnstableRingError:
-            explained = False
-        if explained:
-            amounts, nuisances = tried.amounts, tried.nuisances
-            found, used, low = read, count, end
-            most = high if high == kept.shape[1] else (low + high + 1) // 2
-        else:
-            high = end
-            most = (low + high) // 2
-    if found is None:
-        raise UnstableRingError("the beam is lost in the model before it is read")
-    return damped_posterior(found, known, amounts, nuisances, learn=True).known
+    found = posterior(problem, known, learn=False, partly=True)
+    assert found.problem is not None
+    scaled = posterior(found.problem, known, linearised_at=found.amounts).before
+    return posterior(
+        found.problem, scaled, learn=False, linearised_at=found.amounts, partly=True
+    ).known
 
 
 def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> DistributedErrors:

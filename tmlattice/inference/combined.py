@@ -202,6 +202,10 @@ class CombinedProblem(Problem):
             found.append(own[part.owner().ravel()])
         return np.concatenate(found)
 
+    def way(self) -> Array:
+        """Return the shares of the parts' ways."""
+        return np.concatenate([part.way().ravel() for part in self.parts])
+
     def as_rows(self, readings: Array) -> Array:
         """Return the rows, part after part."""
         rows = [

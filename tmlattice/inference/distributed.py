@@ -12,10 +12,10 @@ as the square of the errors, whatever the number of readings. `DistributedProble
 signatures, since its search whitens rows by them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh
@@ -105,6 +105,16 @@ class DistributedErrors:
         own = zip(self.hypotheses, amounts, strict=True)
         return np.array([find(name).floored(amount) for (name, _), amount in own])
 
+    def independent(self, change: Array) -> Array:
+        """A change of the amounts in independent errors of size 1, [error]: `correlated` undone."""
+        own = change / self.rms
+        return np.asarray(own + ((1 - self.share) ** -0.5 - 1) * (self.seen @ own) @ self.seen)
+
+    def square(self, amounts: Array) -> float:
+        """Sum of squares of the independent errors: the prior's part of the cost."""
+        own = self.independent(amounts - self.amounts)
+        return float(own @ own)
+
     def updated(self, amounts: Array, share: Array, seen: Array) -> "DistributedErrors":
         """Return the distribution after more readings.
 
@@ -122,11 +132,6 @@ class DistributedErrors:
         return replace(
             self, amounts=amounts, seen=seen[big], share=np.minimum(share[big], MAX_SHARE)
         )
-
-    def square(self, amounts: Array) -> float:
-        """Return -2 log density of amounts over that of the mean."""
-        x = (amounts - self.amounts) / self.rms
-        return float(x @ x + self.share / (1 - self.share) @ (self.seen @ x) ** 2)
 
     @property
     def errors(self) -> Array:
@@ -370,34 +375,34 @@ def fit_distributed_errors(
     Raises:
         UnstableRingError: no beam is stored with the most probable errors.
     """
-    amounts = known.amounts if linearised_at is None else linearised_at
-    stored = amounts if stored is None else stored
-    expected = np.inf
-    for step in range(ROUNDS):
-        inner, there, amounts = linearise(problem, known, amounts, stored, causes, nuisances)
-        if step > 1 and abs(there.chi2 - expected) < LINEAR:
-            break
-        stored, point = amounts, there
+
+    def at(inner: Problem, point: Point, amounts: Array) -> DistributedProblem:
         slopes = signatures_of(inner, point, known.hypotheses)
         slopes *= chain_factors(known, amounts)[:, None]
         shift = ((amounts - known.amounts) @ slopes).reshape(inner.valid.shape)
         spread = known.correlated(known.rms[:, None] * slopes).reshape(-1, *inner.valid.shape)
-        among = DistributedProblem(
+        return DistributedProblem(
             places=problem.places, rare=problem.rare, fixed=(), amounts=problem.amounts,
             judgement=problem.judgement, inner=inner, known=known, linearised_at=amounts,
             spread=spread, shift=shift,
         )  # fmt: skip
-        if linearised_at is not None:
-            break
-        there = fit_nuisances(among, causes, point.nuisances)
-        if there.projection is None:
-            raise UnstableRingError(f"{there.lost} with distributed errors")
-        assert point.projection is not None
-        nuisances = there.nuisances
-        amounts = among.estimate(there.projection.out(there.residual))
-        change = ((amounts - stored) @ slopes).reshape(inner.valid.shape)
-        clean = point.projection.out(point.residual - inner.as_rows(change))
-        expected = float(clean @ clean)
+
+    def solved(inner: Problem, point: Point, amounts: Array) -> Linear:
+        among = at(inner, point, amounts)
+        there = among.at(causes, point.nuisances)
+        assert there.projection is not None
+        clean = there.projection.out(there.residual)
+        change = there.projection.coordinates(there.residual)
+        moved = among.moved(point.nuisances, change) if len(change) else point.nuisances
+        return Linear(among, point, among.estimate(clean), float(clean @ clean), moved)
+
+    if linearised_at is None:
+        made = most_probable(problem, known, known.amounts, causes, nuisances, solved)
+        among, point = made.made, made.point
+    else:
+        stored = linearised_at if stored is None else stored
+        inner, point, amounts = linearise(problem, known, linearised_at, stored, causes, nuisances)
+        among = at(inner, point, amounts)
     fitted = FittedErrors(among, problem, sizes_of(known))
     if learn:
         fitted = _scaled(fitted, point, causes, noisy, weigh)
@@ -505,6 +510,102 @@ def families_of(known: DistributedErrors) -> tuple[list[str], Indices]:
     return names, np.array([names.index(name) for name, _ in known.hypotheses])
 
 
+class Linear(NamedTuple):
+    """A linearisation at some amounts, and its most probable ones.
+
+    Attributes:
+        made: the linear problem, or its sums.
+        point: of the causes, at the amounts.
+        amounts: most probable, as far as a beam is stored, [error].
+        cost: expected there: chi-square and `DistributedErrors.square`.
+        nuisances: most probable.
+    """
+
+    made: Any
+    point: Point
+    amounts: Array
+    cost: float
+    nuisances: Array
+
+
+def most_probable(
+    problem: Problem,
+    known: DistributedErrors,
+    amounts: Array,
+    causes: Sequence[Cause],
+    nuisances: Array,
+    solved: Callable[[Problem, Point, Array], Linear],
+    partly: bool = False,
+) -> Linear:
+    """Return the linearisation at the most probable amounts.
+
+    Where orbits are large in strong sextupoles, a beam's whole way is too nonlinear for steps from
+    the design. The amounts are then those of its first half, quarter, ..., and a further part of
+    the way follows, as a machine is threaded.
+
+    Args:
+        problem, known, causes, nuisances: see `fit_distributed_errors`.
+        amounts: first ones, [error].
+        solved: makes the linear problem, and solves it.
+        partly: of as much of the way as the model explains, if it is not all.
+
+    Raises:
+        UnstableRingError: no beam is stored with the first amounts.
+    """
+    way, done, step = problem.way(), 0.0, 1.0
+    smallest = 1 / len(np.unique(way))
+    failed: Linear | UnstableRingError | None = None
+    last: Linear | None = None
+    while True:
+        share = min(done + step, 1.0)
+        part = problem.without(problem.valid & (way > share))
+        begun = nuisances if step == 1 or done else problem.first
+        found: Linear | UnstableRingError
+        try:
+            found, good = _settled(part, known, amounts, causes, begun, solved)
+        except UnstableRingError as error:
+            found, good = error, False
+        if good:
+            assert isinstance(found, Linear)
+            if share == 1:
+                return found
+            last, done, step = found, share, 2 * step
+            amounts, nuisances = found.amounts, found.nuisances
+            continue
+        failed = failed or found
+        if step > smallest:
+            step /= 2
+        elif partly and last is not None:
+            return last
+        elif isinstance(failed, Linear):
+            return failed
+        else:
+            raise failed
+
+
+def _settled(
+    problem: Problem,
+    known: DistributedErrors,
+    amounts: Array,
+    causes: Sequence[Cause],
+    nuisances: Array,
+    solved: Callable[[Problem, Point, Array], Linear],
+) -> tuple[Linear, bool]:
+    """The linearisation of some readings, and whether it predicts the cost at its amounts.
+
+    Steps may raise the cost: where noise is small, they leave a curved valley and come back."""
+    inner, point, amounts = linearise(problem, known, amounts, amounts, causes, nuisances)
+    for _ in range(ROUNDS):
+        found = solved(inner, point, amounts)
+        inner, point, at = linearise(
+            problem, known, found.amounts, amounts, causes, found.nuisances
+        )
+        amounts, cost = at, point.chi2 + known.square(at)
+        if abs(cost - found.cost) < LINEAR:
+            break
+    return found._replace(amounts=amounts), abs(cost - found.cost) < LINEAR * cost
+
+
 def linearise(
     problem: Problem,
     known: DistributedErrors,
@@ -526,18 +627,14 @@ def linearise(
     Raises:
         UnstableRingError: no amounts between the two store a beam.
     """
-    first = amounts is stored
-    for turn in range(len(STEP_SHARES)):
-        own = zip(known.hypotheses, amounts.tolist(), strict=True)
+    for share in (1.0,) if amounts is stored else (*STEP_SHARES, 0.0):
+        some = stored + share * (amounts - stored) if share else stored
+        own = zip(known.hypotheses, some.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
-        inner = replace(problem, fixed=(*problem.fixed, *there))
+        inner = problem.with_fixed(there)
         alone = fit_nuisances(inner, causes, nuisances)
         if alone.projection is not None:
-            return inner, alone, amounts
-        if first:
-            break
-        # beyond the linear range
-        amounts = stored if turn == len(STEP_SHARES) - 2 else (amounts + stored) / 2
+            return inner, alone, some
     raise UnstableRingError(f"{alone.lost} with the most probable distributed errors")
 
 
@@ -592,16 +689,14 @@ class Posterior:
         amounts: most probable amounts, [error].
         visible: errors with a signature.
         spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
-        nuisances: fitted.
-        chi2: where it is linearised.
+        problem: with the readings that were used.
     """
 
     before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
     visible: Indices = field(repr=False)
     spread: Array = field(repr=False)
-    nuisances: Array = field(repr=False)
-    chi2: float
+    problem: Problem | None = field(default=None, repr=False)
 
     @property
     def sizes(self) -> dict[str, float]:
@@ -626,135 +721,77 @@ class Sums:
     Attributes:
         gram: with each other, [error, error].
         inner: with the residual, [error].
-        some: slopes in a few rows, nuisances not projected out, [error, row].
+        keep: a few rows.
+        some: slopes in these, nuisances not projected out, [error, row].
     """
 
     gram: Array
     inner: Array
-    some: Array
-
-
-@dataclass(frozen=True)
-class _Linearised:
-    """The problem at some amounts of the errors.
-
-    Attributes:
-        at: these amounts, [error].
-        point: of the nuisances alone.
-        sums: slopes there.
-        keep: rows of `Sums.some`.
-    """
-
-    at: Array
-    point: Point
-    sums: Sums
     keep: Indices
-
-    @classmethod
-    def of(cls, known: DistributedErrors, inner: Problem, point: Point, at: Array) -> "_Linearised":
-        keep = sampled_rows(len(point.residual))
-        return cls(at, point, sums_at(inner, point, known, at, keep), keep)
-
-    def chi2(self, amounts: Array) -> float:
-        """Chi-square that is expected with other amounts."""
-        change = amounts - self.at
-        return self.point.chi2 - float(change @ (2 * self.sums.inner - self.sums.gram @ change))
-
-    def scaled(self, known: DistributedErrors, unsure: float = np.inf) -> DistributedErrors:
-        """Return the errors with estimated scales; see `posterior`."""
-        assert self.point.projection is not None
-        _, belongs = families_of(known)
-        scales = components_of_rows(
-            self.point.residual[self.keep] + (self.at - known.amounts) @ self.sums.some,
-            self.point.projection.matrix()[self.keep],
-            known.correlated(known.rms[:, None] * self.sums.some), belongs, prior=known.scales,
-        )  # fmt: skip
-        least = np.where(scales.error[belongs] < unsure, 0.0, known.rms)
-        rms = np.maximum(known.rms * scales.scale[belongs], least)
-        return replace(known, rms=rms, scales=scales.covariance)
+    some: Array
 
 
 def posterior(
     problem: Problem,
     known: DistributedErrors,
     *,
-    linearised_at: Array,
+    learn: bool = True,
     unsure: float = np.inf,
+    linearised_at: Array | None = None,
+    partly: bool = False,
 ) -> Posterior:
-    """Return the posterior of distributed errors, linearised at the most probable amounts, by whole
-    Newton steps; the scales are estimated at the last of them.
+    """Return the posterior of distributed errors, linearised at the most probable amounts.
 
     Args:
         problem: of the design.
         known: prior, with initial scales.
-        linearised_at: first point of linearisation, [error].
+        learn: estimate the scales; else they stay.
         unsure: relative error of an estimated scale from which it is not below its initial one.
+        linearised_at: first point of linearisation, [error]; None: the prior's mean.
+        partly: see `most_probable`.
 
     Raises:
         UnstableRingError: no beam is stored with the most probable errors.
     """
-    there = linearise(problem, known, linearised_at, linearised_at, (), problem.first)
-    for _ in range(ROUNDS):
-        here = _Linearised.of(known, *there)
-        amounts = _posterior_at(known, here).amounts
-        there = linearise(problem, known, amounts, here.at, (), here.point.nuisances)
-        if abs(there[1].chi2 - here.chi2(amounts)) < LINEAR:
-            break
-    return _posterior_at(here.scaled(known, unsure), here)
+
+    def solved(inner: Problem, point: Point, amounts: Array) -> Linear:
+        sums = sums_at(inner, point, known, amounts)
+        there = _posterior_at(known, amounts, sums).amounts
+        change = there - amounts
+        chi2 = point.chi2 - float(change @ (2 * sums.inner - sums.gram @ change))
+        cost = chi2 + known.square(there)
+        return Linear((inner, sums, amounts), point, there, cost, point.nuisances)
+
+    start = known.amounts if linearised_at is None else linearised_at
+    made = most_probable(problem, known, start, (), problem.first, solved, partly)
+    (inner, sums, stored), point = made.made, made.point
+    if not learn:
+        used = problem.without(problem.valid & ~inner.valid)
+        return replace(_posterior_at(known, stored, sums), amounts=made.amounts, problem=used)
+    assert point.projection is not None
+    _, belongs = families_of(known)
+    found = components_of_rows(
+        point.residual[sums.keep] + (stored - known.amounts) @ sums.some,
+        point.projection.matrix()[sums.keep],
+        known.correlated(known.rms[:, None] * sums.some), belongs, prior=known.scales,
+    )  # fmt: skip
+    least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
+    rms = np.maximum(known.rms * found.scale[belongs], least)
+    return _posterior_at(replace(known, rms=rms, scales=found.covariance), stored, sums)
 
 
-def damped_posterior(
-    problem: Problem,
-    known: DistributedErrors,
-    amounts: Array,
-    nuisances: Array,
-    learn: bool = False,
-) -> Posterior:
-    """Return the posterior where the readings may be far from linear in the errors: a part of each
-    step, as large as lowers chi-square and prior.
-
-    Args:
-        problem: of the design.
-        known: prior.
-        amounts, nuisances: first guess, [error] and as `Problem.first`.
-        learn: estimate the scales at the first guess; else they stay.
-
-    Raises:
-        UnstableRingError: no beam at the first guess.
-    """
-    here = _Linearised.of(known, *linearise(problem, known, amounts, amounts, (), nuisances))
-    known = here.scaled(known) if learn else known
-    for _ in range(ROUNDS):
-        found = _posterior_at(known, here)
-        least = here.point.chi2 + known.square(here.at)
-        for share in STEP_SHARES:
-            wanted = here.at + share * (found.amounts - here.at)
-            there = linearise(problem, known, wanted, here.at, (), here.point.nuisances)
-            _, point, at = there
-            if at is wanted and share == 1 and abs(point.chi2 - here.chi2(at)) < LINEAR:
-                return found
-            if point.chi2 + known.square(at) < least:
-                break
-        else:
-            break
-        here = _Linearised.of(known, *there)
-    return replace(_posterior_at(known, here), amounts=here.at)
-
-
-def _posterior_at(known: DistributedErrors, here: _Linearised) -> Posterior:
-    """The posterior of linearised errors."""
-    sums = here.sums
+def _posterior_at(known: DistributedErrors, at: Array, sums: Sums) -> Posterior:
+    """The posterior of errors linearised at some amounts."""
     spread = known.correlated(known.correlated(known.rms[:, None] * sums.gram * known.rms).T)
     visible = np.flatnonzero(np.diag(spread) > 0)
     spread = spread[np.ix_(visible, visible)]
-    pull = known.correlated(known.rms * (sums.inner + sums.gram @ (here.at - known.amounts)))
+    pull = known.correlated(known.rms * (sums.inner + sums.gram @ (at - known.amounts)))
     most_probable = np.zeros(len(pull))
     rounding = len(visible) * np.finfo(float).eps * np.diag(spread).max(initial=0.0)
     ridge = (1 + rounding) * np.eye(len(visible))
     factor = cho_factor(spread + ridge, overwrite_a=True, check_finite=False)
     most_probable[visible] = cho_solve(factor, pull[visible], check_finite=False)
-    amounts = known.amounts_at(most_probable)
-    return Posterior(known, amounts, visible, spread, here.point.nuisances, here.point.chi2)
+    return Posterior(known, known.amounts_at(most_probable), visible, spread)
 
 
 def sums_at(
@@ -762,7 +799,6 @@ def sums_at(
     point: Point,
     known: DistributedErrors,
     amounts: Array,
-    keep: Indices,
 ) -> Sums:
     """Return the sums at a point.
 
@@ -771,13 +807,12 @@ def sums_at(
         point: of nuisances alone.
         known: the errors.
         amounts: amounts of the errors in the problem, [error].
-        keep: rows for `Sums.some`.
     """
     assert point.projection is not None
     clean = point.projection.out(point.residual)
     directions = np.linalg.qr(point.projection.matrix())[0]
     slope = chain_factors(known, amounts)
-    count = len(slope)
+    keep, count = sampled_rows(len(clean)), len(slope)
     gram, inner = np.zeros((count, count)), np.zeros(count)
     along, some = np.zeros((count, directions.shape[1])), np.zeros((count, len(keep)))
     column = np.full(len(clean), -1)
@@ -791,4 +826,4 @@ def sums_at(
         here = column[rows]
         some[np.ix_(visible, here[here >= 0])] = own[:, here >= 0]
     gram -= along @ along.T
-    return Sums(gram, inner, some)
+    return Sums(gram, inner, keep, some)

@@ -183,13 +183,16 @@ def fit_nuisances(problem: Problem, causes: Sequence[Cause], nuisances: Array) -
         nuisances: first guess.
     """
     point = problem.at(causes, nuisances)
-    for _ in range(AGAIN):  # nearly linear
+    for _ in range(ITERATIONS):  # two or three, but where orbits are large in strong sextupoles
         if point.projection is None:
             break
         change = point.projection.coordinates(point.residual)
-        if not len(change):
+        there = _best_move(problem, point, np.zeros(0), change, point.chi2) if len(change) else None
+        if there is None:
             break
-        point = problem.at(causes, problem.moved(point.nuisances, change))
+        fell, point = point.chi2 - there.chi2, there
+        if fell < SETTLED:
+            break
     return point
 
 
@@ -259,8 +262,6 @@ def _best_move(
     for shrink in STEP_SHARES:
         trial = _moved(problem, point, shrink * change, shrink * moved)
         cost = _cost(problem, trial)
-        if trial.lost:  # no start for the next step
-            continue
         if cost < now or (shrink == 1.0 and cost <= now + 1e-6):
             return trial
     return None
@@ -269,7 +270,7 @@ def _best_move(
 def _moved(problem: Problem, point: Point, change: Array, moved: Array) -> Point:
     causes = list(point.causes)
     amounts = _continuous(point)
-    for i, delta in zip(amounts, change, strict=False):
+    for i, delta in zip(amounts, change, strict=False):  # none: they stay
         causes[i] = replace(causes[i], amount=causes[i].amount + float(delta))
     kicks, at = {}, len(amounts)
     for place, values in point.kicks.items():

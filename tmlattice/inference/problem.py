@@ -186,6 +186,10 @@ class Problem(ABC):
     def owner(self) -> Indices:
         """Monitor of each reading, of the shape of `valid`."""
 
+    def way(self) -> Array:
+        """Share of the beam's way that each reading sees, of the shape of `valid`; 0: all."""
+        return np.zeros(self.valid.shape)
+
     @abstractmethod
     def as_rows(self, readings: Array) -> Array:
         """Whitened rows [..., row] of readings or their changes [..., *shape of `valid`]."""

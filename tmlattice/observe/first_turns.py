@@ -209,6 +209,12 @@ class FirstTurns(Problem):
         one = np.tile(np.arange(len(self.monitors)), self.data.turns)
         return np.broadcast_to(one[None, :, None], self.valid.shape)
 
+    def way(self) -> Array:
+        """Share of the way to the last BPM that read the beam."""
+        read = np.flatnonzero(self.valid.any(axis=(0, 2)))
+        share = (1.0 + np.arange(self.valid.shape[1])) / (read.max(initial=0) + 1)
+        return np.broadcast_to(share[None, :, None], self.valid.shape)
+
     @property
     def freedom(self) -> int:
         """Degrees of freedom; prior knowledge of a launch counts as readings of it."""
