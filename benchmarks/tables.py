@@ -118,20 +118,6 @@ def of_threading(machines):
         ]  # fmt: skip
 
 
-def of_ranges(machines):
-    """Gain with the default range of a supply and without limits, by `supply_range.py`."""
-    yield ["ring", "code", "wrong by 20 %", "gain with the range", "supplies at a limit",
-           "gain without limits", "largest change (its share of the gain)"]  # fmt: skip
-    for one in machines:
-        if "refused" in one:
-            yield [one["ring"], one["commit"], one["magnet"], "no stored beam", "", "", ""]
-            continue
-        held, free = one["range"], one["free"]
-        change = f"{free['supply']} {100 * free['change']:+.3g} % ({100 * free['its_gain']:.2g} %)"
-        yield [one["ring"], one["commit"], one["magnet"], f"{100 * held['gain']:.1f} %",
-               str(held["at_limit"]), f"{100 * free['gain']:.1f} %", change]  # fmt: skip
-
-
 def of_score(scored):
     """Rates of `tmlattice dev challenge score --json`, by signal to noise and method."""
     yield ["single faults (tier A)", *BLIND.values()]
@@ -214,7 +200,6 @@ SOURCES = {
     "gpu_raw.json": of_gpu,
     "correct_studies.jsonl": of_corrections,
     "threading.jsonl": of_threading,
-    "supply_range.jsonl": of_ranges,
     "blind_score.json": of_score,
 }
 
