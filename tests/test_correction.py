@@ -167,6 +167,25 @@ def test_limits_steps_and_excitation_curves(small_ring, wrong):
     assert rising.setting(0.2) == pytest.approx(140.0)
 
 
+def test_a_strength_without_limits_has_a_range(small_ring):
+    """As far as undoes the largest plausible fault: 7.5 % of a family, 45 % of one magnet."""
+    magnet = small_ring["QF::3"]
+    machine = apply(small_ring, [Cause("quadrupole_gradient", magnet.name, -0.35)])
+    family = correct(machine, goal=small_ring).settings[0].knob
+    assert sorted((family.low / family.present, family.high / family.present)) == pytest.approx(
+        [0.925, 1.075]
+    )
+    (knob,) = (k for k in default_knobs(small_ring, ["quadrupoles"]) if k.name == magnet.name)
+    found = correct(machine, goal=small_ring, knobs=[knob], targets=NO_ORBIT)
+    (held,) = found.settings
+    assert held.at_limit
+    assert held.amount == pytest.approx(0.45)
+    assert f"held by their limits: {magnet.name}" in found.report()
+    stated = replace(knob, low=0.0, high=2 * knob.present)
+    (wide,) = correct(machine, goal=small_ring, knobs=[stated], targets=NO_ORBIT).settings
+    assert 0.5 < wide.amount <= 1 / 0.65 - 1
+
+
 def test_the_rf_frequency_moves_the_energy(small_ring):
     """An orbit of another energy: the RF brings it back."""
     shifted = Estimate(small_ring, small_ring)
@@ -623,6 +642,36 @@ def test_diagnose_states_the_correction(small_ring, tmp_path):
     for part in ("before", "after"):
         for name, planes in first[part].items():
             np.testing.assert_allclose(second[part][name], planes, rtol=1e-4, atol=1e-9)
+
+
+def test_a_folder_of_a_diagnosis_is_corrected(small_ring, tmp_path):
+    """It holds the estimated ring with its uncertainty; after a reference there is none."""
+
+    def run(*words):
+        done = CliRunner().invoke(tmlattice, [str(w) for w in words])
+        return f"{done.output} {done.exception}" if done.exit_code else ""
+
+    save_ring(small_ring, tmp_path / "design.json")
+    for name, amount in (("before", 0.0), ("day", 0.01)):
+        data = simulate_response(
+            small_ring, [Cause("family_gradient", "QD", amount)] * (amount != 0), engine="ocelot",
+            progress=False, noise=1e-7,
+        ).measured  # fmt: skip
+        write_measurement(tmp_path / name, data)
+    words = ("diagnose", tmp_path / "design.json", tmp_path / "day", "--effects",
+             "quadrupole_gradient", "--out", tmp_path / "D")  # fmt: skip
+    assert not run(*words)
+    assert not (tmp_path / "D" / "settings.csv").exists()
+    (tmp_path / "D").rename(tmp_path / "moved")
+    assert not run("correct", tmp_path / "moved", "--target", "tunes", "--out", tmp_path / "S")
+    rows = {r["device"]: r for r in csv.DictReader((tmp_path / "S" / "settings.csv").open())}
+    assert float(rows["QD"]["new"]) == pytest.approx(small_ring["QD::0"].k1 / 1.01, rel=1e-3)
+    page = (tmp_path / "S" / "report.html").read_text()
+    assert "taken as certain" not in page
+    assert not run(*words[:-1], tmp_path / "moved", "--reference", tmp_path / "before")
+    said = run("correct", tmp_path / "moved")
+    assert "names no estimated ring" in said
+    assert not (tmp_path / "moved" / "estimated.json.known.json").exists()
 
 
 def test_an_energy_is_as_uncertain_in_the_files_as_in_the_diagnosis(small_ring, tmp_path):

@@ -90,8 +90,8 @@ def correct(
 ) -> None:
     """Settings of power supplies that bring the ESTIMATED ring to the design, with their gain.
 
-    ESTIMATED is a lattice file of `diagnose --lattice-out`, with the file of remaining
-    uncertainties next to it, or the folder of `diagnose --out` with it; or, to thread a lost beam
+    ESTIMATED is the folder of `diagnose --out`, or a lattice file of `diagnose --lattice-out` with
+    the file of remaining uncertainties next to it; or, to thread a lost beam
     (--target first_turn), the folders of its measured first turns, in the order of time. Predicted
     rms errors have 68 % intervals. Changes that may make the ring worse are shortened, or not made.
     """
@@ -184,8 +184,8 @@ def _sources(estimated: Path, design: str | None) -> tuple[Path, str | None]:
     made = read_document(document, "diagnosis", FORMAT, VERSION)["provenance"]
     if not made.get("lattice_out"):
         raise MeasurementError(
-            f"'{document}' names no estimated ring; run `tmlattice diagnose` with --lattice-out, "
-            "and give that file"
+            f"'{document}' names no estimated ring; run `tmlattice diagnose` without --reference, "
+            "with --out or --lattice-out"
         )
     found, named, kept = made["lattice_out"], made["lattice"], document.with_name(LATTICE)
     check_no_code(document, found, MeasurementError, f"give it instead of {estimated}")
@@ -193,7 +193,7 @@ def _sources(estimated: Path, design: str | None) -> tuple[Path, str | None]:
         design = str(kept)  # the same ring, as data
     if design is None:
         check_no_code(document, named, MeasurementError, f"give --design {plain(named, 60)}")
-    return Path(found), design or named
+    return document.parent / found, design or named
 
 
 def _devices(knobs: str | None, settings: "Ring", targets: dict[str, float | None]) -> list[Any]:

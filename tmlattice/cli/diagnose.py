@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from math import isfinite
 from pathlib import Path
@@ -112,7 +113,8 @@ log = logging.getLogger(__name__)
     "--out",
     type=FILE,
     metavar="DIR",
-    help="Folder for diagnosis.json, report.html, report.txt and the figures.",
+    help="Folder for diagnosis.json, report.html, report.txt, the figures, and the estimated ring, "
+    "for `tmlattice correct DIR`.",
 )
 def diagnose(
     lattice: str,
@@ -142,8 +144,13 @@ def diagnose(
     apply to it.
     """
     from tmlattice.correction.result import FILES
+    from tmlattice.diagnosis.load import ESTIMATED
+    from tmlattice.diagnosis.twin import knowledge_file, known_of
+    from tmlattice.errors import LatticeError
 
-    with outputs(out, json_file, FILES) as (folder, write):
+    kept = Path(ESTIMATED)
+    replaced = (*FILES, *map(str, (kept, calibration_beside(kept), knowledge_file(kept))))
+    with outputs(out, json_file, replaced) as (folder, write):
         from tmlattice.correction.applied import applied
         from tmlattice.correction.applied import sentence as of_device
         from tmlattice.correction.knobs import read_settings
@@ -205,14 +212,17 @@ def diagnose(
             source["assumed_of_files"] = said
         if lattice_out:
             source["lattice_out"] = str(lattice_out.absolute())
-        known = None
-        if lattice_out or (asked and not before):
+        known = correction = None
+        if lattice_out or ((asked or folder) and not before):
             tell("remaining uncertainties")  # minutes, of a large response
-            from tmlattice.diagnosis.twin import known_of
-
             known = known_of(result)
-        # of what was changed on purpose it would be the way back
-        correction = None if asked and before else _correction(result, known, asked)
+        if lattice_out or asked:
+            # of what was changed on purpose it would be the way back
+            correction = None if asked and before else _correction(result, known, asked)
+        if folder and not lattice_out and not before:
+            with suppress(LatticeError):  # an element that no file holds
+                _save_rings(result, known, folder / ESTIMATED, None)
+                source["lattice_out"] = ESTIMATED
         calibrations = applied(result, asked) if asked and before else []
         if calibrations:
             source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]

@@ -63,20 +63,17 @@ def correct(
     """
     begun = time.perf_counter()
     goal = None if goal is None else load_ring(goal)
-    chosen = targets
-    if chosen is None:
+    if targets is None:
         orbit = isinstance(diagnosis, Diagnosis) and "closed_orbit" in diagnosis.measured
-        chosen = (*OPTICS, "closed_orbit") if orbit else OPTICS
+        targets = (*OPTICS, "closed_orbit") if orbit else OPTICS
     progress("posterior")
     estimate = _estimate(diagnosis, goal)
     wanted = estimate.settings if goal is None else goal
     compared: Targets | Threading
-    if [*chosen] == [THREADING]:
-        compared = Threading(
-            wanted, dict(chosen)[THREADING] if isinstance(chosen, Mapping) else None
-        )
+    if [*targets] == [THREADING]:
+        compared = Threading(wanted, targets[THREADING] if isinstance(targets, Mapping) else None)
     else:
-        compared = Targets(wanted, chosen)
+        compared = Targets(wanted, targets)
         estimate = estimate.storing()
     devices = chosen_knobs(knobs, estimate.settings, compared.names)
     progress("correction")
@@ -90,9 +87,8 @@ def correct(
     whole, order = fewest(problem)
     end, aversion = safest(begin, whole, order)
     found = _fields(begin, whole, end, aversion, order)
-    seconds = time.perf_counter() - begun
     made = {"lattice": estimate.settings.name, "seed": seed, "draws": DRAWS,
-            "knobs": len(devices), "seconds": seconds}  # fmt: skip
+            "knobs": len(devices), "seconds": time.perf_counter() - begun}  # fmt: skip
     return Correction(**found, ring=estimate.settings, provenance=made)
 
 

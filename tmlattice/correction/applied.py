@@ -63,8 +63,7 @@ def applied(diagnosis: Diagnosis, settings: Sequence[tuple[Knob, float]]) -> lis
     for knob, new in settings:
         if new == knob.present:
             continue
-        family = {"quadrupole": "family_gradient", "sextupole": "family_sextupole"}.get(knob.kind)
-        shared, sigma = amounts.get((str(family), knob.name.casefold()), (0.0, 0.0))
+        shared, sigma = amounts.get((KINDS[knob.kind].family, knob.name.casefold()), (0.0, 0.0))
         members = [(str(KINDS[knob.kind].effect), member.casefold()) for member in knob.members]
         own = [amounts[key] for key in members if key in amounts]
         mean, error = shared, math.inf

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import erfcx
 
 from tmlattice.beam.model import Model
 from tmlattice.beam.readouts import APERTURE
@@ -26,10 +26,8 @@ from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.knobs import KINDS
 from tmlattice.correction.targets import TARGETS, THREADING, Weighted
 from tmlattice.effects import Cause, apply, background_rms, find
-from tmlattice.errors import UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors, families_of, posterior
 from tmlattice.inference.metric import Hypothesis
-from tmlattice.inference.newton import fit_nuisances
 from tmlattice.inference.variance_components import prior_covariance
 from tmlattice.lattice import Element, Ring
 from tmlattice.measurement import Measurement
@@ -42,8 +40,6 @@ TURNS = 2
 LOST = 0.1
 """m; reading of a lost beam. It is beyond any aperture, so that the first readings outside of one
 still show the beam's direction."""
-FITS = 12
-"""Posteriors at most, each with readings that the one before it made reachable."""
 UNREAD = 2
 """Readings at the end of a shot, at least, that a lost beam lacks: one alone may be a dead BPM."""
 SURPRISE = 2.0
@@ -144,8 +140,7 @@ def estimate_of_turns(
     for measured in measurements:
         data = of_measurement(ring, measured)
         known = given_losses(ring, _given_readings(ring, data, known), data)
-        changed = data.settings[-1].items()
-        kicks = {name: own["kick"] for name, own in changed if "kick" in own}
+        kicks = {n: own["kick"] for n, own in data.settings[-1].items() if "kick" in own}
     estimate = Estimate(ring, ring, known or DistributedErrors.usual([], {}))
     settings, causes = ring, []
     for name, kick in kicks.items():
@@ -158,7 +153,7 @@ def estimate_of_turns(
 
 def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> DistributedErrors:
     """The posterior given the readings: those behind a loss in the model come when it gets there,
-    and half as many where they are not explained, since the model is too nonlinear."""
+    and as many as it explains, since it is too nonlinear far from its linearisation."""
     problem = FirstTurns(model=Model(ring, data.settings, data.turns), data=data, places={})
     usual = background_rms({"all": None})
     seen = [(n, p) for n in usual for p in find(n).places(ring) if problem.sees((n, p))]
@@ -167,38 +162,12 @@ def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> 
         kinds = [name.removesuffix("_x").removesuffix("_y") for name in families_of(known)[0]]
         known = replace(known, scales=prior_covariance(kinds))
     known = known.extended(seen)
-    amounts, used, most = known.amounts, 0, data.valid.shape[1]
-    found = None
-    for _ in range(FITS):
-        there = _with(problem, known, amounts)
-        kept = data.valid & np.isfinite(there.model.readings(problem.first, there.fixed))
-        kept[:, most:] = False
-        count = int(kept.sum())
-        if count <= used:
-            break
-        own = problem.without(~kept)
-        try:
-            tried = posterior(own, known, linearised_at=amounts, learn=False)
-            better = _chi2(own, known, tried.amounts) < _chi2(own, known, amounts) + count
-        except UnstableRingError:
-            better = False
-        if better:
-            found, amounts, used, most = own, tried.amounts, count, data.valid.shape[1]
-        else:
-            most = int(np.flatnonzero(kept.any(axis=(0, 2)))[-1] + 1) // 2
-    if found is None:
-        raise UnstableRingError("the beam is lost in the model before it is read")
-    return posterior(found, known, linearised_at=amounts).known
-
-
-def _with(problem: FirstTurns, known: DistributedErrors, amounts: Array) -> FirstTurns:
-    own = zip(known.hypotheses, amounts.tolist(), strict=True)
-    return problem.with_fixed([Cause(*h, amount) for h, amount in own if amount])
-
-
-def _chi2(problem: FirstTurns, known: DistributedErrors, amounts: Array) -> float:
-    point = fit_nuisances(_with(problem, known, amounts), (), problem.first)
-    return np.inf if point.lost else point.chi2
+    found = posterior(problem, known, learn=False, partly=True)
+    assert found.problem is not None
+    scaled = posterior(found.problem, known, linearised_at=found.amounts).before
+    return posterior(
+        found.problem, scaled, learn=False, linearised_at=found.amounts, partly=True
+    ).known
 
 
 def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> DistributedErrors:
@@ -249,7 +218,7 @@ def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> Distribute
         distance, side, direction = min(nearest, key=lambda one: one[0])
         scale = max(distance / SURPRISE, 1.0)
         z = distance / scale
-        mean = float(norm.pdf(z) / norm.sf(z))
+        mean = float(np.sqrt(2 / np.pi) / erfcx(z / np.sqrt(2)))  # of a Gaussian beyond z
         share = max(1 - scale**2 * (1 + z * mean - mean**2), 0.0)
         step = side * scale * mean * direction
         left = 1 - np.sqrt(1 - share)

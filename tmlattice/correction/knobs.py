@@ -20,6 +20,7 @@ import numpy as np
 from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, check, find
 from tmlattice.errors import EffectError, MeasurementError, plain, unknown_choice
+from tmlattice.inference.judgement import BEYOND
 from tmlattice.input_files import number, text_of, yaml_of
 from tmlattice.lattice import Ring
 from tmlattice.lattice.supplies import magnets, supplied_alike
@@ -37,6 +38,7 @@ class Kind:
         strength: OCELOT's attribute that it sets, as in snippets.
         unit: of the strength.
         relative: whether the effect's amount is the relative change of the strength.
+        family: the effect on several magnets of one supply.
         error: default relative error of a change: calibration and hysteresis of quadrupoles are
             known to a per cent, a corrector's to the usual size of its error.
     """
@@ -45,20 +47,18 @@ class Kind:
     strength: str
     unit: str
     relative: bool
+    family: str = ""
     error: float = 0.01
 
 
+CALIBRATED = find("corrector_calibration").background or 0.0
 KINDS: dict[str, Kind] = {
-    "quadrupole": Kind("quadrupole_gradient", "k1", "1/m2", True),
+    "quadrupole": Kind("quadrupole_gradient", "k1", "1/m2", True, "family_gradient"),
     "skew_quadrupole": Kind("skew_gradient", "k1sl", "1/m", False),
-    "sextupole": Kind("sextupole_strength", "k2", "1/m3", True),
-    "hcorrector": Kind(
-        "corrector_kick_x", "kick", "rad", False, find("corrector_calibration").background or 0.0
-    ),
-    "vcorrector": Kind(
-        "corrector_kick_y", "kick", "rad", False, find("corrector_calibration").background or 0.0
-    ),
-    "rf": Kind(None, "frequency", "Hz", True, 0.0),
+    "sextupole": Kind("sextupole_strength", "k2", "1/m3", True, "family_sextupole"),
+    "hcorrector": Kind("corrector_kick_x", "kick", "rad", False, error=CALIBRATED),
+    "vcorrector": Kind("corrector_kick_y", "kick", "rad", False, error=CALIBRATED),
+    "rf": Kind(None, "frequency", "Hz", True, error=0.0),
 }
 
 
@@ -72,7 +72,7 @@ class Knob:
         members: names of the elements that it powers; none of the RF.
         unit: of its setting.
         present: setting.
-        low, high: limits of the setting.
+        low, high: limits of the setting; infinite: those of `within_range`.
         step: smallest change of the setting; 0: none.
         curve: points (setting, strength) in rising settings; none: the strength is proportional to
             the setting (of an effect that adds, equal to it).
@@ -170,11 +170,23 @@ def chosen_knobs(
         orbit = {"closed_orbit", "first_turn"} & set(targets)
         optics = [] if set(targets) <= orbit else ["supplies", "skew_quadrupoles"]
         knobs = [*optics, *["correctors"] * bool(orbit)]
-    devices = [own for own in knobs if isinstance(own, Knob)]
     kinds = [own for own in knobs if isinstance(own, str)]
-    every = devices + (default_knobs(ring, kinds) if kinds else [])
+    every = [*(own for own in knobs if isinstance(own, Knob)), *default_knobs(ring, kinds)]
     check_distinct("the knobs", every)
-    return every
+    return [within_range(own, ring) for own in every]
+
+
+def within_range(knob: Knob, ring: Ring) -> Knob:
+    """Return the knob with limits where it states none: a strength of the design is set as far as
+    undoes the largest plausible fault of the supply, or of its one magnet."""
+    kind = KINDS[knob.kind]
+    if not kind.family:
+        return knob
+    alone = len({ring.pieces(ring[member].name) for member in knob.members}) == 1
+    most = BEYOND * find(str(kind.effect) if alone else kind.family).largest
+    low, high = sorted(knob.setting(side * most) for side in (-1, 1))
+    return replace(knob, low=knob.low if math.isfinite(knob.low) else low,
+                   high=knob.high if math.isfinite(knob.high) else high)  # fmt: skip
 
 
 def check_distinct(where: str, knobs: Iterable[Knob]) -> None:
@@ -381,11 +393,9 @@ def _read(path: Path, row: Mapping[str, Any], ring: Ring, shown: Mapping[str, Kn
     name = str(given.pop("knob", "")).strip()
     where = f"{path}: knob '{plain(name, 40)}'"
     if not name or (strange := set(given) - set(COLUMNS)):
-        what = (
-            f"{path}: a row without a knob"
-            if not name
-            else f"{where}: unknown column {plain(str(min(map(str, strange))), 40)}"
-        )
+        what = f"{path}: a row without a knob"
+        if name:
+            what = f"{where}: unknown column {plain(str(min(map(str, strange))), 40)}"
         raise MeasurementError(f"{what}; the columns are {', '.join(COLUMNS)}")
     members = given.pop("members", ())
     names = members.split() if isinstance(members, str) else list(members)

@@ -34,6 +34,8 @@ from tmlattice.measurement.documents import read_document
 FORMAT, VERSION = "tmlattice-diagnosis", 2
 DOCUMENT, LATTICE = "diagnosis.json", "diagnosis.lattice.json"
 """Of a folder of `save`: the result, and the lattice that it is about."""
+ESTIMATED = "estimated.json"
+"""Of a folder of `diagnose --out`: the estimated ring, with its files of `--lattice-out`."""
 
 
 def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diagnosis:

@@ -135,8 +135,6 @@ def directions_nearby(
             again = sitting_on(origin.ring, layers.ring, hypotheses, places)
             if again:
                 found = found.replaced(again, directions(layers, [hypotheses[i] for i in again]))
-        if layers.origin is not None:
-            return found
         layers.memory[key] = found
     remembered: Directions = layers.memory[key]
     return remembered

@@ -535,6 +535,7 @@ def most_probable(
     causes: Sequence[Cause],
     nuisances: Array,
     solved: Callable[[Problem, Point, Array], Linear],
+    partly: bool = False,
 ) -> Linear:
     """Return the linearisation at the most probable amounts.
 
@@ -546,6 +547,7 @@ def most_probable(
         problem, known, causes, nuisances: see `fit_distributed_errors`.
         amounts: first ones, [error].
         solved: makes the linear problem, and solves it.
+        partly: of as much of the way as the model explains, if it is not all.
 
     Raises:
         UnstableRingError: no beam is stored with the first amounts.
@@ -553,6 +555,7 @@ def most_probable(
     way, done, step = problem.way(), 0.0, 1.0
     smallest = 1 / len(np.unique(way))
     failed: Linear | UnstableRingError | None = None
+    last: Linear | None = None
     while True:
         share = min(done + step, 1.0)
         part = problem.without(problem.valid & (way > share))
@@ -566,12 +569,14 @@ def most_probable(
             assert isinstance(found, Linear)
             if share == 1:
                 return found
-            done, step = share, 2 * step
+            last, done, step = found, share, 2 * step
             amounts, nuisances = found.amounts, found.nuisances
             continue
         failed = failed or found
         if step > smallest:
             step /= 2
+        elif partly and last is not None:
+            return last
         elif isinstance(failed, Linear):
             return failed
         else:
@@ -627,7 +632,7 @@ def linearise(
         some = stored + share * (amounts - stored) if share else stored
         own = zip(known.hypotheses, some.tolist(), strict=True)
         there = [Cause(*h, a) for h, a in own if a]
-        inner = replace(problem, fixed=(*problem.fixed, *there))
+        inner = problem.with_fixed(there)
         alone = fit_nuisances(inner, causes, nuisances)
         if alone.projection is not None:
             return inner, alone, some
@@ -685,12 +690,14 @@ class Posterior:
         amounts: most probable amounts, [error].
         visible: errors with a signature.
         spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
+        problem: with the readings that were used.
     """
 
     before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
     visible: Indices = field(repr=False)
     spread: Array = field(repr=False)
+    problem: Problem | None = field(default=None, repr=False)
 
     @property
     def sizes(self) -> dict[str, float]:
@@ -732,6 +739,7 @@ def posterior(
     learn: bool = True,
     unsure: float = np.inf,
     linearised_at: Array | None = None,
+    partly: bool = False,
 ) -> Posterior:
     """Return the posterior of distributed errors, linearised at the most probable amounts.
 
@@ -741,6 +749,7 @@ def posterior(
         learn: estimate the scales; else they stay.
         unsure: relative error of an estimated scale from which it is not below its initial one.
         linearised_at: first point of linearisation, [error]; None: the prior's mean.
+        partly: see `most_probable`.
 
     Raises:
         UnstableRingError: no beam is stored with the most probable errors.
@@ -751,13 +760,15 @@ def posterior(
         there = _posterior_at(known, amounts, sums).amounts
         change = there - amounts
         chi2 = point.chi2 - float(change @ (2 * sums.inner - sums.gram @ change))
-        return Linear((sums, amounts), point, there, chi2 + known.square(there), point.nuisances)
+        cost = chi2 + known.square(there)
+        return Linear((inner, sums, amounts), point, there, cost, point.nuisances)
 
     start = known.amounts if linearised_at is None else linearised_at
-    made = most_probable(problem, known, start, (), problem.first, solved)
-    (sums, stored), point = made.made, made.point
+    made = most_probable(problem, known, start, (), problem.first, solved, partly)
+    (inner, sums, stored), point = made.made, made.point
     if not learn:
-        return replace(_posterior_at(known, stored, sums), amounts=made.amounts)
+        used = problem.without(problem.valid & ~inner.valid)
+        return replace(_posterior_at(known, stored, sums), amounts=made.amounts, problem=used)
     assert point.projection is not None
     _, belongs = families_of(known)
     found = components_of_rows(
