@@ -162,12 +162,7 @@ def _given_readings(ring: Ring, data: Data, known: DistributedErrors | None) -> 
         kinds = [name.removesuffix("_x").removesuffix("_y") for name in families_of(known)[0]]
         known = replace(known, scales=prior_covariance(kinds))
     known = known.extended(seen)
-    found = posterior(problem, known, learn=False, partly=True)
-    assert found.problem is not None
-    scaled = posterior(found.problem, known, linearised_at=found.amounts).before
-    return posterior(
-        found.problem, scaled, learn=False, linearised_at=found.amounts, partly=True
-    ).known
+    return posterior(problem, known, partly=True).known
 
 
 def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> DistributedErrors:

@@ -690,14 +690,12 @@ class Posterior:
         amounts: most probable amounts, [error].
         visible: errors with a signature.
         spread: S S^T of these, in the coordinates of `correlated`, [visible, visible].
-        problem: with the readings that were used.
     """
 
     before: DistributedErrors = field(repr=False)
     amounts: Array = field(repr=False)
     visible: Indices = field(repr=False)
     spread: Array = field(repr=False)
-    problem: Problem | None = field(default=None, repr=False)
 
     @property
     def sizes(self) -> dict[str, float]:
@@ -767,8 +765,7 @@ def posterior(
     made = most_probable(problem, known, start, (), problem.first, solved, partly)
     (inner, sums, stored), point = made.made, made.point
     if not learn:
-        used = problem.without(problem.valid & ~inner.valid)
-        return replace(_posterior_at(known, stored, sums), amounts=made.amounts, problem=used)
+        return replace(_posterior_at(known, stored, sums), amounts=made.amounts)
     assert point.projection is not None
     _, belongs = families_of(known)
     found = components_of_rows(
@@ -778,7 +775,11 @@ def posterior(
     )  # fmt: skip
     least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
     rms = np.maximum(known.rms * found.scale[belongs], least)
-    return _posterior_at(replace(known, rms=rms, scales=found.covariance), stored, sums)
+    # the amounts follow their scales
+    return posterior(
+        problem.without(problem.valid & ~inner.valid), partly=partly, learn=False,
+        known=replace(known, rms=rms, scales=found.covariance), linearised_at=made.amounts,
+    )  # fmt: skip
 
 
 def _posterior_at(known: DistributedErrors, at: Array, sums: Sums) -> Posterior:
