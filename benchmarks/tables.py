@@ -114,7 +114,7 @@ def of_threading(machines):
             ring, code(own), f"{1e3 * offset:g} mm", str(len(own)),
             f"{100 * np.median([one['before'] for one in own]):.0f} %",
             str(sum(one["oracle"] == 20 for one in own)), str(len(rounds)),
-            f"{np.median(rounds):g} ({max(rounds)})",
+            f"{np.median(rounds):g} ({max(rounds)})" if rounds else "",
         ]  # fmt: skip
 
 

@@ -94,7 +94,7 @@ def test_chi_square_of_a_healthy_ring_is_right_at_every_amplitude(small_ring, am
     found = fit(problem, (), problem.first)
     assert found.chi2 < problem.freedom + 4 * np.sqrt(2 * problem.freedom)
     assert found.chi2 > 0.6 * problem.freedom
-    pulls = found.point.nuisances[0, :, 2:4] / problem.shift.error[0].T
+    pulls = found.point.nuisances[0, :, 2:5] / problem.shift.error[0].T
     assert np.abs(pulls).max() < 1  # the shift is AT's to less than a tenth
     linear = replace(problem, shift=replace(problem.shift, modes=0 * problem.shift.modes,
                                             tunes=0 * problem.shift.tunes))  # fmt: skip
@@ -114,7 +114,7 @@ def test_shifts_are_of_the_measured_actions_where_a_kick_makes_others():
     problem = many_turns(ring, turns, {})
     found = fit(problem, (), problem.first)
     assert found.chi2 < problem.freedom
-    pulls = found.point.nuisances[0, :, 2:4] / problem.shift.error[0].T
+    pulls = found.point.nuisances[0, :, 2:5] / problem.shift.error[0].T
     assert np.abs(pulls).max() < 1.5
     assert diagnose(ring, turns).verdict == "none"
 
@@ -147,13 +147,13 @@ def test_what_decoheres_has_an_imaginary_energy(small_ring):
     turns = simulate_turns(small_ring, **beam, noise=2e-6).measured
     problem = many_turns(small_ring, turns, {})
     point = fit(problem, (), problem.first).point
-    real, imaginary, square, _ = point.nuisances[0, :, 4:].T
+    real, imaginary, square, _ = point.nuisances[0, :, 5:].T
     assert_allclose(imaginary, np.pi**-0.5, rtol=0.4)  # the kick favours some energies
     assert np.abs(real).max() < 0.1
     assert 0.2 < square.min() < square.max() < 1.2  # of delta ** 2, with weights of some turns
     # a mean energy of a tenth of the spread moves the tunes by the chromaticity
     more = point.nuisances.copy()
-    more[..., 4] += 0.1
+    more[..., 5] += 0.1
     moved = problem.read(point.view, more) - problem.read(point.view, point.nuisances)
     network = TaylorNetwork.from_ring(small_ring, 6)
     chromaticity = off_momentum(network, small_ring.length).chromaticity

@@ -19,7 +19,8 @@ shift by as much. The design is tracked from the measured amplitudes, and its tu
 the same `lines` as the measured ones. The shift is the difference from a small oscillation. It has
 a part by the action of each mode, which may compensate one another; each has an error of its own.
 Its next order, in the fourth power of the amplitude, is the shift less twice that at half the
-action.
+action: a pattern around the ring with an unknown share. (As independent errors of the monitors a
+family of quadrupoles explained it, in a ring whose cells repeat.)
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +52,9 @@ FLOOR = 1e-4
 monitors."""
 
 
-OTHERS = 6
+ORDERS = 3
+"""Parts of a shift by amplitude: of the action of each mode, and the next order."""
+OTHERS = ORDERS + 4
 """Nuisances of a shot and mode other than its amplitude: see `ManyTurns`."""
 LINES = -2 * OTHERS - 2
 """End of the lines among the data of a shot."""
@@ -90,30 +93,24 @@ class Shift:
     """Shift of the lines of each shot by its amplitude.
 
     Attributes:
-        modes: change of the modes' vectors at the monitors by the action of each mode, [shot,
-            action, monitor, 2, mode].
-        tunes: change of Q, [shot, action, mode].
-        error: relative rms error of both, common to all monitors, [shot, action, mode].
-        mode_error, tune_error: rms of the next order: of the lines, m, independent between
-            monitors, [shot, monitor, 2, mode], and of the tunes, [shot, mode].
+        modes: change of the modes' vectors at the monitors by the action of each mode, and by the
+            next order, [shot, part, monitor, 2, mode].
+        tunes: change of Q, [shot, part, mode].
+        error: relative rms error of both, common to all monitors, [shot, part, mode].
         too_large: shots whose amplitude second-order maps do not describe, [shot].
     """
 
     modes: ComplexArray
     tunes: Array
     error: Array
-    mode_error: Array
-    tune_error: Array
     too_large: Flags
 
     @classmethod
     def none(cls, shots: int, monitors: int) -> "Shift":
         """Return no shift."""
-        modes, two = np.zeros((shots, 2, monitors, 2, 2)), np.zeros((shots, 2))
-        return cls(
-            modes.astype(np.complex128), np.zeros((shots, 2, 2)), np.full((shots, 2, 2), SHARE),
-            modes[:, 0], two, np.zeros(shots, dtype=np.bool_),
-        )  # fmt: skip
+        modes = np.zeros((shots, ORDERS, monitors, 2, 2), dtype=np.complex128)
+        shape = (shots, ORDERS, 2)
+        return cls(modes, np.zeros(shape), np.full(shape, SHARE), np.zeros(shots, dtype=np.bool_))
 
 
 def shift_of(ring: Ring, beams: Sequence[StoredBeam], found: Lines, at: Array) -> Shift:
@@ -232,12 +229,10 @@ def _fill(
     there = np.isfinite(of_parts.sum(axis=1) + rms(half) + tune_parts.sum(axis=1)) & (size != 0)
     large = there & (rms(whole) > SEEN)
     share = np.where(large, rms(beyond) / np.maximum(rms(whole), 1e-300), 0.0)
-    shift.modes[shots] = np.where(there[:, None, None, None], parts, 0.0)
-    shift.tunes[shots] = np.where(there[:, None], tune_parts, 0.0)
-    # an action with an error of SHARE makes twice that of its square
-    more = np.where(there[:, None, None], np.abs(beyond * amplitude[:, None, None]), 0.0)
-    shift.mode_error[shots] = 2 * SHARE * more
-    shift.tune_error[shots] = 2 * SHARE * np.where(there, np.abs(beyond_tune), 0.0)
+    orders = np.concatenate([parts, beyond[:, None]], axis=1)
+    tune_orders = np.concatenate([tune_parts, beyond_tune[:, None]], axis=1)
+    shift.modes[shots] = np.where(there[:, None, None, None], orders, 0.0)
+    shift.tunes[shots] = np.where(there[:, None], tune_orders, 0.0)
     # a small part is what terms of the usual size leave of one another
     seen = there[:, None]
     squares = np.where(seen, of_parts, 0.0) ** 2
@@ -245,7 +240,8 @@ def _fill(
     decohered = (spread[..., 0] - spread[..., 1]) / np.maximum(spread.sum(axis=2), 1e-300)
     terms = SHARE * np.fmax(usual / np.maximum(of_parts, 1e-300), 1.0)
     own = np.sqrt(terms**2 + (decohered**2 + (2 * SHARE * share) ** 2)[:, None])
-    shift.error[shots] = np.where(seen, own, SHARE)
+    # an action with an error of SHARE makes twice that of its square
+    shift.error[shots, :2], shift.error[shots, 2] = np.where(seen, own, SHARE), 2 * SHARE
     shift.too_large[shots] = ~kept.all(axis=0) | (share > CONVERGED).any(axis=1)
 
 
@@ -362,8 +358,9 @@ class ManyTurns(Stored):
     of the energy and of its square), two tunes]; m, 1.
 
     Nuisances are re and im of the complex amplitude of each shot and mode, the relative errors of
-    its shifts by both actions, re and im of the energy of what oscillates in units of the beam's
-    spread, and of its square, [shot, mode, 2 + OTHERS]. All but the amplitudes are read as 0.
+    its shifts by both actions and in the next order, re and im of the energy of what oscillates in
+    units of the beam's spread, and of its square, [shot, mode, 2 + OTHERS]. All but the amplitudes
+    are read as 0.
 
     With chromaticity a particle's phase keeps account of its energy. Those ahead of the mean phase
     have another energy than those behind it, which is an imaginary energy of the line. It grows
@@ -436,8 +433,8 @@ class ManyTurns(Stored):
 
     def shown(self, view: Beams, nuisances: Array) -> list[Moved]:
         """Return the states, shifted by the amplitude and by the energy of what oscillates."""
-        by = 1 + nuisances[..., 2:4]
-        energy = nuisances[..., 4::2] + 1j * nuisances[..., 5::2]
+        by = nuisances[..., 2 : 2 + ORDERS] + [1, 1, 0]  # the parts have the next order in them
+        energy = nuisances[..., 2 + ORDERS :: 2] + 1j * nuisances[..., 3 + ORDERS :: 2]
         tunes, modes = self.chromatic
         modes = np.einsum("sko,sompk->smpk", energy, modes)
         modes += np.einsum("ska,sampk->smpk", by, self.shift.modes)
@@ -557,7 +554,7 @@ def many_turns(
         shift = shift_of(ring, beams, found, at)
     # the model's error is proportional to the line of the mode in its own plane
     size = np.nan_to_num(np.abs(found.amplitude)).max(axis=2, keepdims=True)
-    error = np.sqrt(found.error**2 + (FLOOR * size) ** 2 + shift.mode_error**2).reshape(shots, -1)
+    error = np.sqrt(found.error**2 + (FLOOR * size) ** 2).reshape(shots, -1)
     both = np.stack([found.amplitude.real, found.amplitude.imag], axis=-1)
     # of shifts and energies, common to all shots: their mean is known no better than one. The mean
     # phase of a symmetric beam is that of its mean energy, which is the ring's
@@ -566,7 +563,7 @@ def many_turns(
     known = known.reshape(shots, -1) * np.sqrt(shots)
     tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
     data = np.concatenate([both.reshape(shots, -1), np.zeros_like(known), tunes], axis=1)
-    tune_error = np.sqrt(found.tune_error**2 + TUNE**2 + shift.tune_error**2)
+    tune_error = np.sqrt(found.tune_error**2 + TUNE**2)
     errors = np.concatenate([np.repeat(error, 2, axis=1), known, tune_error], axis=1)
     there = np.isfinite(data) & np.isfinite(errors)
     there[shift.too_large, :LINES] = there[shift.too_large, -2:] = False

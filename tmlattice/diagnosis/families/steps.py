@@ -146,6 +146,11 @@ class EnergySpread(_OfBeam):
         return [{("energy_spread", None): DELTA**2}]
 
 
+PLANE = 0.03
+"""Prior rms: gains of all BPMs, or calibrations of all correctors, of a plane, whose product alone
+is measured where no RF step tells them apart."""
+
+
 class _Monitors(Family):
     per, rms, tails = "monitor", 0.01, TAILS
 
@@ -166,7 +171,7 @@ class MonitorGain(_Monitors):
         """Priors of single BPMs and of all BPMs of a plane."""
         alike = np.zeros((self.size(data), 2))
         alike[0::2, 0] = alike[1::2, 1] = 1
-        return [*super().groups(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
+        return [*super().groups(data), Group(f"{self.name} of a plane", alike, PLANE, fixed=True)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The diagonals of the BPMs' matrices."""
@@ -260,9 +265,14 @@ class CorrectorCalibration(_Columns):
     block, variable, trust, gross, rms = 0, "calibration", 0.01, 0.3, 0.02
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """The priors of single correctors and of families."""
+        """The priors of single correctors, of families and of all of a plane."""
         kinds = families([*data.measured.correctors, "\0"])[1]
-        return [*super().groups(data), Group(f"{self.name} of families", kinds, 0.05)]
+        alike = np.eye(2)[data.plane]
+        alike[-1] = 0  # the RF
+        return [
+            *super().groups(data), Group(f"{self.name} of families", kinds, 0.05),
+            Group(f"{self.name} of a plane", alike, PLANE, fixed=True),
+        ]  # fmt: skip
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The column itself; 0 for the RF."""
@@ -331,13 +341,12 @@ STEPS = (
     Trial((CorrectorRoll(),), 0, 1),
     Trial((SkewGradient(),), 2, 2),
     Trial((HorizontalOrbit(),), 2, 0),
-    Trial((VerticalOrbit(),), 2, 2),
+    Trial((VerticalOrbit(),), 0, 2),
     Trial((HorizontalKicks(),), 2, 0),
     Trial((EnergyOffset(),), 2, 0),
     Trial((VerticalKicks(),), 0, 2),
 )
-"""The trials, in order. Skew gradients, and vertical orbits in sextupoles, move the tunes to second
-order, which the gradients correct.
+"""The trials, in order. Skew gradients move the tunes to second order, which the gradients correct.
 The energy offset changes the dispersion, and comes after the kicks that do so, too."""
 
 CHANGES = (
