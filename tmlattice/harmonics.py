@@ -19,13 +19,10 @@ from importlib import import_module
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, ComplexArray
 from tmlattice.errors import TooFewTurnsError
 from tmlattice.optics import Optics
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 MIN_TURNS = 16
 

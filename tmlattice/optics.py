@@ -17,8 +17,8 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, ComplexArray
 from tmlattice.beam.assembly import Assembly
 from tmlattice.beam.chain import Chain, LayerChain, products
 from tmlattice.beam.closed_orbit import ResponseModel
@@ -28,9 +28,6 @@ from tmlattice.lattice import Ring, load_ring
 from tmlattice.maps.magnets import LayerMaps, ring_matrix
 from tmlattice.maps.taylor import symplectic_form
 from tmlattice.speaks import Speaks
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,11 @@
 """The aperture beyond which a trajectory is lost."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam import sweeps
 from tmlattice.errors import BeamLostError
 from tmlattice.maps import RingMaps
-
-Array = NDArray[np.float64]
 
 APERTURE = 1.0
 """m and rad: far outside any beam pipe, where second-order maps are meaningless."""
@@ -19,7 +17,7 @@ def bounded(n: int) -> list[int]:
     return [i for i in range(n) if i != 4]
 
 
-def lost(states: Array) -> NDArray[np.bool_]:
+def lost(states: Array) -> Flags:
     """Whether states [..., n] are outside the aperture, or NaN, [...]."""
     inside = np.abs(states[..., bounded(states.shape[-1])]) < APERTURE
     return np.asarray(~np.all(inside, axis=-1))

@@ -26,7 +26,6 @@ from tmlattice.effects.directions import directions, kept_directions, ring_effec
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
 
-Array = NDArray[np.float64]
 Hypothesis = tuple[str, str | None]
 """An effect and its place."""
 

@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam import sweeps
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.aperture import APERTURE, check_alive, lost
@@ -21,9 +22,6 @@ from tmlattice.by_name import by_name
 from tmlattice.errors import BeamLostError, UnstableRingError
 from tmlattice.lattice.ring import Ring
 from tmlattice.maps import RingMaps, ring_maps
-
-Array = NDArray[np.float64]
-
 
 NO_ORBIT = (
     "no closed orbit: the search does not converge; the ring is at an integer resonance, or its "

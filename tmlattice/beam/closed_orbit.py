@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.chain import NO_ORBIT, Chain, closing
 from tmlattice.beam.settle import settle
 from tmlattice.beam.threads import share
@@ -27,9 +28,6 @@ from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, changed_maps, ring_maps
 from tmlattice.maps.quadratic import Quadratic, difference, each_after
 from tmlattice.maps.taylor import second_derivatives
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 KICK = 1e-4
 """Of the central differences of a corrector's map, rad; the maps are linear in the kick."""
@@ -278,7 +276,7 @@ class ResponseModel:
         after = np.einsum("mai,ci->cma", self.reading_slopes, columns.launch_kick)
         return np.asarray(before + self.downstream(columns)[:, :, None] * after)
 
-    def downstream(self, columns: Columns) -> NDArray[np.bool_]:
+    def downstream(self, columns: Columns) -> Flags:
         """Whether a monitor reads behind the corrector, [column, monitor]."""
         return np.asarray(self.maps.at[None] > columns.layer[:, None])
 

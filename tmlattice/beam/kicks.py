@@ -8,13 +8,10 @@ were made to cancel. They show in the dispersion, where no gradient makes the sa
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.lattice import Ring
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 KICKING = ({"bend", "quadrupole", "hcorrector"}, {"bend", "quadrupole", "vcorrector"})
 """Kinds of magnets that kick a closed orbit, in x and in y."""

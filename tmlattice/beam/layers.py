@@ -5,13 +5,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.sweeps import curved
 from tmlattice.maps import RingMaps
 from tmlattice.maps.quadratic import Weights
 
-Array = NDArray[np.float64]
 LayerParts = tuple[Weights, list[Weights]]
 """The weights of a layer, and the read-outs of the monitors before its magnet."""
 
@@ -32,8 +31,8 @@ class Layers:
 
     W: Weights
     R: Weights
-    at: NDArray[np.int64]
-    start: NDArray[np.int64]
+    at: Indices
+    start: Indices
 
     @classmethod
     def of(cls, maps: RingMaps, weights: Weights | None = None) -> "Layers":
@@ -50,7 +49,7 @@ class Layers:
         return len(self.W[0])
 
     @property
-    def curved(self) -> NDArray[np.bool_]:
+    def curved(self) -> Flags:
         """Whether each step has a second order, [step]."""
         return curved(self.W[2])
 

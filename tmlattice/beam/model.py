@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.assembly import Group, Hypothesis
 from tmlattice.beam.threads import share
@@ -27,8 +28,6 @@ from tmlattice.effects import (
 
 __all__ = ["LAUNCH", "Hypothesis", "Kicks", "Model", "Paths"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 SMALL = 1e-4
 """Step of central differences of readings over the largest fault; no effect is of higher than

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, ComplexArray, Indices
 from tmlattice.beam.readouts import APERTURE
 from tmlattice.beam.rf import Cavities
 from tmlattice.beam.sweeps import curved
@@ -26,9 +26,6 @@ from tmlattice.lattice import Element
 from tmlattice.lattice.ring import NO_ERRORS
 from tmlattice.maps import LayerMaps, RingMaps
 from tmlattice.maps.quadratic import Quadratic, halves_without_sextupole
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 THIN = 1e-3
 """m; for shorter sextupoles the second-order map is complete."""
@@ -49,7 +46,7 @@ class NonlinearTurn:
     W: tuple[Array, Array, Array]
     fields: ComplexArray
     second: Array
-    exits: NDArray[np.int64]
+    exits: Indices
 
 
 def nonlinear_turn(layers: LayerMaps) -> NonlinearTurn:

@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam import sweeps
 from tmlattice.beam.layers import Layers
 from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.beam.sweeps import curved
-
-Array = NDArray[np.float64]
 
 APERTURE = 0.05
 """m; distance from the axis at a magnet's exit beyond which a beam is lost."""

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import KICK, ResponseModel, feed_down
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions, ring_effect
@@ -27,8 +27,6 @@ from tmlattice.errors import EffectError
 from tmlattice.maps.quadratic import Quadratic, difference
 from tmlattice.maps.taylor import second_derivatives
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Hypothesis = tuple[str, str | None]
 
 STILL = 1e-12
@@ -167,7 +165,7 @@ class ResponseSlopes:
         kicks = (back @ kick[:, :, None])[..., 0]
         return kicks, back @ (d.D1 + bent) @ model.tangents[d.layer]
 
-    def _stepped(self, layers: NDArray[np.int64], sources: Array) -> tuple[Array, Array, Array]:
+    def _stepped(self, layers: Indices, sources: Array) -> tuple[Array, Array, Array]:
         """Terms of new kicks S u [row, n, n] in layers: in the monitors' readings of the launch; in
         the columns' kicks behind the layers, [column, n]; and their sum, [n, n]."""
         seen, missed = np.zeros_like(self.readings), np.zeros_like(self.launch_kick)
@@ -177,7 +175,7 @@ class ResponseSlopes:
             missed += (self._exits > k)[:, None] * (self.launch_kick @ source.T)
         return seen, missed, sources.sum(axis=0)
 
-    def _moved(self, layers: NDArray[np.int64], kicks: Array) -> tuple[Array, Array, Array]:
+    def _moved(self, layers: Indices, kicks: Array) -> tuple[Array, Array, Array]:
         """Terms of orbit kicks [row, n] in layers: in the monitors' readings of the launch, in the
         columns' kicks, [column, n], and the sum of the layers' sources, [n, n]."""
         fed, seen_by, missed_by, own_by = self._fed

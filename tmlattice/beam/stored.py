@@ -23,16 +23,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, ComplexArray
 from tmlattice.beam.closed_orbit import ResponseModel, feed_down
 from tmlattice.beam.rf import NO_RF, Cavities
 from tmlattice.effects.directions import Directions, directions_nearby
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import second_derivatives
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Hypothesis = tuple[str, str | None]
 
 TRANSVERSE = 4

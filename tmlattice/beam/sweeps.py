@@ -17,12 +17,11 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam.threads import share
 from tmlattice.compiled import jit, jit_sums
 
-Array = NDArray[np.float64]
 Size = tuple[tuple[None, ...], tuple[None, ...]]
 
 LANES = (1, 16, 64)
@@ -199,7 +198,7 @@ def weights(first, last, size, states, adjoint, G0, G1, G2):  # type: ignore[no-
                         m += 1
 
 
-def curved(W2: Array) -> NDArray[np.bool_]:
+def curved(W2: Array) -> Flags:
     """Whether each layer has a second-order part: the sweeps skip zero ones."""
     return np.asarray(W2.any(axis=(1, 2)))
 

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam import aperture
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.assembly import Group, assembly, on_ring
@@ -31,8 +32,6 @@ from tmlattice.effects import (
 )
 from tmlattice.effects.apply import groups
 from tmlattice.lattice import Ring
-
-Array = NDArray[np.float64]
 
 Kicks = Mapping[int, Array]
 """Free kicks by layer: (px, py) of every shot in the middle of its magnet, rad, [shot, 2]."""
@@ -87,7 +86,7 @@ class TrackedShots:
         turns: int = 1,
         known: Sequence[Cause] = (),
         dimension: int = 6,
-        active: NDArray[np.bool_] | None = None,
+        active: Flags | None = None,
     ) -> None:
         self.design = ring
         self._settings = tuple(settings)

@@ -7,8 +7,8 @@ import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.challenge.case import Case, ring_of
 from tmlattice.challenge.kinds import problem_of_case
 from tmlattice.challenge.oracle import hypotheses_of
@@ -18,7 +18,6 @@ from tmlattice.inference.newton import Fit, fit
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
 
-Array = NDArray[np.float64]
 Guesses = list[dict[str, Any]]
 
 SUSPECTS = 3

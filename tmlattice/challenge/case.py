@@ -19,8 +19,8 @@ from typing import Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.batch import fingerprint
 from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.effects import Cause
@@ -36,8 +36,6 @@ from tmlattice.measurement import (
     read_measurement,
     write_measurement,
 )
-
-Array = NDArray[np.float64]
 
 SET = "tmlattice-challenge-set"
 PUBLIC = "tmlattice-challenge-case"

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.model import Model
 from tmlattice.challenge.case import BEFORE, Case, Truth, ring_of
 from tmlattice.challenge.draw import Draw
@@ -28,8 +28,6 @@ from tmlattice.machine.response import NOISE, simulate_response
 from tmlattice.machine.shots import stream
 from tmlattice.observe.data import Data, joined, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
-
-Array = NDArray[np.float64]
 
 TIER_KINDS: Mapping[str, tuple[str, ...]] = {
     "R": ("orbit_response",),

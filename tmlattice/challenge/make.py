@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from tmlattice.arrays import Array
 from tmlattice.batch import fingerprint
 from tmlattice.challenge.case import (
     CONTENTS,
@@ -51,8 +51,6 @@ from tmlattice.lattice.load import contents
 from tmlattice.machine import Machine, Shots, draw_background, draw_shots
 from tmlattice.machine.shots import stream
 from tmlattice.measurement import AnyMeasurement, Measurement
-
-Array = NDArray[np.float64]
 
 SIGNAL = (5.0, 100.0)
 """Signal to noise, log-uniform."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.challenge.case import Case, Truth, ring_of
 from tmlattice.challenge.kinds import CHANGES, problem_of_case
 from tmlattice.effects import Cause, find, modelled
@@ -20,8 +21,6 @@ from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import Scan, scan
-
-Array = NDArray[np.float64]
 
 CLASS = 9.0
 """Chi-square within which the oracle does not distinguish hypotheses."""

@@ -4,14 +4,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause, Settings
 from tmlattice.lattice import Ring
 from tmlattice.machine import Machine, Shots
 from tmlattice.machine.at_engine import AtEngine
-
-Array = NDArray[np.float64]
 
 LARGEST: Mapping[str, float] = {
     "hysteresis": 0.3,

@@ -9,8 +9,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import Diagnosis
@@ -22,8 +22,6 @@ from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import STEP_SHARES
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +44,7 @@ class Estimate:
     energy_error: float = 0.0
 
     @cached_property
-    def kept(self) -> NDArray[np.int64]:
+    def kept(self) -> Indices:
         """Indices in `known` of the errors of a stored beam's ring."""
         own = zip(self.known.hypotheses, self.known.rms.tolist(), strict=True)
         return np.array([i for i, ((name, _), rms) in enumerate(own) if rms > 0 and _of_ring(name)],

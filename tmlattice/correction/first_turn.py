@@ -17,9 +17,9 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfcx
 
+from tmlattice.arrays import Array
 from tmlattice.beam.model import Model
 from tmlattice.beam.readouts import APERTURE
 from tmlattice.correction.estimate import Estimate
@@ -33,8 +33,6 @@ from tmlattice.lattice import Element, Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.data import Data, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
-
-Array = NDArray[np.float64]
 
 TURNS = 2
 LOST = 0.1

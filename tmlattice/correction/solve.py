@@ -23,9 +23,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve, solve_triangular
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.first_turn import Threading
 from tmlattice.correction.knobs import KINDS, Knob
@@ -33,8 +33,6 @@ from tmlattice.correction.targets import THREADING, Targets
 from tmlattice.effects import apply
 from tmlattice.errors import UnstableRingError
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Shown = Any
 """Orbit and optics of a ring, as its targets use them: `StoredOptics` or `Trajectory`."""
 

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.errors import TmlatticeError, unknown_choice
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.optics import short_way
-
-Array = NDArray[np.float64]
 
 ENERGY = 1e-4
 """Relative energy of the two stored beams: third orders are 1e-8 of the first."""

@@ -5,12 +5,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects.effect import Cause, LaunchEffect, ReadingEffect, RingEffect, find
 from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError
 from tmlattice.lattice import Element, Ring
 
-Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
 
 

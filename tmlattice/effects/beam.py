@@ -2,11 +2,9 @@
 
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects.effect import LaunchEffect, register
-
-Array = NDArray[np.float64]
 
 NODES = 5
 """Energies of a Gaussian spread: exact for readings to the ninth power of delta."""

@@ -15,17 +15,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tmlattice import cache
+from tmlattice.arrays import Array, Indices
 from tmlattice.effects.effect import FamilyEffect, RingEffect, find
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
 from tmlattice.maps.quadratic import Quadratic, Weights, difference
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 STEP = 1e-3
 """Step of differences over the largest fault: their error is STEP^2 of an effect's nonlinearity."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects.build import Build, Where
 from tmlattice.effects.reading import Monitors
 from tmlattice.errors import EffectError, UnknownNameError, unknown_name
@@ -21,8 +21,6 @@ from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import Slopes
 from tmlattice.lattice.slices import stem
 from tmlattice.speaks import Speaks
-
-Array = NDArray[np.float64]
 
 Group = Literal[
     "quadrupoles", "bends", "correctors", "sextupoles", "insertion devices", "monitors", "beam"

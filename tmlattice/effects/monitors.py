@@ -3,12 +3,10 @@
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.effects.effect import ReadingEffect, register
 from tmlattice.effects.reading import Monitors
-
-Array = NDArray[np.float64]
 
 
 class _Offset(ReadingEffect):

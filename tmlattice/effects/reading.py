@@ -3,11 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.errors import EffectError
-
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -29,9 +27,9 @@ class Monitors:
     roll: Array
     coupling: Array
     late: Array
-    swapped: NDArray[np.bool_]
-    silent: NDArray[np.bool_]
-    frozen: NDArray[np.bool_]
+    swapped: Flags
+    silent: Flags
+    frozen: Flags
 
     @classmethod
     def perfect(cls, count: int) -> "Monitors":

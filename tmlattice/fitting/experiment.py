@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.by_name import by_name
 from tmlattice.errors import (
     MeasurementError,
@@ -33,8 +33,6 @@ from tmlattice.network import TaylorNetwork
 from tmlattice.network.base import NetworkChain
 from tmlattice.observe.data import NOISE_FLOOR, launch_errors
 from tmlattice.optics import matrix_tunes, one_turn_optics
-
-Array = NDArray[np.float64]
 
 DEFAULT_LAUNCH = (1e-3, 0.0, 1e-3, 0.0)
 """x, px, y, py: off axis by 1 mm in both planes."""

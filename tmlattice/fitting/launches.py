@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.model import Model
 from tmlattice.errors import BeamLostError, MeasurementError
 from tmlattice.inference.newton import fit
@@ -23,8 +23,6 @@ from tmlattice.network.base import NetworkChain
 from tmlattice.observe.data import NOISE_FLOOR, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import estimate
-
-Array = NDArray[np.float64]
 
 STEP = 1e-6
 """m, rad or relative: half the distance of the two launches of a slope."""

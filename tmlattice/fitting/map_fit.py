@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
+from tmlattice.arrays import Array
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError, choice
 from tmlattice.fitting.adam import FitResult
@@ -26,8 +27,6 @@ from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import RingTunes, short_way
-
-Array = NDArray[np.float64]
 
 
 class Prior(StrEnum):

@@ -5,16 +5,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.sparse import MAX_MISFIT
 from tmlattice.late import Method
 from tmlattice.lattice import Ring
 from tmlattice.optics import short_way
 from tmlattice.speaks import Speaks, last_part
-
-Array = NDArray[np.float64]
 
 METHODS = ("adam", "sparse", "map")
 """The paper's recipe first; then the sparse fit, which identifies magnets."""

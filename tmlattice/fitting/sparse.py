@@ -12,9 +12,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2 as chi_square
 
+from tmlattice.arrays import Array
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
@@ -29,8 +30,6 @@ from tmlattice.network import TaylorNetwork
 from tmlattice.observe.data import Data, first_turn
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import RingTunes, short_way
-
-Array = NDArray[np.float64]
 
 EFFECTS = {"quadrupole": "quadrupole_gradient", "sextupole": "sextupole_strength"}
 

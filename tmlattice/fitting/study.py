@@ -18,8 +18,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.batch import MADE_BY, fingerprint, run_batch
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
@@ -38,7 +38,6 @@ from tmlattice.maps import ring_matrix
 from tmlattice.network import TaylorNetwork
 from tmlattice.optics import Optics, matrix_tunes, one_turn_optics
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 METHODS = ("adam", "adam-none", "adam-l1", "adam-l2", "map", "sparse", "known")

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam import tangents as kernels
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.effects import CATALOGUE, RingEffect, directions, names
@@ -22,9 +22,6 @@ from tmlattice.network.generators import field_matrix
 from tmlattice.observe.data import of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.metric import behind
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 PARTS = ("physical", "symplectic", "non-symplectic")
 """Parts of a change: effects of the catalogue, other symplectic changes, the rest."""

@@ -29,9 +29,8 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tmlattice.arrays import INVISIBLE
+from tmlattice.arrays import INVISIBLE, Array, Indices
 from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.errors import LatticeError, MeasurementError
 from tmlattice.fitting.weight_parts import (
@@ -46,9 +45,6 @@ from tmlattice.fitting.weight_parts import (
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

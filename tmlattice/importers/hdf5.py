@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, device_names, numbers
 from tmlattice.importers.matlab_ring import Elements, Roles, planes_by, ring_of_elements
@@ -25,7 +25,6 @@ from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
 
-Array = NDArray[np.float64]
 Plane = {"B1L": "x", "A1L": "y"}
 ARRAYS = (
     "matrix", "inputs_delta", "raw_up", "raw_down", "measured_eta_x", "measured_eta_y",

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder
 from tmlattice.lattice import Ring, save_ring
@@ -22,8 +22,6 @@ from tmlattice.measurement import (
 from tmlattice.measurement.shots import FEWEST, MOST
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.write import check_free
-
-Array = NDArray[np.float64]
 
 LIGHT = 299792458.0
 """m/s."""

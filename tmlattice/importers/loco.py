@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import (
     Imported,
@@ -34,8 +34,6 @@ from tmlattice.importers.matlab_ring import Placed, Roles, planes_by, ring_of_el
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Fields = Mapping[str, Any]
 Iteration = Literal["first", "last"]
 
@@ -273,7 +271,7 @@ def _good(
     kickers: Mapping[str, Indices],
     placed: Placed,
     keep_bad: bool,
-) -> tuple[dict[str, NDArray[np.bool_]], list[str]]:
+) -> tuple[dict[str, Flags], list[str]]:
     """Flags of the good lists by list ("x" and "y" of monitors, "H" and "V" of correctors)."""
     good, said = {}, []
     for plane, letter in LETTERS.items():
@@ -308,7 +306,7 @@ def _columns(
     reads: Mapping[str, Indices],
     kickers: Mapping[str, Indices],
     placed: Placed,
-    good: Mapping[str, NDArray[np.bool_]],
+    good: Mapping[str, Flags],
 ) -> dict[str, Any]:
     """Correctors, planes, kicks, monitors, response and noise of the measurement."""
     horizontal, vertical = len(kickers["x"]), len(kickers["y"])
@@ -388,7 +386,7 @@ def _unkicked(correctors: Fields, kickers: Mapping[str, Indices]) -> list[str]:
 def _spread(
     column: Array,
     reads: Mapping[str, Indices],
-    good: Mapping[str, NDArray[np.bool_]],
+    good: Mapping[str, Flags],
     placed: Placed,
 ) -> Array:
     """Readings x then y as [monitor, 2], NaN where there is none or it is bad."""
@@ -404,7 +402,7 @@ def _rf(
     data: Fields,
     lattice: Fields,
     reads: Mapping[str, Indices],
-    good: Mapping[str, NDArray[np.bool_]],
+    good: Mapping[str, Flags],
     placed: Placed,
 ) -> RfStep | None:
     step, eta = data.get("DeltaRF"), np.asarray(data.get("Eta", ()))
@@ -419,7 +417,7 @@ def _rf(
     return RfStep(float(frequency), round(harmonic), float(step), orbit)
 
 
-def _computed(data: Fields, models: Any, good: Mapping[str, NDArray[np.bool_]]) -> list[str]:
+def _computed(data: Fields, models: Any, good: Mapping[str, Flags]) -> list[str]:
     """A dispersion that is LOCO's own model's."""
     first = models[0] if isinstance(models, list) and models else models
     if not isinstance(first, Mapping) or not np.size(data.get("Eta", ())):

@@ -8,11 +8,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.importers.imported import LIGHT, is_number, is_positive
 
-Array = NDArray[np.float64]
 Fields = Mapping[str, Any]
 
 SAME_RF = 0.02
@@ -330,7 +329,7 @@ def _units(data: dict[str, Any], correctors: dict[str, Any], said: list[str]) ->
             )
 
 
-def _goods(structure: Fields, kind: str) -> NDArray[np.int64]:
+def _goods(structure: Fields, kind: str) -> Indices:
     """Places of the good ones among those of both planes."""
     places, first = [], 0
     for letter in "HV":

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, check_fields, numbers
 from tmlattice.importers.loco import Iteration, bring_loco, conventions
@@ -23,7 +23,6 @@ from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.arrays import METRES
 from tmlattice.measurement.orbit_response import RfStep
 
-Array = NDArray[np.float64]
 Fields = Mapping[str, Any]
 Device = tuple[int, ...]
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.errors import MeasurementError, plain, unknown_name
 from tmlattice.importers.columns import Column
 from tmlattice.importers.imported import (
@@ -29,8 +29,6 @@ from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.arrays import METRES
 from tmlattice.measurement.lost_beam import about_sums, no_beam
 from tmlattice.measurement.monitors import LARGEST_READING
-
-Array = NDArray[np.float64]
 
 SIZES = ((0.02, "m"), (30.0, "mm"), (3e4, "um"), (np.inf, "nm"))
 """Readings below the first are in the second, where nothing states their unit: orbits of 20 mm and
@@ -222,7 +220,7 @@ def _fill(values: Array) -> float | None:
     return float(own[-1]) if often else None
 
 
-def _taken_out(readings: Array, filled: NDArray[np.bool_], fill: float | None) -> list[str]:
+def _taken_out(readings: Array, filled: Flags, fill: float | None) -> list[str]:
     """Take that number for no reading where no beam can be, or where others follow it in its shot;
     else the beam was lost there, as `check` states. A sentence about it."""
     own = filled.any(axis=3).reshape(len(filled), -1)

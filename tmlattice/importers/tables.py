@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.importers.columns import SDDS, Column
 from tmlattice.importers.imported import (
@@ -32,8 +32,6 @@ from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.orbit_response import RfStep
 from tmlattice.measurement.shots import FEWEST, MOST
 from tmlattice.measurement.tables import KINDS
-
-Array = NDArray[np.float64]
 
 KICK = 1e-4
 """rad; the step that a wide table is taken to have been made with."""

@@ -8,11 +8,10 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.lattice.slices import Piece, stem
 
-Array = NDArray[np.float64]
 Supplies = Mapping[str, tuple[str, ...]]
 """Names of all magnets of each, their pieces too, by what identifies it."""
 

@@ -28,8 +28,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import LatticeError, plain
 from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.at_child import check_methods, map_of
@@ -43,7 +43,6 @@ from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 ACTS = frozenset({
     "BEAMBEAM", "CHANGEREF", "NLLENS", "SROTATION", "TRANSLATION", "XROTATION", "YROTATION",

@@ -18,11 +18,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.lattice.ocelot import OpticElement, SecondTM, elements, rot_mtx
-
-Array = NDArray[np.float64]
 
 ELECTRON_GEV = 0.51099895e-3
 

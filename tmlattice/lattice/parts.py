@@ -14,15 +14,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, ComplexArray
 from tmlattice.errors import LatticeError, first_of, plain
 from tmlattice.lattice.at_fields import straight_magnet
 from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements, rotation
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 from tmlattice.lattice.wigglers import merge_wigglers
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -320,7 +318,7 @@ def _integrated(part: Part, attribute: str) -> Array:
     return np.concatenate([given, np.zeros(max(0, 4 - len(given)))])
 
 
-def fields(part: Part) -> NDArray[np.complex128]:
+def fields(part: Part) -> ComplexArray:
     """k_n + i k_ns of each order, four at least; integrated where the element is thin."""
     length = part.number("l")
     normal, skew = _integrated(part, "knl"), _integrated(part, "ksl")
@@ -333,7 +331,7 @@ def fields(part: Part) -> NDArray[np.complex128]:
     return total
 
 
-def strengths(part: Part) -> NDArray[np.complex128]:
+def strengths(part: Part) -> ComplexArray:
     """`fields` over n!, as AT has them."""
     total = fields(part)
     total /= np.array([math.factorial(n) for n in range(len(total))], dtype=float)

@@ -16,13 +16,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import first_of
 from tmlattice.lattice.parts import Part
 from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring
-
-Array = NDArray[np.float64]
 
 _TURNS = ("quadrupole", "sextupole", "octupole")
 _NO_FIELD = ("drift", "monitor", "cavity", "hcorrector", "vcorrector")

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
 from tmlattice.lattice.source import copied
-
-Array = NDArray[np.float64]
 
 TUNES, TUNES_WITH_RF = 1e-4, 1e-3
 """Both codes multiply the same linear maps: from five digits a tune agrees to 1e-5. A magnet that

@@ -7,12 +7,10 @@
 from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.lattice.alike import bodies, families
 from tmlattice.lattice.ring import Element, Ring
-
-Array = NDArray[np.float64]
 
 
 def magnets(ring: Ring, kinds: Collection[str], powered: bool = False) -> list[tuple[Element, ...]]:

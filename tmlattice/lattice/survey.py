@@ -8,11 +8,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.lattice.ring import Ring
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

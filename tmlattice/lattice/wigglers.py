@@ -6,13 +6,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.lattice.places import Place
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 THIN_BEND = 0.1
 """m; a bend not longer than this may be a slice of a wiggler."""

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.lattice.at_file import quiet_at
 from tmlattice.lattice.parts import Part, strengths
 from tmlattice.lattice.places import rotation
@@ -21,8 +21,6 @@ from tmlattice.lattice.plain import (
     second_order,
 )
 from tmlattice.lattice.ring import Element, Ring
-
-Array = NDArray[np.float64]
 
 LIGHT = 299792458.0
 STEP = 0.035

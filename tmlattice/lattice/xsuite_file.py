@@ -14,16 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import LatticeError, plain
 from tmlattice.input_files import json_of
 from tmlattice.lattice.expressions import Arithmetic
 from tmlattice.lattice.lines import chosen, with_gaps
 from tmlattice.lattice.parts import Part, Report, edge_focusing, fringe_of, ring_of_parts
 from tmlattice.lattice.ring import ELECTRON_GEV, Ring
-
-Array = NDArray[np.float64]
 
 MOST_BYTES = 1_000_000_000
 DEEPEST = 50

@@ -6,18 +6,16 @@ from typing import Any
 
 import at
 import numpy as np
-from numpy.typing import NDArray
 from scipy.constants import physical_constants
 from scipy.linalg import sqrtm
 
+from tmlattice.arrays import Array
 from tmlattice.effects.build import Build, Where
 from tmlattice.effects.radiation import expected_loss as loss_of
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.combined import bend_matrix
 from tmlattice.lattice.places import rotation
 from tmlattice.lattice.ring import Element, Ring
-
-Array = NDArray[np.float64]
 
 ELECTRON = physical_constants["electron mass energy equivalent in MeV"][0] * 1e6  # eV
 RADIUS = physical_constants["classical electron radius"][0]  # m

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import c as SPEED_OF_LIGHT
 
+from tmlattice.arrays import Array
 from tmlattice.beam.rf import RELATIVISTIC, Rf, rf_of, stable_phase
 from tmlattice.effects import Cause, RingEffect, check, find
 from tmlattice.effects.apply import groups
@@ -41,7 +42,6 @@ from tmlattice.machine.at_elements import (
     expected_loss,
 )
 
-Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
 """Settings by element: {"kick": rad}, {"k1_relative": 1}, {"k2_relative": 1}, and
 {"rf": {"frequency_relative": 1}}."""

@@ -3,12 +3,11 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.chain import NO_ORBIT
 from tmlattice.errors import UnstableRingError
 
-Array = NDArray[np.float64]
 Turn = Callable[[Array], Array]
 """Moves states [6, shot] to the line's end, in place, and returns readings of the first of them."""
 

@@ -6,14 +6,12 @@ from typing import Any
 
 import at
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import UnstableRingError
 from tmlattice.machine import at_orbit
 from tmlattice.machine.at_engine import AtEngine, Settings
 from tmlattice.machine.network_engine import NetworkEngine
-
-Array = NDArray[np.float64]
 
 TRANSVERSE, ALL = (0, 1, 2, 3), (0, 1, 2, 3, 4, 5)
 ENERGY = 1e-3

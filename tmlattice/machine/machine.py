@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings, background_rms, beams, check, monitors_with
 from tmlattice.errors import TmlatticeError
@@ -18,8 +18,6 @@ from tmlattice.lattice import Ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.machine.shots import Shots, draw_background, stream
 from tmlattice.workers import Caught, Processes, heard
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 

@@ -8,15 +8,13 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.rf import cavities, rf_of
 from tmlattice.effects import Cause, Settings, apply
 from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.machine.at_engine import from_at, to_at
-
-Array = NDArray[np.float64]
 
 
 class NetworkEngine:

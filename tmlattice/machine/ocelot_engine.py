@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.assembly import Group, assembly
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.rf import NO_RF, rf_of
 from tmlattice.effects import Cause, Settings
 from tmlattice.effects.apply import groups
 from tmlattice.lattice import Ring
-
-Array = NDArray[np.float64]
 
 
 class OcelotEngine:

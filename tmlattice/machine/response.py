@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.rf import rf_of
 from tmlattice.by_name import by_name
@@ -22,8 +22,6 @@ from tmlattice.machine.machine import (
 from tmlattice.machine.shots import stream
 from tmlattice.measurement import OrbitResponse, RfStep
 from tmlattice.observe.calibration import corrector_scales, offset_of
-
-Array = NDArray[np.float64]
 
 NOISE = (2e-6, 1.2e-6)
 """rms of an orbit change, m: averaged readings of a stored beam (x, y)."""

@@ -10,16 +10,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.chain import Chain
 from tmlattice.effects import Cause, Settings, find
 from tmlattice.errors import BeamLostError, TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.lattice.checks import need_monitors
 from tmlattice.optics import one_turn_optics
-
-Array = NDArray[np.float64]
 
 LAUNCH_SIGMA = (1e-4, 2e-5, 1e-4, 2e-5, 0.0)
 """rms of the launch's x, px, y, py, delta about the nominal one, m and rad."""

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, Settings, monitors_with
 from tmlattice.errors import EffectError, TmlatticeError
@@ -32,7 +32,6 @@ from tmlattice.machine.response import NOISE, energies, rf_step_of, spread_of
 from tmlattice.machine.shots import draw_shots, each_setting, stream
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
 
-Array = NDArray[np.float64]
 Noise = float | Sequence[float]
 
 TURN_NOISE = 2e-5

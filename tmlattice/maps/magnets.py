@@ -13,9 +13,9 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tmlattice import cache
+from tmlattice.arrays import Array, Indices
 from tmlattice.by_name import by_name
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Errors, Ring
@@ -31,8 +31,6 @@ from tmlattice.maps.quadratic import (
     quadratic_map,
 )
 from tmlattice.maps.taylor import TaylorMap
-
-Array = NDArray[np.float64]
 
 
 def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMap:
@@ -87,7 +85,7 @@ class RingMaps:
     W2: Array
     monitors: tuple[str, ...]
     s_monitors: Array
-    at: NDArray[np.int64]
+    at: Indices
     R0: Array
     R1: Array
     R2: Array
@@ -99,7 +97,7 @@ class RingMaps:
         return int(self.W0.shape[1])
 
     @cached_property
-    def start(self) -> NDArray[np.int64]:
+    def start(self) -> Indices:
         """The monitors at exit k are start[k] to start[k + 1] - 1, [layer + 2]."""
         return np.searchsorted(self.at, np.arange(len(self.layers) + 2)).astype(np.int64)
 

@@ -15,12 +15,12 @@ from itertools import product
 from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.errors import TmlatticeError
 from tmlattice.maps.taylor import TaylorMap, _Table, _table, kronecker_exponents
 
-Array = NDArray[np.float64]
 Exponents = tuple[int, ...]
 Terms = Mapping[Exponents, ArrayLike | Callable[[float], ArrayLike]]
 

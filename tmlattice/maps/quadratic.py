@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import NO_ERRORS, Element, Slopes
 
-Array = NDArray[np.float64]
 Weights = tuple[Array, Array, Array]
 Made = TypeVar("Made")
 

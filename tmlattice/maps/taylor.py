@@ -17,7 +17,8 @@ from math import comb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from tmlattice.arrays import Array
+
 Indices = NDArray[np.intp]
 
 

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 
-Array = NDArray[np.float64]
 Unit = Literal["m", "mm", "um", "nm"]
 
 METRES = {

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError, unknown_name
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.monitors import Names
@@ -24,7 +25,6 @@ from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.trajectory import Measurement
 from tmlattice.measurement.tune_reading import TuneReading
 
-Array = NDArray[np.float64]
 Order = NDArray[np.intp]
 Data = TypeVar("Data")
 WORDS: Mapping[type, str] = {

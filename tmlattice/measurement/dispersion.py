@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.monitors import (
@@ -17,8 +18,6 @@ from tmlattice.measurement.monitors import (
 )
 from tmlattice.measurement.orbit_response import RfStep, check_rf
 from tmlattice.measurement.shown import OfMonitors
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -5,12 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import plain
 from tmlattice.measurement.monitors import Names, noise_table
-
-Array = NDArray[np.float64]
 
 FORMAT = "tmlattice-measurement"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.measurement.dispersion import Dispersion
 from tmlattice.measurement.documents import check_table, located
@@ -21,7 +21,6 @@ from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.trajectory import COORDINATES, UNKNOWN_LAUNCH, Measurement
 from tmlattice.measurement.tune_reading import TuneReading
 
-Array = NDArray[np.float64]
 Document = dict[str, Any]
 Known = Sequence[str] | None
 """The ring's monitors, where they are known."""
@@ -215,7 +214,7 @@ def _launches(listed: list[Document]) -> tuple[Array, Array | None]:
     return launches, sigma if known else None
 
 
-def places_of(rows: Rows, column: str, known: Sequence[int]) -> NDArray[np.int64]:
+def places_of(rows: Rows, column: str, known: Sequence[int]) -> Indices:
     """Each row's place among the shots, or steps, of the document; MeasurementError: one that is
     not among them, with its line."""
     index = {own: i for i, own in enumerate(known)}

@@ -12,11 +12,10 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.measurement.shots import TurnByTurn
 from tmlattice.measurement.trajectory import Measurement
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
 Data = TypeVar("Data", Measurement, TurnByTurn)
 

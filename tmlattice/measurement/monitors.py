@@ -7,12 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.errors import MeasurementError, first_of, unknown_name
 from tmlattice.measurement.arrays import METRES
 
-Array = NDArray[np.float64]
 Settings = Mapping[str, Mapping[str, float]]
 
 SETTINGS = ("kick", "k1_relative", "k2_relative", "frequency_relative")
@@ -63,7 +62,7 @@ class Names:
         return place
 
 
-def merge_spellings(spellings: Sequence[str]) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+def merge_spellings(spellings: Sequence[str]) -> tuple[tuple[str, ...], Indices]:
     """Names that differ in case alone, or in `::0` after the bare name, become one.
 
     Returns:

@@ -8,16 +8,14 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.errors import first_of
 from tmlattice.measurement.assume import in_beam_order, with_read
 from tmlattice.measurement.lost_beam import beam_lost, exact
 from tmlattice.measurement.shots import TurnByTurn
 from tmlattice.measurement.trajectory import Measurement
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Data = TypeVar("Data")
 
 FEWEST = 8

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Indices
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.input_files import check_regular
 from tmlattice.measurement.documents import not_utf8
 from tmlattice.measurement.monitors import LARGEST_READING, Names, merge_spellings
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
+Integers = Indices
 
 _MOST_CELLS = 50_000_000
 """Readings that an array may have without having a hundredth of them in the table: 0.8 GB."""

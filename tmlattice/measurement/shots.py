@@ -5,8 +5,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.monitors import (
@@ -19,8 +20,6 @@ from tmlattice.measurement.monitors import (
     shot_places,
 )
 from tmlattice.measurement.shown import OfMonitors
-
-Array = NDArray[np.float64]
 
 
 class Shots(OfMonitors):

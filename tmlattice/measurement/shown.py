@@ -5,13 +5,11 @@ from dataclasses import is_dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.late import ClassMethod, Method
 from tmlattice.measurement.monitors import places_of, spread
 from tmlattice.speaks import Speaks, counted, last_part
-
-Array = NDArray[np.float64]
 
 
 class Shown(Speaks):

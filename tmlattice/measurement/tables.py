@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.lattice.mat_file import read_apart
@@ -16,7 +15,6 @@ from tmlattice.measurement.monitors import LARGEST_READING, Names, merge_spellin
 from tmlattice.measurement.rows import dense, match_names, read_rows
 from tmlattice.measurement.trajectory import Measurement
 
-Array = NDArray[np.float64]
 COLUMNS = ("shot", "turn", "monitor", "x", "y")
 
 

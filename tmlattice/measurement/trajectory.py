@@ -5,14 +5,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.arrays import Unit, names_of, readings_of
 from tmlattice.measurement.monitors import Settings
 from tmlattice.measurement.shots import Shots
-
-Array = NDArray[np.float64]
 
 COORDINATES = ("x", "px", "y", "py", "delta")
 """Of a launch: m, and units of the reference momentum; delta is the relative energy deviation."""

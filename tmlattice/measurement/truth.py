@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_file, write_json
 from tmlattice.measurement.documents import read_document
 from tmlattice.measurement.trajectory import COORDINATES
-
-Array = NDArray[np.float64]
 
 FORMAT = "tmlattice-truth"
 

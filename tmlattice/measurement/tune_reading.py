@@ -4,13 +4,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.measurement.monitors import Settings, check_energy, checked_shots
 from tmlattice.measurement.shown import Shown
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

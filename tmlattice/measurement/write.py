@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
 from tmlattice.measurement.documents import Digest
@@ -17,8 +17,6 @@ from tmlattice.measurement.header import finite, header
 from tmlattice.measurement.kinds import KINDS, TURNS, plain_settings, quoted, reading_lines
 from tmlattice.measurement.monitors import Names, Settings, check_settings, check_size, noise_table
 from tmlattice.measurement.trajectory import COORDINATES, Measurement
-
-Array = NDArray[np.float64]
 
 
 def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bool = False) -> None:

@@ -5,12 +5,11 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from tmlattice.arrays import Array
 from tmlattice.beam.chain import LayerChain
-
-Array = NDArray[np.float64]
 
 
 class NetworkChain(torch.nn.Module, LayerChain):

@@ -13,11 +13,9 @@ the integrated strengths b1 = k1 L and b2 = k2 L in OCELOT's sign, and kicks px 
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.maps.taylor import kronecker_exponents, second_derivatives, symplectic_form
-
-Array = NDArray[np.float64]
 
 DEGREE = 3
 """Largest degree of a generator: its flow agrees with a second-order map to second order."""

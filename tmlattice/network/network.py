@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from tmlattice.arrays import Array
 from tmlattice.beam import sweeps
 from tmlattice.beam.aperture import APERTURE, bounded, lost_beam
 from tmlattice.beam.chain import Chain, first_pass
@@ -23,8 +24,6 @@ from tmlattice.network.autograd import BackEnd, Sweep, Tensors
 from tmlattice.network.base import NetworkChain
 from tmlattice.network.reference import monomials, packed, plain_pass
 from tmlattice.network.symplectic_network import SymplecticNetwork
-
-Array = NDArray[np.float64]
 
 
 class OnLost(StrEnum):

@@ -15,15 +15,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from tmlattice.arrays import Array
 from tmlattice.beam.threads import share
 from tmlattice.compiled import jit
 from tmlattice.maps.taylor import symplectic_form
 from tmlattice.network.reference import plain_penalty_parts
-
-Array = NDArray[np.float64]
 
 _LANES = 32  # layers side by side: their matrices together stay in the first cache
 

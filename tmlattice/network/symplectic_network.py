@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.beam import flows, sweeps
 from tmlattice.beam.aperture import check_alive
 from tmlattice.beam.chain import Chain, merged, products
@@ -21,9 +22,6 @@ from tmlattice.network.generators import (
     nearest_symplectic,
     pull_field,
 )
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 class _FlowSweep(torch.autograd.Function):

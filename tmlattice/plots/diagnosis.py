@@ -7,8 +7,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import find
 from tmlattice.inference.judgement import DEFAULT
@@ -25,8 +25,6 @@ from tmlattice.plots.readings import (
 from tmlattice.plots.response import response_figures
 from tmlattice.plots.strip import above_strip, lattice_strip
 from tmlattice.speaks import micrometres
-
-Array = NDArray[np.float64]
 
 STYLES: Mapping[str, tuple[str, str]] = {
     "quadrupoles": ("tab:red", "s"),

@@ -6,13 +6,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.lattice.survey import Survey, survey
 from tmlattice.plots.strip import COLOURS
-
-Array = NDArray[np.float64]
 
 
 class Small(NamedTuple):

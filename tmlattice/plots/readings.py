@@ -3,16 +3,14 @@
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array, Flags
 from tmlattice.correction.result import Correction
 from tmlattice.correction.targets import TARGETS
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import RingEffect, find
 from tmlattice.inference.newton import fit
 from tmlattice.plots.strip import above_strip, plain_log
-
-Array = NDArray[np.float64]
 
 BEFORE, AFTER = "C0", "C3"
 
@@ -29,7 +27,7 @@ def _starts(finding: Finding) -> float | None:
     return None if finding.where is None or finding.effect is not None else finding.where[0]
 
 
-def before_findings(diagnosis: Diagnosis) -> NDArray[np.bool_] | None:
+def before_findings(diagnosis: Diagnosis) -> Flags | None:
     """The BPMs before the first finding, [monitor]; None where there is no such place, or too
     few."""
     starts = [s for finding in diagnosis.findings if (s := _starts(finding)) is not None]
@@ -129,7 +127,7 @@ def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
     return figure
 
 
-def _left_text(left: Array, before: NDArray[np.bool_] | None) -> str:
+def _left_text(left: Array, before: Flags | None) -> str:
     """The rms residual, m, as µm: of all, or before and behind the first finding."""
 
     def rms(values: Array) -> str:

@@ -7,8 +7,8 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.errors import unknown_choice
 from tmlattice.lattice import Ring, load_ring
@@ -26,7 +26,6 @@ from tmlattice.plots.diagnosis import figures
 from tmlattice.plots.optics import plot_betas
 from tmlattice.plots.strip import lattice_strip
 
-Array = NDArray[np.float64]
 MOST = 8
 """Shots that are drawn."""
 

@@ -20,15 +20,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
+from tmlattice.arrays import Array
 from tmlattice.maps import TaylorMap, ode_of_taylor_map, recentred, taylor_map_of_ode
 from tmlattice.maps.ode import OdeError
 from tmlattice.systems import Comparison
 from tmlattice.systems.learning import MapFit, fit_map, follow, weights_of
-
-Array = NDArray[np.float64]
 
 REST = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 

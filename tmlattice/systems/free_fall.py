@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.maps import TaylorMap, taylor_map_of_ode
 from tmlattice.systems import Comparison
 from tmlattice.systems.learning import follow, map_of_weights, weights_of
-
-Array = NDArray[np.float64]
 
 GRAVITY = 9.8  # m/s^2
 DRAG = 0.392  # kg/m

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 from tqdm.auto import tqdm
 
+from tmlattice.arrays import Array
 from tmlattice.errors import missing_package
 from tmlattice.maps import TaylorMap, right_hand_side, taylor_map_of_ode
 from tmlattice.systems import Comparison
@@ -24,7 +25,6 @@ from tmlattice.systems.learning import fit_step_by_step, follow, weights_of
 if TYPE_CHECKING:
     import torch
 
-Array = NDArray[np.float64]
 
 EQUATION: dict[tuple[int, ...], list[float]] = {
     (0, 1): [1.0, 0.0],

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.errors import BeamLostError
 from tmlattice.maps import TaylorMap, element_map, part_maps, taylor_map_of_ode
 from tmlattice.systems import Comparison
@@ -27,7 +28,6 @@ from tmlattice.systems import Comparison
 if TYPE_CHECKING:
     from tmlattice.lattice.ring import Element, Ring
 
-Array = NDArray[np.float64]
 Polynomial = dict[tuple[int, ...], float]  # exponents of (x, px, y, py) -> coefficient
 
 KINDS = ("drift", "quadrupole", "bend", "sextupole")

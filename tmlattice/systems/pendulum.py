@@ -13,15 +13,14 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
+from tmlattice.arrays import Array
 from tmlattice.maps import TaylorMap, ode_of_taylor_map, taylor_map_of_ode
 from tmlattice.systems import Comparison
 from tmlattice.systems.learning import MapFit, fit_map, follow, weights_of
-
-Array = NDArray[np.float64]
 
 GRAVITY = 9.8  # m/s^2, the paper's
 FRAME = 0.1  # s
