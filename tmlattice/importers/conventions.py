@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.errors import MeasurementError, UnstableRingError
-from tmlattice.importers.imported import Array, counted
+from tmlattice.importers.imported import counted
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.compared import NEAR, OfResponse, ratio

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
+from tmlattice.arrays import Array
 from tmlattice.errors import TmlatticeError
 from tmlattice.maps import TaylorMap
-from tmlattice.maps.taylor import Array
 
 Bools = NDArray[np.bool_]
 LOST = 1e3  # times the largest observation: a state beyond carries no information
