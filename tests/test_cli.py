@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import importlib
 import json
 import os
 import shlex
@@ -93,7 +94,8 @@ def test_tune_fit_has_a_column_for_each_method_and_says_which_to_trust(outcome):
 
 
 def test_a_method_alone_does_not_pay_for_the_others_and_quiet_prints_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("torch.optim.adam.adam", None)  # whoever fits by it fails
+    adam = importlib.import_module("torch.optim.adam")  # `torch.optim` hides it
+    monkeypatch.setattr(adam, "adam", None)  # whoever fits by it fails
     words = ("tune-fit", SMALL, *QUICK, "--noise", "1e-6", "--method", "sparse")
     done = tmlattice(*words, "--json", "a.json", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
@@ -205,8 +207,8 @@ def test_version_has_one_source(tmp_path):
         (["study", "tune-fit"], "did you mean 'dev study'?"),
         (["tunefit"], "no command 'tunefit'; did you mean 'tune-fit'?"),
         (["nonsense"], "`tmlattice --help` lists them"),
-        (["simulate", SMALL, "--effect", "quadropol QD::5 -1", "--out", "y"],
-         "no effect 'quadropol'; did you mean 'quadrupole_gradient'"),
+        (["simulate", SMALL, "--effect", "quadrupol QD::5 -1", "--out", "y"],
+         "no effect 'quadrupol'; did you mean 'quadrupole_gradient'"),
         (["diagnose", SMALL, "day", "./day"], "is given twice"),
         (["info", "petra4"], "no lattice"),
     ],

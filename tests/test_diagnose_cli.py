@@ -112,7 +112,7 @@ def test_command_reports_writes_and_draws(outcome, folders):
     names = {path.name for path in (folder / "day").iterdir()}
     assert names == {
         "diagnosis.json", "report.html", "report.txt", "plan.png", "readings.png", "scan.png",
-        "scan-near.png", "gap.png", "diagnosis.lattice.json",
+        "scan-near.png", "gap.png", "diagnosis.lattice.json", "estimated.json",
     }  # fmt: skip
     for name in names:
         if name.endswith(".png"):

@@ -120,14 +120,11 @@ def choice(kind: str, name: str, known: type[Choice]) -> Choice:
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """The error for a `name` that is not among the `known` ones, with the nearest of them."""
     known = list(known)
-    wanted = name.casefold()
-    spelled: dict[str, list[str]] = {}  # whole, and by a beginning as long as the name
-    for one in known:
-        for text in {one.casefold(), one.casefold()[: len(wanted)]}:
-            spelled.setdefault(text, []).append(one)
-    texts = difflib.get_close_matches(wanted, spelled, 3, 0.5)
-    near = list(dict.fromkeys(one for text in texts for one in spelled[text]))[:3]
-    near = near or [one for one in known if name and wanted in one.casefold()][:3]
+    wanted, original = name.casefold(), {k.casefold(): k for k in known}
+    begin = [k for k in original if name and k.startswith(wanted)]
+    close = [*begin, *difflib.get_close_matches(wanted, original, 3, 0.5)]
+    close = close or [k for k in original if name and wanted in k]
+    near = [original[k] for k in dict.fromkeys(close)][:3]
     shown = near or known[:3]
     offer = [f"'{k}'" for k in shown]
     known_are = f"known: {', '.join(offer)}{', ...' * (len(known) > len(offer))}"

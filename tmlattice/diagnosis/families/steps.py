@@ -146,11 +146,6 @@ class EnergySpread(_OfBeam):
         return [{("energy_spread", None): DELTA**2}]
 
 
-PLANE = 0.03
-"""Prior rms: gains of all BPMs, or calibrations of all correctors, of a plane, whose product alone
-is measured where no RF step tells them apart."""
-
-
 class _Monitors(Family):
     per, rms, tails = "monitor", 0.01, TAILS
 
@@ -171,7 +166,7 @@ class MonitorGain(_Monitors):
         """Priors of single BPMs and of all BPMs of a plane."""
         alike = np.zeros((self.size(data), 2))
         alike[0::2, 0] = alike[1::2, 1] = 1
-        return [*super().groups(data), Group(f"{self.name} of a plane", alike, PLANE, fixed=True)]
+        return [*super().groups(data), Group(f"{self.name} of a plane", alike, 0.03, fixed=True)]
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The diagonals of the BPMs' matrices."""
@@ -265,14 +260,9 @@ class CorrectorCalibration(_Columns):
     block, variable, trust, gross, rms = 0, "calibration", 0.01, 0.3, 0.02
 
     def groups(self, data: ResponseData) -> list[Group]:
-        """The priors of single correctors, of families and of all of a plane."""
+        """The priors of single correctors and of families."""
         kinds = families([*data.measured.correctors, "\0"])[1]
-        alike = np.eye(2)[data.plane]
-        alike[-1] = 0  # the RF
-        return [
-            *super().groups(data), Group(f"{self.name} of families", kinds, 0.05),
-            Group(f"{self.name} of a plane", alike, PLANE, fixed=True),
-        ]  # fmt: skip
+        return [*super().groups(data), Group(f"{self.name} of families", kinds, 0.05)]
 
     def rows(self, at: Predicted, values: Array) -> Array:
         """The column itself; 0 for the RF."""

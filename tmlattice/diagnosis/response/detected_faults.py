@@ -126,10 +126,10 @@ class _Search:
         state, suspect = _as_number(self.state, cause, information)
         values = state.values[suspect.variable] + amount * suspect.members
         try:
-            moved = state.moved({**state.values, suspect.variable: values})
+            moved = fit_chi2(state.moved({**state.values, suspect.variable: values}))
         except TmlatticeError:
             return [np.inf, np.inf]
-        return [own.chi2 for own in fit_chi2(moved)]
+        return [own.chi2 for own in moved]
 
     def seen(self, state: State) -> Seen:
         """All suspects, linearised at the state."""
