@@ -18,7 +18,7 @@ import warnings
 from pathlib import Path
 
 from healthy import SHIPPED, ring_of
-from tables import markdown, of_turns
+from tables import commit, markdown, of_turns
 
 from tmlattice import diagnose
 from tmlattice.effects import Cause
@@ -82,7 +82,7 @@ def main() -> None:
                 case = (name, fault, chosen.particles, amplitude, seed)
                 if case in done:
                     continue
-                row = dict(zip(keys, case, strict=True)) | one(ring, *case[1:])
+                row = dict(zip(keys, case, strict=True)) | one(ring, *case[1:]) | {"commit": commit()}
                 rows.append(row)
                 with chosen.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
