@@ -82,7 +82,9 @@ def main() -> None:
                 case = (name, fault, chosen.particles, amplitude, seed)
                 if case in done:
                     continue
-                row = dict(zip(keys, case, strict=True)) | one(ring, *case[1:]) | {"commit": commit()}
+                row = (
+                    dict(zip(keys, case, strict=True)) | one(ring, *case[1:]) | {"commit": commit()}
+                )
                 rows.append(row)
                 with chosen.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")

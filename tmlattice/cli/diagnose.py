@@ -2,7 +2,6 @@
 
 import logging
 import warnings
-from contextlib import suppress
 from dataclasses import replace
 from math import isfinite
 from pathlib import Path
@@ -220,9 +219,11 @@ def diagnose(
             # of what was changed on purpose it would be the way back
             correction = None if asked and before else _correction(result, known, asked)
         if folder and not lattice_out and not before:
-            with suppress(LatticeError):  # an element that no file holds
+            try:
                 _save_rings(result, known, folder / ESTIMATED, None)
                 source["lattice_out"] = ESTIMATED
+            except LatticeError as error:  # an element that no file holds
+                log.warning("no estimated ring for `tmlattice correct`: %s", error)
         calibrations = applied(result, asked) if asked and before else []
         if calibrations:
             source["applied"] = [vars(own) | {"ratio": own.ratio} for own in calibrations]

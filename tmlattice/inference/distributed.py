@@ -552,6 +552,23 @@ def most_probable(
     Raises:
         UnstableRingError: no beam is stored with the first amounts.
     """
+
+    def settled(part: Problem, near: Array, begun: Array, whole: bool) -> tuple[Linear, bool]:
+        """The linearisation of some readings, and whether it predicts the cost at its amounts.
+
+        Steps may raise the cost: where noise is small, they leave a curved valley and come back.
+        """
+        inner, point, near = linearise(part, known, near, near, causes, begun)
+        for _ in range(ROUNDS):
+            found = solved(inner, point, near)
+            inner, point, near = linearise(
+                part, known, found.amounts, near, causes, found.nuisances
+            )
+            cost = point.chi2 + known.square(near)
+            if abs(cost - found.cost) < LINEAR * (1.0 if whole else cost):
+                break
+        return found._replace(amounts=near), abs(cost - found.cost) < LINEAR * cost
+
     way, done, step = problem.way(), 0.0, 1.0
     smallest = 1 / len(np.unique(way))
     failed: Linear | UnstableRingError | None = None
@@ -559,10 +576,10 @@ def most_probable(
     while True:
         share = min(done + step, 1.0)
         part = problem.without(problem.valid & (way > share))
-        begun = nuisances if step == 1 or done else problem.first
         found: Linear | UnstableRingError
         try:
-            found, good = _settled(part, known, amounts, causes, begun, solved, share < 1)
+            begun = nuisances if step == 1 or done else problem.first
+            found, good = settled(part, amounts, begun, share == 1)
         except UnstableRingError as error:
             found, good = error, False
         if good:
@@ -581,30 +598,6 @@ def most_probable(
             return failed
         else:
             raise failed
-
-
-def _settled(
-    problem: Problem,
-    known: DistributedErrors,
-    amounts: Array,
-    causes: Sequence[Cause],
-    nuisances: Array,
-    solved: Callable[[Problem, Point, Array], Linear],
-    roughly: bool,
-) -> tuple[Linear, bool]:
-    """The linearisation of some readings, and whether it predicts the cost at its amounts.
-
-    Steps may raise the cost: where noise is small, they leave a curved valley and come back."""
-    inner, point, amounts = linearise(problem, known, amounts, amounts, causes, nuisances)
-    for _ in range(ROUNDS):
-        found = solved(inner, point, amounts)
-        inner, point, at = linearise(
-            problem, known, found.amounts, amounts, causes, found.nuisances
-        )
-        amounts, cost = at, point.chi2 + known.square(at)
-        if abs(cost - found.cost) < LINEAR * (cost if roughly else 1.0):
-            break
-    return found._replace(amounts=amounts), abs(cost - found.cost) < LINEAR * cost
 
 
 def linearise(
