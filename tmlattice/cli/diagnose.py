@@ -143,11 +143,11 @@ def diagnose(
     apply to it.
     """
     from tmlattice.correction.result import FILES
-    from tmlattice.diagnosis.load import ESTIMATED
+    from tmlattice.diagnosis.load import ESTIMATED_FILE
     from tmlattice.diagnosis.twin import knowledge_file, known_of
     from tmlattice.errors import LatticeError
 
-    kept = Path(ESTIMATED)
+    kept = Path(ESTIMATED_FILE)
     replaced = (*FILES, *map(str, (kept, calibration_beside(kept), knowledge_file(kept))))
     with outputs(out, json_file, replaced) as (folder, write):
         from tmlattice.correction.applied import applied
@@ -220,8 +220,8 @@ def diagnose(
             correction = None if asked and before else _correction(result, known, asked)
         if folder and not lattice_out and not before:
             try:
-                _save_rings(result, known, folder / ESTIMATED, None)
-                source["lattice_out"] = ESTIMATED
+                _save_rings(result, known, folder / ESTIMATED_FILE, None)
+                source["lattice_out"] = ESTIMATED_FILE
             except LatticeError as error:  # an element that no file holds
                 log.warning("no estimated ring for `tmlattice correct`: %s", error)
         calibrations = applied(result, asked) if asked and before else []
@@ -475,7 +475,12 @@ def _print(
         )
     made = result.provenance
     screen.print(f"\n{result.ring.name}: {what}, seed {made['seed']}, {made['seconds']:.1f} s")
-    written = [f"{out}/: report.html, report.txt, diagnosis.json, figures"] if out else []
+    from tmlattice.diagnosis.load import ESTIMATED_FILE
+
+    written = []
+    if out:
+        also = ", estimated ring" if (out / ESTIMATED_FILE).exists() else ""
+        written = [f"{out}/: report.html, report.txt, diagnosis.json, figures{also}"]
     written += [str(json_file)] if json_file else []
     written += rings
     if written:

@@ -34,7 +34,7 @@ from tmlattice.measurement.documents import read_document
 FORMAT, VERSION = "tmlattice-diagnosis", 2
 DOCUMENT, LATTICE = "diagnosis.json", "diagnosis.lattice.json"
 """Of a folder of `save`: the result, and the lattice that it is about."""
-ESTIMATED = "estimated.json"
+ESTIMATED_FILE = "estimated.json"
 """Of a folder of `diagnose --out`: the estimated ring, with its files of `--lattice-out`."""
 
 
