@@ -8,20 +8,19 @@ from collections.abc import Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
 from tmlattice.diagnosis.assessment import Block
-from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import element_kind
-from tmlattice.diagnosis.records import decoded
+from tmlattice.diagnosis.records import decoded, stored_fields
 from tmlattice.diagnosis.response.common_factors import CommonFactors
 from tmlattice.diagnosis.response.inconsistencies import Inconsistency
 from tmlattice.diagnosis.response.missing_effects import Weighed
 from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis, Finding
-from tmlattice.diagnosis.support import Correlation, Support
+from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.diagnosis.views import PartView, StoredView
 from tmlattice.effects import Cause, RingEffect, apply, find
@@ -36,6 +35,9 @@ DOCUMENT, LATTICE = "diagnosis.json", "diagnosis.lattice.json"
 """Of a folder of `save`: the result, and the lattice that it is about."""
 ESTIMATED_FILE = "estimated.json"
 """Of a folder of `diagnose --out`: the estimated ring, with its files of `--lattice-out`."""
+
+RECORDS = {own.__name__: own for own in (CommonFactors, Inconsistency, Step, Suspect, Weighed)}
+"""Records of a result that its own module does not import."""
 
 
 def load(cls: type, path: str | PathLike[str], ring: Ring | None = None) -> Diagnosis:
@@ -88,24 +90,18 @@ def _ring(file: Path, document: Mapping[str, Any]) -> Ring:
 
 
 def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
-    gap = d["gap"]
+    gap, held = d["gap"], d["gap"]["heldout"] or {}
     noise = gap["readings_noise"]
     causes = tuple(Cause(row["effect"], row["element"], row["amount"]) for row in d["errors"])
+    hints = get_type_hints(cls, localns=RECORDS)
     made: Diagnosis = cls(
-        verdict=d["verdict"],
         findings=tuple(_finding(row, ring) for row in d["findings"]),
         fit_before=decoded(Misfit, gap["fit"]["before"]),
         fit_after=decoded(Misfit, gap["fit"]["after"]),
         heldout=_gap(gap),
-        heldout_shots=tuple((gap["heldout"] or {}).get("shots", ())),
-        unexplained=dict(d["unexplained"]),
-        tunes=d["tunes"],
-        next=decoded(NextMeasurement | None, d["next_measurement"]),
-        sensitivity={name: decoded(float, value) for name, value in d["sensitivity"].items()},
-        warnings=tuple(d["warnings"]),
+        heldout_shots=tuple(held.get("shots", ())),
         noise=(decoded(float, noise["x"]), decoded(float, noise["y"])),
         noise_estimated=noise["estimated"],
-        provenance=d["provenance"],
         ring=ring,
         corrected=apply(ring, [cause for cause in causes if _in_ring(cause)]),
         causes=causes,
@@ -114,25 +110,15 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
             d["kind"],
             tuple(_part(row) for row in d.get("measurements", ())),
             tuple(d["assessment"]["measured"]),
-            (gap["heldout"] or {}).get("correctors"),
+            held.get("correctors"),
         ),
-        outliers=tuple(d["outliers"]),
-        steps=decoded(tuple[Step, ...], d["steps"]),
-        rejected_steps=decoded(tuple[Step, ...], d["rejected_steps"]),
-        bad_monitors=tuple(d["bad_monitors"]),
-        priors=d["priors"],
-        prior_errors={name: decoded(float, value) for name, value in d["prior_errors"].items()},
-        degenerate=tuple(d["degenerate"]),
-        common_factors=decoded(CommonFactors | None, d["common_factors"]),
-        inconsistencies=decoded(Inconsistency | None, d["inconsistencies"]),
-        hypotheses=decoded(tuple[Weighed, ...] | None, d["hypotheses"]),
-        suspects=decoded(tuple[Suspect, ...], d["suspects"]),
-        rejected_channels=tuple((row["element"], row["plane"]) for row in d["rejected_channels"]),
         compared=decoded(tuple[Block, ...], d["assessment"]["blocks"]),
-        correlations=decoded(tuple[Correlation, ...], d["correlations"]),
-        devices=d.get("devices", {}),
         supports=decoded(tuple[Support, ...], d["errors"]),
-    )
+        **{
+            name: decoded(hints[name], value)
+            for name, value in stored_fields(cls, d).items() if name != "findings"
+        },
+    )  # fmt: skip
     return made
 
 

@@ -90,6 +90,19 @@ def _hints(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
+def stored_fields(kind: Any, row: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a record's fields that a file holds, by their names here.
+
+    Raises:
+        KeyError: one is absent that is not optional.
+    """
+    own = (field for field in fields(kind) if "hidden" not in field.metadata)
+    return {
+        field.name: row[_key(field)]
+        for field in own if "optional" not in field.metadata or _key(field) in row
+    }  # fmt: skip
+
+
 def _record(kind: Any, row: Mapping[str, Any]) -> Any:
     own = {}
     for field in fields(kind):

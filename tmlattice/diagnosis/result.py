@@ -14,7 +14,7 @@ from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.kinds import KINDS
 from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
-from tmlattice.diagnosis.records import OPTIONAL, encoded, of, record_of
+from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, encoded, named, of, record_of
 from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
 from tmlattice.diagnosis.tables import Tables
 from tmlattice.diagnosis.views import (
@@ -223,23 +223,25 @@ class Diagnosis(Speaks):
 
     verdict: str
     findings: tuple[Finding, ...]
-    fit_before: Misfit
-    fit_after: Misfit
-    heldout: Gap | None
-    heldout_shots: tuple[int, ...]
+    fit_before: Misfit = field(metadata=HIDDEN)
+    fit_after: Misfit = field(metadata=HIDDEN)
+    heldout: Gap | None = field(metadata=HIDDEN)
+    heldout_shots: tuple[int, ...] = field(metadata=HIDDEN)
     unexplained: dict[str, Any]
     tunes: dict[str, list[float] | None]
-    next: NextMeasurement | None
+    next: NextMeasurement | None = field(metadata=named("next_measurement"))
     sensitivity: dict[str, float]
     warnings: tuple[str, ...]
-    noise: tuple[float, float]
-    noise_estimated: bool
+    noise: tuple[float, float] = field(metadata=HIDDEN)
+    noise_estimated: bool = field(metadata=HIDDEN)
     provenance: dict[str, Any]
-    ring: Ring = field(repr=False)
-    corrected: Ring = field(repr=False)
-    causes: tuple[Cause, ...]
-    errors: tuple[float, ...]
-    view: TrajectoryView | ResponseView | JointView | StoredView = field(repr=False)
+    ring: Ring = field(repr=False, metadata=HIDDEN)
+    corrected: Ring = field(repr=False, metadata=HIDDEN)
+    causes: tuple[Cause, ...] = field(metadata=HIDDEN)
+    errors: tuple[float, ...] = field(metadata=HIDDEN)
+    view: TrajectoryView | ResponseView | JointView | StoredView = field(
+        repr=False, metadata=HIDDEN
+    )
     outliers: tuple[dict[str, Any], ...] = ()
     steps: "tuple[Step, ...]" = ()
     rejected_steps: "tuple[Step, ...]" = ()
@@ -251,13 +253,15 @@ class Diagnosis(Speaks):
     inconsistencies: "Inconsistency | None" = None
     hypotheses: "tuple[Weighed, ...] | None" = None
     suspects: "tuple[Suspect, ...]" = ()
-    dispersion: Dispersion = field(default_factory=dict, repr=False)
-    rejected_channels: tuple[tuple[str, str | None], ...] = ()
-    compared: tuple[Block, ...] = ()
+    dispersion: Dispersion = field(default_factory=dict, repr=False, metadata=HIDDEN)
+    rejected_channels: tuple[tuple[str, str | None], ...] = field(
+        default=(), metadata=of("element", "plane")
+    )
+    compared: tuple[Block, ...] = field(default=(), metadata=HIDDEN)
     correlations: tuple[Correlation, ...] = ()
-    devices: Mapping[str, str] = field(default_factory=dict)
-    supports: tuple[Support, ...] = ()
-    covariance: Array | None = field(default=None, repr=False)
+    devices: Mapping[str, str] = field(default_factory=dict, metadata=OPTIONAL)
+    supports: tuple[Support, ...] = field(default=(), metadata=HIDDEN)
+    covariance: Array | None = field(default=None, repr=False, metadata=HIDDEN)
 
     report = Method("tmlattice.report.plain", "report_text", "The report as plain text.")
     save = Method(
@@ -514,17 +518,7 @@ class Diagnosis(Speaks):
             "package": __version__,
             "kind": self.kind,
             "model": self.ring.model,
-            "verdict": self.verdict,
-            "findings": encoded(self.findings),
-            "steps": encoded(self.steps),
-            "rejected_steps": encoded(self.rejected_steps),
-            "bad_monitors": list(self.bad_monitors),
-            "rejected_channels": [
-                {"element": name, "plane": plane} for name, plane in self.rejected_channels
-            ],
-            "degenerate": list(self.degenerate),
-            "priors": dict(self.priors),
-            "prior_errors": dict(self.prior_errors),
+            **record_of(self),
             "errors": [
                 {
                     "effect": c.effect,
@@ -536,20 +530,8 @@ class Diagnosis(Speaks):
                 }
                 for c, s, support in self.supported
             ],
-            "correlations": encoded(self.correlations),
-            "common_factors": encoded(self.common_factors),
-            "inconsistencies": encoded(self.inconsistencies),
-            "hypotheses": encoded(self.hypotheses),
             **({"measurements": encoded(self.parts)} if self.parts else {}),
             "assessment": self.assessment.as_json(),
             "gap": self.gap,
-            "suspects": encoded(self.suspects),
             "unexplained": {"patterns": None, **self.unexplained},
-            "tunes": self.tunes,
-            "next_measurement": encoded(self.next),
-            "sensitivity": self.sensitivity,
-            "warnings": list(self.warnings),
-            "outliers": [dict(row) for row in self.outliers],
-            **({"devices": dict(self.devices)} if self.devices else {}),
-            "provenance": self.provenance,
         }
