@@ -36,7 +36,7 @@ from tmlattice.lattice.at_file import quiet_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
 from tmlattice.machine.shots import draw_background
-from tmlattice.observe.calibration import write_calibration
+from tmlattice.observe.calibration import Calibration, write_calibration
 
 NO_ORBIT = ("beta_beating", "phase_advance", "dispersion", "tunes")
 
@@ -678,7 +678,8 @@ def test_an_energy_is_as_uncertain_in_the_files_as_in_the_diagnosis(small_ring, 
     path, energy = tmp_path / "found.json", Cause("energy_offset", None, 1e-3)
     save_ring(small_ring, path)
     errors = {("energy_offset", None): 2e-4}
-    write_calibration(tmp_path / "found.json.calibration.json", [energy], errors=errors)
+    calibration = Calibration([energy], errors=errors)
+    write_calibration(tmp_path / "found.json.calibration.json", calibration)
     estimate, _ = read_estimate(path, small_ring, small_ring)
     assert (estimate.energy, estimate.energy_error) == (1e-3, 2e-4)
 

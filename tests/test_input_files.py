@@ -17,7 +17,7 @@ from tmlattice.importers.hdf5 import read_hdf5, read_mapping
 from tmlattice.input_files import json_of, yaml_of
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import read_turn_by_turn
-from tmlattice.observe.calibration import read_calibration, read_rejected
+from tmlattice.observe.calibration import read_calibration
 
 NAMES = [f"bpm{i}" for i in range(6)]
 
@@ -278,7 +278,7 @@ def test_a_cause_that_stands_twice_in_a_calibration_is_refused(tmp_path, small_r
             json.dumps({"format": "tmlattice-calibration", "version": 1, "effects": effects})
         )
         if whole:
-            assert len(read_calibration(path, small_ring)) == 1
+            assert len(read_calibration(path, small_ring).causes) == 1
             continue
         with pytest.raises(Exception, match="occurs twice"):
             read_calibration(path, small_ring)
@@ -359,7 +359,7 @@ def test_only_bpms_and_correctors_are_rejected_channels(tmp_path, small_ring, fa
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps(document))
     with pytest.raises(MeasurementError, match=words):
-        read_rejected(path, small_ring)
+        read_calibration(path, small_ring)
 
 
 # --- what is no regular file ----------------------------------------------------------------------

@@ -25,9 +25,9 @@ from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.calibration import (
+    Calibration,
     calibrated_response,
     read_calibration,
-    read_dispersion,
     write_calibration,
 )
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -209,9 +209,9 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
     (text,) = (one for one in found.warnings if "RF's orbit" in one)
     assert "RF's orbit in x are not from a gradient" in text  # the added kicks are horizontal
     path = tmp_path / "ring.calibration.json"
-    write_calibration(path, found.calibration, found.dispersion)
-    dispersion = read_dispersion(path, ring)
-    assert dispersion == found.dispersion
+    write_calibration(path, Calibration(found.calibration, found.dispersion))
+    own = read_calibration(path, ring)
+    assert own.dispersion == found.dispersion
     measured = found.view.measured
     for row, said in (
         ('{"element": "QF::1", "x": 0, "y": 0}', "is a quadrupole"),
@@ -224,13 +224,11 @@ def test_predict_has_the_dispersion_that_was_found(tmp_path, ring_kicking_x, bes
             f'"dispersion": [{row}]}}'
         )
         with pytest.raises(MeasurementError, match=said):
-            read_dispersion(other, ring)
+            read_calibration(other, ring)
     at = [found.as_found.monitors.index(found.as_found[name]) for name in measured.monitors]
     missed = []
-    for more in (dispersion, None):
-        _, response = calibrated_response(
-            found.as_found, read_calibration(path, ring), measured.correctors, more
-        )
+    for more in (own.dispersion, None):
+        _, response = calibrated_response(found.as_found, own.causes, measured.correctors, more)
         read = np.array(measured.kicks)[:, None, None] * response[:, at]
         missed.append(np.nanstd(read - found.view.model[:-1]))
     assert missed[0] < 2e-9 < 0.1 * missed[1]  # the steps' third order

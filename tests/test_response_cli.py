@@ -13,7 +13,12 @@ from tmlattice import Cause, load_ring, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import EffectError, MeasurementError
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.calibration import calibrated_response, read_calibration, write_calibration
+from tmlattice.observe.calibration import (
+    Calibration,
+    calibrated_response,
+    read_calibration,
+    write_calibration,
+)
 from tmlattice.observe.compared import OfResponse
 
 CAUSES = [
@@ -86,8 +91,8 @@ def test_command_line(tmp_path):
 
 def test_predict_with_a_calibration(tmp_path, small_ring):
     file, out = tmp_path / "ring.calibration.json", tmp_path / "predicted.csv"
-    write_calibration(file, CAUSES)
-    assert read_calibration(file, small_ring) == CAUSES
+    write_calibration(file, Calibration(CAUSES))
+    assert read_calibration(file, small_ring).causes == CAUSES
     tmlattice("predict", SMALL, "--calibration", file, "--corrector", "v5", "--corrector", "v6",
               "--kick", "2e-5", "--out", out, cwd=tmp_path, check=0)  # fmt: skip
     with out.open(encoding="utf-8") as table:
@@ -105,8 +110,9 @@ def test_predict_with_a_calibration(tmp_path, small_ring):
 
 
 def test_calibration_that_cannot_be(tmp_path, small_ring):
+    own = Calibration([Cause("quadrupole_gradient", "QF::1", 0.1)])
     with pytest.raises(EffectError, match="is no calibration"):
-        write_calibration(tmp_path / "c.json", [Cause("quadrupole_gradient", "QF::1", 0.1)])
+        write_calibration(tmp_path / "c.json", own)
     (tmp_path / "c.json").write_text('{"format": "tmlattice-calibration", "version": 1}')
     with pytest.raises(MeasurementError, match="effects"):
         read_calibration(tmp_path / "c.json", small_ring)

@@ -185,7 +185,8 @@ def write_calibration(folder):
     from tmlattice.observe import calibration
 
     causes = [Cause("monitor_gain_x", "m::0", 0.01), Cause("corrector_calibration", "ch::0", 0.02)]
-    calibration.write_calibration(folder / "calibration.json", causes)
+    own = calibration.Calibration(causes)
+    calibration.write_calibration(folder / "calibration.json", own)
     words = ["predict", "ring.json", "--calibration", "calibration.json", "--out", "told.csv"]
     tmlattice(*words, "-q", cwd=folder, check=0)
     return {"calibration": (words, "calibration.json")}

@@ -348,7 +348,7 @@ def _save_rings(
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import save_ring
-    from tmlattice.observe.calibration import write_calibration
+    from tmlattice.observe.calibration import Calibration, write_calibration
     from tmlattice.report.action_texts import by_hand_text
 
     written: dict[str, tuple[str, ...]] = {}
@@ -360,9 +360,8 @@ def _save_rings(
         if result.calibration or result.by_steps:
             amounts = zip(result.causes, result.errors, strict=True)
             errors = {(c.effect, c.element): e for c, e in amounts if isfinite(e)}
-            write_calibration(
-                beside, result.calibration, result.dispersion, result.rejected_channels, errors
-            )
+            own = (result.calibration, result.dispersion, result.rejected_channels, errors)
+            write_calibration(beside, Calibration(*own))
             written[str(beside)] = ()
         else:  # that of the ring which stood there
             beside.unlink(missing_ok=True)

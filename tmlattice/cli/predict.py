@@ -46,22 +46,15 @@ def predict(
     """
     from tmlattice.files import output_file
     from tmlattice.measurement.kinds import write_response_table
-    from tmlattice.observe.calibration import (
-        calibrated_response,
-        read_calibration,
-        read_dispersion,
-        read_rejected,
-    )
+    from tmlattice.observe.calibration import Calibration, calibrated_response, read_calibration
 
     if kick == 0 or not abs(kick) < float("inf"):
         raise click.BadParameter(f"a kick of {kick:g} rad; it is finite and not zero")
     with output_file(out) as file:
         ring = open_ring(lattice)
-        causes = read_calibration(calibration, ring) if calibration else []
-        dispersion = read_dispersion(calibration, ring) if calibration else None
-        rejected = read_rejected(calibration, ring) if calibration else []
+        own = read_calibration(calibration, ring) if calibration else Calibration()
         columns, response = calibrated_response(
-            ring, causes, correctors or None, dispersion, rejected
+            ring, own.causes, correctors or None, own.dispersion, own.rejected
         )
         monitors = [monitor.name for monitor in ring.monitors]
         orbits = list(zip(columns.names, kick * response, strict=True))

@@ -21,7 +21,7 @@ from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import STEP_SHARES
 from tmlattice.lattice import Ring
-from tmlattice.observe.calibration import Dispersion, read_dispersion, read_energy
+from tmlattice.observe.calibration import Dispersion, offset_of, read_calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +167,7 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
     else:
         warnings = (f"'{with_beam.name}' is missing: the estimated ring is taken as certain",)
     if calibration.is_file():
-        energy = read_energy(calibration, ring)
-        found = found.with_beam(read_dispersion(calibration, ring), *energy)
+        own = read_calibration(calibration, ring)
+        sigma = own.errors.get(("energy_offset", None), 0.0)
+        found = found.with_beam(own.dispersion, offset_of(own.causes), sigma)
     return found, warnings

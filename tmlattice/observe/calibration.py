@@ -1,6 +1,7 @@
 """Calibration of monitors and correctors: a file of effects, and the calibrated response."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,31 +26,25 @@ Channel = tuple[str, str | None]
 """A monitor and its plane, "x" or "y"; or a corrector and None."""
 
 
-def read_calibration(path: str | Path, ring: Ring) -> list[Cause]:
-    """Return the effects of a calibration file.
+@dataclass(frozen=True)
+class Calibration:
+    """What is beside the lattice file of an estimated ring.
 
-    Args:
-        path: JSON, see the schema `calibration`.
-        ring: the ring of the effects.
-
-    Raises:
-        MeasurementError: no such file, or not a calibration of this ring.
+    Attributes:
+        causes: effects on monitors, correctors and the beam.
+        dispersion: beyond that of the lattice.
+        rejected: channels that are not predicted.
+        errors: standard errors of the amounts, by effect and element, where known.
     """
-    path = Path(path)
-    document = read_document(path, "calibration", FORMAT)
-    with located(path):
-        causes = [Cause(e["effect"], e["element"], float(e["amount"])) for e in document["effects"]]
-    try:
-        _check(causes)
-        check(ring, causes)
-        _once(causes)
-    except TmlatticeError as error:
-        raise type(error)(f"{path}: {error}") from error
-    return causes
+
+    causes: Sequence[Cause] = ()
+    dispersion: Dispersion = field(default_factory=dict)
+    rejected: Iterable[Channel] = ()
+    errors: Mapping[Channel, float] = field(default_factory=dict)
 
 
-def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
-    """Return the dispersion of a calibration file beyond the lattice's; empty if it has none.
+def read_calibration(path: str | Path, ring: Ring) -> Calibration:
+    """Return the content of a calibration file.
 
     Args:
         path: JSON, see the schema `calibration`.
@@ -57,60 +52,39 @@ def read_dispersion(path: str | Path, ring: Ring) -> Dispersion:
 
     Raises:
         MeasurementError: no such file, not a calibration, a row that is not a number, or an element
-            that is neither a monitor nor a corrector.
-        UnknownNameError: an element of another ring.
+            that cannot have it.
+        EffectError, UnknownNameError: an effect or an element of another ring.
     """
     path = Path(path)
     document = read_document(path, "calibration", FORMAT)
-    found: dict[str, tuple[float, float]] = {}
+    rows = document["effects"]
+    with located(path):
+        causes = [Cause(e["effect"], e["element"], float(e["amount"])) for e in rows]
+    try:
+        _check(causes)
+        check(ring, causes)
+        _once(causes)
+    except TmlatticeError as error:
+        raise type(error)(f"{path}: {error}") from error
+    dispersion: dict[str, tuple[float, float]] = {}
     for row in document.get("dispersion", []):
         with located(path):
             element = ring[row["element"]]
         both = float(row["x"]), float(row["y"])
         if element.kind != "monitor" and element.kind not in CORRECTORS:
             wrong = f"is a {element.kind}, and has no place there"
-        elif element.name in found:
+        elif element.name in dispersion:
             wrong = "occurs twice"
         elif not np.isfinite(both).all():
             wrong = "is no number"
         else:
-            found[element.name] = both
+            dispersion[element.name] = both
             continue
         raise MeasurementError(
             f"{path}: the dispersion of '{element.name}' {wrong}; write the calibration anew "
             "(diagnose --lattice-out)"
         )
-    return found
-
-
-def read_energy(path: str | Path, ring: Ring) -> tuple[float, float]:
-    """Relative deviation of the beam's mean energy in a calibration file, and its standard error.
-
-    The error is 0 if the file does not state it.
-
-    Raises:
-        MeasurementError: no such file, or not a calibration of this ring.
-    """
-    amount = offset_of(read_calibration(path, ring))
-    rows = read_document(Path(path), "calibration", FORMAT)["effects"]
-    sigmas = [row.get("sigma", 0.0) for row in rows if row["effect"] == "energy_offset"]
-    return amount, float(np.linalg.norm(sigmas))
-
-
-def read_rejected(path: str | Path, ring: Ring) -> list[Channel]:
-    """Return the rejected channels of a calibration file, which are not predicted.
-
-    Args:
-        path: JSON, see the schema `calibration`.
-        ring: its ring.
-
-    Raises:
-        MeasurementError: no such file, or not a calibration.
-        UnknownNameError: an element of another ring.
-    """
-    path = Path(path)
-    document = read_document(path, "calibration", FORMAT)
-    found: list[Channel] = []
+    rejected: list[Channel] = []
     for row in document.get("rejected", []):
         with located(path):
             element, plane = ring[row["element"]], row["plane"]
@@ -120,25 +94,13 @@ def read_rejected(path: str | Path, ring: Ring) -> list[Channel]:
                 f"{'BPM' if plane else 'corrector'}; write the calibration anew (diagnose "
                 "--lattice-out)"
             )
-        found.append((element.name, plane))
-    return found
+        rejected.append((element.name, plane))
+    errors = {(e["effect"], e["element"]): e["sigma"] for e in rows if "sigma" in e}
+    return Calibration(causes, dispersion, rejected, errors)
 
 
-def write_calibration(
-    path: str | Path,
-    causes: Iterable[Cause],
-    dispersion: Dispersion | None = None,
-    rejected: Iterable[Channel] = (),
-    errors: Mapping[Channel, float] | None = None,
-) -> None:
+def write_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write a calibration file, atomically.
-
-    Args:
-        path: of the file, JSON.
-        causes: effects on monitors, correctors and the beam.
-        dispersion: beyond that of the lattice.
-        rejected: rejected channels.
-        errors: standard errors of the amounts, by effect and element, where known.
 
     Raises:
         EffectError: an effect that is not a calibration.
@@ -146,20 +108,20 @@ def write_calibration(
     """
     from tmlattice import __version__
 
-    causes, errors = list(causes), errors or {}
-    _check(causes)
+    errors = calibration.errors
+    _check(calibration.causes)
     effects = [
         {"effect": c.effect, "element": c.element, "amount": c.amount}
         | ({"sigma": errors[c.effect, c.element]} if (c.effect, c.element) in errors else {})
-        for c in causes
+        for c in calibration.causes
     ]
     document = {"format": FORMAT, "version": 1, "package": __version__, "effects": effects}
-    if dispersion:
+    if calibration.dispersion:
         document["dispersion"] = [
-            {"element": name, "x": x, "y": y} for name, (x, y) in dispersion.items()
+            {"element": name, "x": x, "y": y} for name, (x, y) in calibration.dispersion.items()
         ]
-    if silenced := [{"element": name, "plane": plane} for name, plane in rejected]:
-        document["rejected"] = silenced
+    if rejected := [{"element": name, "plane": plane} for name, plane in calibration.rejected]:
+        document["rejected"] = rejected
     with output_file(Path(path)) as file:
         write_json(file, document)
 
