@@ -9,9 +9,8 @@ from shared import parted
 
 from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
-from tmlattice.diagnosis.response.detected_faults import as_turned
+from tmlattice.diagnosis.response.detected_faults import as_turned, sizes_in, small_errors
 from tmlattice.diagnosis.response.linear import linear
-from tmlattice.diagnosis.response.small_errors import sizes_in, small_errors
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.suspects import numbers
 from tmlattice.effects import background_rms

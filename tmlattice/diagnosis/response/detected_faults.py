@@ -2,49 +2,89 @@
 
 >>> apart, findings = detected_faults(data, split, fit.state, hypotheses, most, judgement)
 
-One cause after another is given a prior of its own, together with all usual distributed errors
-(`small_errors`). Their scales are learnt without it, and everything is fitted again, not
-linearised. A cause is detected at five standard deviations of its family's scatter, and above the
-chance level of so many causes and families.
+All usual distributed errors of a ring are the background model of a fault (`small_errors`): the
+families of a hierarchical fit, and the closed orbit in sextupoles. All readings are fitted; of
+held-out correctors the half of the BPMs that determines their kicks. Priors are Gaussian, and the
+largest number of a family is omitted from its scale, because it may be the fault.
+
+A cause that is one number of a family (a quadrupole's gradient, a gain, a roll), or a sum of some
+(a supply), is in the normal equations already. Others (a misaligned sextupole, a device) are
+compared by their signatures; the usual errors of their effect, of which the fit has no family,
+reduce their statistics.
+
+One cause after another is given a prior of its own. The scales are learnt without it, and
+everything is fitted again, not linearised. A cause is detected at five standard deviations of its
+family's scatter, and above the chance level of so many causes and families.
 """
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 from scipy.stats import t as student
 
-from tmlattice.arrays import Array
-from tmlattice.diagnosis.families.dispersion import OrbitFamily
+from tmlattice.arrays import REDUNDANT, Array
+from tmlattice.diagnosis.assessment import MISSING
+from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, OrbitFamily, VerticalOrbit
+from tmlattice.diagnosis.families.family import Family, RingFamily
+from tmlattice.diagnosis.families.fields import (
+    FamilyGradient,
+    OtherGradient,
+    QuadrupoleGradient,
+    SkewGradient,
+)
+from tmlattice.diagnosis.families.steps import (
+    CorrectorCalibration,
+    CorrectorRoll,
+    MonitorGain,
+    MonitorRoll,
+)
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
-from tmlattice.diagnosis.response.linear import Linear, linear
+from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.missing_effects import HELPS
-from tmlattice.diagnosis.response.rounds import log_evidence, settle
-from tmlattice.diagnosis.response.small_errors import ANEW, USUAL, sizes_in, small_errors
-from tmlattice.diagnosis.response.state import Candidate, State, allow, bend
+from tmlattice.diagnosis.response.rounds import LEARN, log_evidence, settle
+from tmlattice.diagnosis.response.state import Candidate, State, allow, begin, bend, jump
 from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.stepwise import ROUGH, StepwiseFit, fit_chi2
-from tmlattice.diagnosis.response.suspected import KINDS, Seen, Weighed, suspects_of, with_number
 from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.response.weights import weighed, weight
 from tmlattice.diagnosis.result import Finding
-from tmlattice.effects import Cause, find, rare
+from tmlattice.effects import Cause, RingEffect, find, rare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.alternatives import Detection, linear_evidence
 from tmlattice.inference.common_factors import MIN_CHI2
 from tmlattice.inference.judgement import BEYOND, SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
-from tmlattice.inference.priors import Group
+from tmlattice.inference.priors import SMALLEST, Group
 from tmlattice.inference.scan import Scan
-from tmlattice.observe.orbit_response import Errors, Hypothesis
+from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.split import Split
 
 log = logging.getLogger(__name__)
 
+USUAL: tuple[Family, ...] = (
+    CorrectorCalibration(), FamilyGradient(), MonitorGain(), QuadrupoleGradient(), OtherGradient(),
+    MonitorRoll(), CorrectorRoll(), SkewGradient(), HorizontalOrbit(), VerticalOrbit(),
+)  # fmt: skip
+"""Families of every ring."""
+ANEW = 20_000
+"""Most readings for a second fit, from the design, because the given one may be of a wrong ring;
+and for several candidates per step."""
+SHARED = {
+    "vertical_focusing": "vertical_focusing",
+    "quadrupole_gradient of families": "quadrupole_gradient",
+    "corrector_calibration of families": "corrector_calibration",
+}
+"""Groups of few numbers, in which the usual scale counts as `COUNTS` further numbers."""
+COUNTS = 4
+AFFORDABLE = 4e9
+"""Most products of signatures and derivatives; above it only numbers of families are compared."""
 FAULTS = 8
 """Most faults: more of them are distributed errors."""
 WORTH, HIDDEN = 15.0, 8.0
@@ -58,6 +98,299 @@ MEMBERS = 16
 """Assumed number of orbit patterns, where there are none."""
 
 
+# --- the background model -------------------------------------------------------------------------
+def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
+    """Return the fit of the distributed errors to all readings outside the validation set.
+
+    Args:
+        data, split: the data, and the validation split.
+        fitted: a hierarchical fit of the data.
+    """
+    orbits, half = data.orbits.copy(), split.half.copy()
+    orbits[:-1][split.held[:-1, None] & ~split.half[:-1]] = np.nan  # the validation readings
+    for column in np.flatnonzero(split.held):
+        half[column, np.flatnonzero(half[column])[::2]] = False  # half of the remaining ones
+    data, none = replace(data, orbits=orbits), np.zeros_like(split.held)
+    split = Split(none, none, half, np.zeros_like(split.inner_rf))
+    design = replace(begin(data, split), good=fitted.good, exploring=False)
+    names = [family.name for family in USUAL]
+    known = [*USUAL, *(family for family in fitted.families if family.name not in names)]
+    families = [f for f in known if design.reads(f.block) and f.size(data)]
+    at = Predicted(data, Errors.none(data), fitted.at.bent)
+    there = allow(replace(design, at=at, lacking=fitted.lacking, groups=fitted.groups), families)
+    continued = there.moved({
+        name: fitted.values.get(name, values) for name, values in there.values.items()
+    })  # fmt: skip
+    found: list[tuple[float, State]] = []
+    few = data.orbits.size <= ANEW
+    for start in (allow(design, families), continued) if few else (continued,):
+        try:
+            state = settle(jump(bend(start), beyond=1.0), gain=ROUGH)
+            state = settle(bend(state))
+        except (TmlatticeError, np.linalg.LinAlgError):  # diverged
+            continue
+        found.append((log_evidence(state, state.good), state))
+        log.info("distributed errors: evidence %.1f", found[-1][0])
+        if all(own.ratio**2 < MISSING for own in fit_chi2(state)[:2]):
+            break
+    return max(found, key=lambda one: one[0])[1] if found else continued
+
+
+def sizes_in(there: Linear) -> tuple[Group, ...]:
+    """Return the priors of a fit with scales from all numbers but each family's largest."""
+    groups = [replace(group, each=None, freedom=np.inf) for group in there.groups]
+    pull = there.normal.vector + there.normal.matrix @ there.start
+    ends = np.cumsum([group.basis.shape[1] for group in groups])[:-1]
+    for _ in range(LEARN):
+        found = solve(there.normal, groups, there.start, rounds=0)
+        scale = np.concatenate([group.scale for group in groups])
+        amounts = found.covariance @ (found.spread.T @ pull)
+        squares = (amounts**2 + np.diag(found.covariance)) * scale**2
+        groups = [
+            _sized(group, own) for group, own in zip(groups, np.split(squares, ends), strict=True)
+        ]
+    return tuple(groups)
+
+
+def _sized(group: Group, squares: Array) -> Group:
+    """The mean square without the largest, corrected for that omission."""
+    n = len(squares)
+    if group.fixed or not n:
+        return group
+    if group.name in SHARED:
+        usual = find(SHARED[group.name]).background or SMALLEST
+        mean = (squares.sum() - squares.max() + COUNTS * usual**2) / (n - 1 + COUNTS)
+    elif n < 3:
+        mean = float(squares.mean())
+    else:
+        expected = float(ndtri(0.5 / n)) ** 2  # expectation of the largest of n
+        without = (squares.sum() - squares.max()) / max(n - expected, 1.0)
+        mean = min(float(squares.mean()), float(without))
+    return replace(group, rms=max(float(np.sqrt(mean)), SMALLEST))
+
+
+# --- causes as numbers of the fit -----------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class Others(RingFamily):
+    """Causes without a family, of one number each, in units of its effect's largest fault; their
+    priors are those of single faults.
+
+    Attributes:
+        block: whose readings determine the amounts.
+        causes: effect and place.
+    """
+
+    block: int  # type: ignore[misc]
+    causes: tuple[Hypothesis, ...] = ()
+
+    trust, effects = 0.03, ()
+
+    @property
+    def variable(self) -> str:  # type: ignore[override]
+        """One for each block."""
+        return f"others {self.block}"
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """That of its variable."""
+        return self.variable
+
+    def groups(self, data: ResponseData) -> list[Group]:
+        """None: each number has the prior of its single fault."""
+        return []
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """One cause for each number."""
+        return [{cause: find(cause[0]).largest} for cause in self.causes]
+
+
+OTHERS = ("", Others(0).variable, Others(1).variable)
+"""Variables of causes without a family; the first one before they are numbers."""
+
+
+def with_number(state: State, cause: Hypothesis, block: int) -> State:
+    """The state with one more number, at zero."""
+    name = Others(block).variable
+    have = next((f.causes for f in state.families
+                 if isinstance(f, Others) and f.block == block), ())  # fmt: skip
+    if cause in have:
+        return state
+    apart = tuple(
+        replace(one, members=np.append(one.members, 0.0)) if one.variable == name else one
+        for one in state.apart
+    )
+    families = [f for f in state.families if f.variable != name]
+    values = {**state.values, name: np.append(state.values.get(name, np.zeros(0)), 0.0)}
+    return replace(
+        state, apart=apart, families=(*families, Others(block, (*have, cause))), values=values
+    )
+
+
+def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Candidate]:
+    """Return the suspects of causes that the readings may determine."""
+    numbers = _numbers(state)
+    found, signed = [], []
+    for cause in causes:
+        if cause in numbers:
+            family, shares = numbers[cause]
+            members = np.zeros(len(state.values[family.variable]))
+            members[list(shares)] = list(shares.values())
+            found.append(Candidate(cause, family.block, family.variable, members))
+        elif cause[1] is not None and isinstance(find(cause[0]), RingEffect):
+            signed.append(Candidate(cause))
+    size = sum(len(values) for values in state.values.values())
+    if len(signed) * state.data.orbits.size * size <= AFFORDABLE:
+        found += signed
+    return found
+
+
+def _numbers(state: State) -> dict[Hypothesis, tuple[Family, Mapping[int, float]]]:
+    """Causes that are numbers of the fit, or sums of some: family, and numbers for a unit of the
+    amount. A fault of one piece of a magnet is the magnet's."""
+    data, ring = state.data, state.data.ring
+    out: dict[Hypothesis, tuple[Family, Mapping[int, float]]] = {}
+    for family in state.families:
+        gradients = isinstance(family, QuadrupoleGradient)
+        magnets = gradients or isinstance(family, SkewGradient)
+        each, own = family.moves(data), dict[tuple[str, str], dict[int, float]]()
+        for i, moves in enumerate(each):
+            for (effect, place), share in moves.items():
+                pattern = family.per == "ring" and len(moves) > 1 and not magnets
+                if place is not None and not pattern:
+                    shares = own.setdefault((effect, ring[place].name), {})
+                    shares[i] = 1.0 if magnets else share
+        for (effect, name), shares in own.items():
+            i, unit = next(iter(shares)), 1 / sum(share**2 for share in shares.values())
+            if isinstance(family, CorrectorRoll):  # its number is a share of the stated kick
+                unit *= 1 + state.at.errors.calibration[i]
+            out[effect, name] = family, {n: unit * share for n, share in shares.items()}
+            strength = ring[name].k1 * ring[name].length
+            if gradients:
+                out["gradient_absolute", name] = family, {i: 1 / strength}
+            elif magnets and strength and len(each[i]) == 1:
+                out["quadrupole_roll", name] = family, {i: -2 * strength}
+        supply = find("family_gradient")
+        assert isinstance(supply, RingEffect)
+        for place in supply.places(ring) if gradients else ():
+            members = (("quadrupole_gradient", ring.elements[i].name)
+                       for i in supply.members(ring, place))  # fmt: skip
+            some = sorted({next(iter(own[one])) for one in members if one in own})
+            if len(some) > 1:
+                out[supply.name, place] = family, dict.fromkeys(some, 1.0)
+    return out
+
+
+# --- products -------------------------------------------------------------------------------------
+class _Block(NamedTuple):
+    """One block of the fit, with the distributed errors' priors, and each suspect's products."""
+
+    there: Linear
+    sizes: tuple[Group, ...]  # without those of single faults
+    across: Array  # J^T W S, [number, suspect]
+    own: Array  # S^T W S, [suspect]
+    left: Array  # S^T W r, [suspect]
+
+
+class Weighed(NamedTuple):
+    """The statistics of each suspect given distributed errors, [suspect]."""
+
+    statistic: Array  # fall of chi-square, given the usual scatter of the amount
+    amount: Array
+    sigma: Array  # its error
+    information: Array  # by block, [2, suspect]
+    evidence: Array  # log, linear
+
+
+class Seen:
+    """The products of all suspects at a fit.
+
+    Args:
+        state: with distributed errors, and with the single faults so far.
+        hypotheses: to be compared.
+        problem: for their priors.
+    """
+
+    def __init__(self, state: State, hypotheses: Sequence[Hypothesis], problem: Response) -> None:
+        self.state, self.problem = state, problem
+        self.suspects = suspects_of(state, hypotheses)
+        self.causes = tuple(one.cause for one in self.suspects)
+        self.scatter = np.array([(find(one.cause[0]).background or 0.0) * (one.variable in OTHERS)
+                                 for one in self.suspects])  # fmt: skip
+        self.blocks = {block: self._block(block) for block in (0, 1) if state.of_block(block)}
+        some = [h for h, one in enumerate(self.suspects) if one.block is None]
+        weights = {block: weight(state, block) for block in self.blocks}
+        signatures = state.at.signatures([self.causes[h] for h in some])
+        for h, signature in zip(some, signatures, strict=True):
+            for block, it in self.blocks.items():
+                row = np.where(weights[block] > 0, state.data.pick(signature, block), 0.0)
+                heavy = weighed(state, block, row)
+                left = np.where(weights[block] > 0, state.data.pick(state.at.left, block), 0.0)
+                it.own[h], it.left[h] = np.sum(heavy * row), np.sum(heavy * left)
+                it.across[:, h] = gathered(it.there, state.data.plane_of(block), heavy)
+
+    def _block(self, block: int) -> _Block:
+        there = linear(self.state, block)
+        across = np.zeros((len(there.normal.vector), len(self.suspects)))
+        for h, one in enumerate(self.suspects):
+            if one.block == block and one.variable in there.where:
+                across[there.where[one.variable], h] = one.members
+        left = there.normal.vector @ across
+        spread = there.normal.matrix @ across
+        return _Block(there, sizes_in(there), spread, np.einsum("nh,nh->h", across, spread), left)
+
+    def place(self, one: Candidate) -> int:
+        """The index of a fault."""
+        return self.causes.index(one.cause)
+
+    def beside(self, without: Candidate | None = None) -> Weighed:
+        """Return the statistics of each suspect, given distributed errors and accepted faults.
+
+        Args:
+            without: an accepted fault that is replaced by its alternatives.
+        """
+        information, inner = np.zeros((2, 2, len(self.suspects)))
+        for block, it in self.blocks.items():
+            priors = [group for group in it.sizes if without is None or group.name != without.name]
+            found = solve(it.there.normal, priors, it.there.start, rounds=0)
+            along = found.spread.T @ it.across
+            taken = np.einsum("ph,ph->h", along, found.covariance @ along)
+            information[block] = np.maximum(it.own - taken, 0.0)
+            information[block][information[block] < REDUNDANT * it.own] = 0.0
+            inner[block] = it.left - (found.values - it.there.start) @ it.across
+        inner[information == 0] = 0.0
+        total, pull = information.sum(axis=0), inner.sum(axis=0)
+        safe = np.where(total > 0, total, 1.0)
+        amount = np.where(total > 0, pull / safe, 0.0)
+        statistic = amount * pull / (1 + total * self.scatter**2)
+        linear_ones = linear_evidence(
+            self.problem, Scan(self.causes, statistic, amount, total, 1.0)
+        )
+        largest = np.array([find(name).largest for name, _ in self.causes])
+        return Weighed(
+            statistic, amount, np.where(total > 0, 1 / np.sqrt(safe), np.inf), information,
+            np.where(np.abs(amount) < BEYOND * largest, linear_ones, -np.inf),
+        )  # fmt: skip
+
+    def shown(self, one: Candidate) -> tuple[float, Cause, float]:
+        """Statistic, amount and error of a fault, widened for contradicting BPMs and columns."""
+        own, here = self.beside(one), self.place(one)
+        assert one.block is not None
+        there, sizes, *_ = self.blocks[one.block]
+        posterior = solve(there.normal, sizes, there.start, rounds=0)
+        wider = doubt(self.state, one, there, posterior)
+        amount, variance = float(own.amount[here]), float(own.sigma[here]) ** 2 * wider
+        # a distributed error scales with the fault: it is three times as large for a kick three
+        # times as strong
+        share = max(abs(find(one.cause[0]).joined(amount, 1.0) - amount), 1.0)
+        along = np.zeros(len(there.start))
+        along[there.where[one.variable]] = one.unit
+        scatter = sum(np.sum((along @ group.basis * group.scale) ** 2)
+                      for group in sizes if group.name != one.name)  # fmt: skip
+        variance += (share**2 - 1) * float(scatter)
+        return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(variance**0.5)
+
+
+# --- the search -----------------------------------------------------------------------------------
 def detected_faults(
     data: ResponseData,
     split: Split,
@@ -108,6 +441,10 @@ class _Search:
             rare=rare(state.data.ring, list(places)), judgement=judgement,
         )  # fmt: skip
 
+    def seen(self, state: State) -> Seen:
+        """All suspects, linearised at the state."""
+        return Seen(state, self.hypotheses, self.problem)
+
     def drowned(self) -> bool:
         """Whether the residual far exceeds the noise, and no single cause explains most of it:
         model discrepancy could be detected as a fault."""
@@ -131,21 +468,6 @@ class _Search:
             return [np.inf, np.inf]
         return [own.chi2 for own in moved]
 
-    def seen(self, state: State) -> Seen:
-        """All suspects, linearised at the state."""
-        return Seen(state, suspects_of(state, self.hypotheses))
-
-    def evidence(self, seen: Seen, own: Weighed) -> Array:
-        """Log evidence of each suspect, linear, [suspect]."""
-        information = np.where(np.isfinite(own.sigma), own.sigma**-2.0, 0.0)
-        causes = tuple(one.cause for one in seen.suspects)
-        largest = np.array([find(name).largest for name, _ in causes])
-        possible = np.abs(own.amount) < BEYOND * largest
-        messages = linear_evidence(
-            self.problem, Scan(causes, own.statistic, own.amount, information, 1.0)
-        )
-        return np.where(possible, messages, -np.inf)
-
     def next(self) -> State | None:
         """The state with the most probable further cause, if it is detected; else None."""
         # the distributed errors have outliers already, so the evidence need not grow with a fault;
@@ -166,14 +488,12 @@ class _Search:
     def leaders(self) -> list[tuple[Hypothesis, float, Array]]:
         """Candidates: the most probable by the linear model, one of each action, with amount and
         information of each block."""
-        ring = self.state.data.ring
         seen = self.seen(self.state)
         if not seen.suspects:
             return []
         own = seen.beside()
-        evidence = self.evidence(seen, own)
         worth = [HIDDEN if one.block is None else WORTH for one in seen.suspects]
-        evidence[own.statistic < worth] = -np.inf
+        evidence = np.where(own.statistic < worth, -np.inf, own.evidence)
         first = int(np.argmax(evidence))
         least = evidence[first] - self.judgement.window
         least -= self.judgement.drift * own.statistic[first]
@@ -181,10 +501,10 @@ class _Search:
         found: dict[str, tuple[Hypothesis, float, Array]] = {}
         have = [one.cause for one in self.state.apart]
         for h in order:
-            cause = seen.suspects[h].cause
-            same = recommended_action(ring, Cause(*cause, float(own.amount[h])))
+            cause, amount = seen.causes[h], float(own.amount[h])
+            same = recommended_action(self.state.data.ring, Cause(*cause, amount))
             if cause not in have and len(found) < self.tries:
-                found.setdefault(same, (cause, float(own.amount[h]), own.information[:, h]))
+                found.setdefault(same, (cause, amount, own.information[:, h]))
         return list(found.values())
 
     def put(self, state: State, cause: Hypothesis, information: Array) -> State | None:
@@ -200,15 +520,13 @@ class _Search:
     def better(self, state: State, one: Candidate) -> State:
         """The state with an alternative instead of a cause, if that explains more."""
         seen = self.seen(state)
-        own = seen.beside(one.name)
-        evidence = self.evidence(seen, own)
-        here = _place(seen, one)
+        own = seen.beside(one)
         have = [other.cause for other in state.apart if other is not one]
-        evidence[[h for h, s in enumerate(seen.suspects) if s.cause in have]] = -np.inf
+        evidence = np.where([cause in have for cause in seen.causes], -np.inf, own.evidence)
         best = int(np.argmax(evidence))
-        if not evidence[best] > evidence[here] + self.judgement.behind:
+        if not evidence[best] > evidence[seen.place(one)] + self.judgement.behind:
             return state
-        other = self.put(_without(state, one), seen.suspects[best].cause, own.information[:, best])
+        other = self.put(_without(state, one), seen.causes[best], own.information[:, best])
         if other is None:
             return state
         prior = self.problem.prior
@@ -222,7 +540,7 @@ class _Search:
             state = self.better(state, one)
         while len(state.apart) > 1:
             seen = self.seen(state)
-            worth = [_shown(seen, one)[0] for one in state.apart]
+            worth = [seen.shown(one)[0] for one in state.apart]
             if min(worth) > MIN_CHI2:
                 break
             least = state.apart[int(np.argmin(worth))]
@@ -232,42 +550,34 @@ class _Search:
             state = self.better(fewer, fewer.apart[-1])
         return state
 
-    def members(self, state: State, one: Candidate) -> int:
-        """Number of amounts that determine the statistic's scale, of the family or orbit
-        patterns."""
-        if one.variable not in (kind.variable for kind in KINDS):
-            return max(len(one.members) - 1, 1)
-        orbit = [len(state.values[f.variable]) for f in state.of_block(one.block or 0)
-                 if isinstance(f, OrbitFamily)]  # fmt: skip
-        return max(min(orbit, default=MEMBERS) - 1, 1)
-
-    def p_value(self, seen: Seen, statistic: float, one: Candidate) -> float:
-        """Probability that the largest of so many errors reaches this statistic by chance."""
-        members = self.members(seen.state, one)
-        own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), members))
+    def p_value(self, state: State, statistic: float, one: Candidate) -> float:
+        """Probability that the largest of so many errors reaches this statistic by chance; its
+        scale is that of the amounts of the family, or of the orbit patterns."""
+        members = len(one.members)
+        if one.variable in OTHERS:
+            members = min((len(state.values[f.variable]) for f in state.of_block(one.block or 0)
+                           if isinstance(f, OrbitFamily)), default=MEMBERS)  # fmt: skip
+        own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), max(members - 1, 1)))
         return min(1.0, own * len(self.hypotheses))
 
     def clear(self, seen: Seen, one: Candidate) -> bool:
         """Whether the cause is detected."""
-        statistic, cause, _ = _shown(seen, one)
-        if not abs(cause.amount) < BEYOND * find(cause.effect).largest:
-            return False
-        return (
-            statistic > MIN_CHI2 and self.p_value(seen, statistic, one) < self.judgement.false_alarm
-        )
+        statistic, cause, _ = seen.shown(one)
+        chance = self.p_value(seen.state, statistic, one)
+        plausible = abs(cause.amount) < BEYOND * one.wide
+        return plausible and statistic > MIN_CHI2 and chance < self.judgement.false_alarm
 
     def finding(self, seen: Seen, one: Candidate) -> Finding:
         """The fault with its amount, error and alternatives."""
-        own = seen.beside(one.name)
-        evidence = self.evidence(seen, own)
-        statistic, cause, sigma = _shown(seen, one)
+        own = seen.beside(one)
+        statistic, cause, sigma = seen.shown(one)
         cause, sigma = as_turned(cause, sigma, seen.state.at.errors, seen.state.data)
         known = {one.cause, (cause.effect, cause.element)}
-        rivals = [int(h) for h in np.argsort(-evidence)[: self.judgement.alternatives]
-                  if np.isfinite(evidence[h]) and seen.suspects[h].cause not in known]  # fmt: skip
-        chance = np.exp(evidence[[_place(seen, one), *rivals]] - evidence.max())
-        causes = (Cause(*seen.suspects[h].cause, float(own.amount[h])) for h in rivals)
-        detection = Detection(statistic, MIN_CHI2, self.p_value(seen, statistic, one))
+        rivals = [int(h) for h in np.argsort(-own.evidence)[: self.judgement.alternatives]
+                  if np.isfinite(own.evidence[h]) and seen.causes[h] not in known]  # fmt: skip
+        chance = np.exp(own.evidence[[seen.place(one), *rivals]] - own.evidence.max())
+        causes = (Cause(*seen.causes[h], float(own.amount[h])) for h in rivals)
+        detection = Detection(statistic, MIN_CHI2, self.p_value(seen.state, statistic, one))
         return finding_of(
             seen.state.data.ring, (cause, *causes), chance / chance.sum(), sigma, detection,
             self.judgement.mass,
@@ -304,33 +614,6 @@ def _apart(state: State, cause: Hypothesis) -> State:
     return replace(state, apart=(*state.apart, *suspects_of(state, [cause])))
 
 
-def _place(seen: Seen, one: Candidate) -> int:
-    return next(h for h, suspect in enumerate(seen.suspects) if suspect.cause == one.cause)
-
-
-def _shown(seen: Seen, one: Candidate) -> tuple[float, Cause, float]:
-    """Statistic, amount and error of a cause, widened for contradicting BPMs and columns."""
-    own, here = seen.beside(one.name), _place(seen, one)
-    assert one.block is not None
-    it = seen.blocks[one.block]
-    posterior = solve(it.there.normal, it.sizes, it.there.start, rounds=0)
-    wider = doubt(seen.state, one, it.there, posterior)
-    amount, variance = float(own.amount[here]), float(own.sigma[here]) ** 2 * wider
-    # a distributed error scales with the fault: it is three times as large for a kick three times
-    # as strong
-    share = max(abs(find(one.cause[0]).joined(amount, 1.0) - amount), 1.0)
-    variance += (share**2 - 1) * _scatter(it.there, it.sizes, one) ** 2
-    return float(own.statistic[here]) / wider, Cause(*one.cause, amount), float(np.sqrt(variance))
-
-
-def _scatter(there: Linear, sizes: Sequence[Group], one: Candidate) -> float:
-    """rms of the amount by the distributed errors of its family."""
-    along = np.zeros(len(there.start))
-    along[there.where[one.variable]] = one.unit
-    return float(np.sqrt(sum(np.sum((along @ group.basis * group.scale) ** 2)
-                             for group in sizes if group.name != one.name)))  # fmt: skip
-
-
 def _without(state: State, one: Candidate) -> State:
     """The state without a cause, not converged: the next step takes its number back."""
     return replace(state, apart=tuple(other for other in state.apart if other is not one))
@@ -341,9 +624,9 @@ def _settled(state: State) -> State | None:
     beam is stored, or where an amount is implausible. Scales are learnt anew, because a scale that
     vanished would not grow again."""
     state = replace(state, groups={})
-    for begin in (_stepped, replace):
+    for first in (_stepped, replace):
         try:
-            rough = settle(begin(state), gain=ROUGH, possible=_possible)
+            rough = settle(first(state), gain=ROUGH, possible=_possible)
             return settle(bend(rough)) if _possible(rough) else None
         except (TmlatticeError, np.linalg.LinAlgError):
             continue
@@ -369,13 +652,12 @@ def _stepped(state: State) -> State:
     return replace(state, groups=groups).moved(values)
 
 
-# --- report ---------------------------------------------------------------------------------------
 def given_faults(fit: StepwiseFit, apart: Sequence[Candidate]) -> StepwiseFit:
     """Return the hierarchical fit with the faults' numbers free of their families, as a further
     step; unchanged where held-out residuals grow."""
     state = fit.state
     for one in apart:
-        if one.variable in (kind.variable for kind in KINDS):
+        if one.variable in OTHERS:
             state = with_number(state, one.cause, one.block or 0)
         elif one.variable not in state.values:
             state = allow(state, [f for f in USUAL if f.variable == one.variable])
