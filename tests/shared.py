@@ -66,8 +66,7 @@ def small_steps(ring, causes=(), **options):
 
 def parted(ring, measured, seed=0):
     """Data of a response, and which of its columns are held out."""
-    from tmlattice.observe.response_data import response_data
-    from tmlattice.observe.split import split_columns
+    from tmlattice.observe.response_data import response_data, split_columns
 
     data = response_data(ring, measured)
     return data, split_columns(data, 0.2, np.random.default_rng(seed))

@@ -17,10 +17,8 @@ from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import save_ring
 from tmlattice.measurement import read_measurement, write_measurement
-from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_change import response_change
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.orbit_response import Errors, Predicted, response_change
+from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.optics import ring_tunes
 from tmlattice.report.plain import report_text
 

@@ -30,10 +30,8 @@ from tmlattice.observe.calibration import (
     read_calibration,
     write_calibration,
 )
-from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_change import response_change
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.orbit_response import Errors, Predicted, response_change
+from tmlattice.observe.response_data import response_data, split_columns
 
 STEP = -2000.0
 """Hz."""

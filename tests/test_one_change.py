@@ -19,11 +19,9 @@ from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import Cause, find
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_change import response_change
-from tmlattice.observe.response_data import response_data
+from tmlattice.observe.orbit_response import Errors, Predicted, response_change
+from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.observe.response_problem import Response
-from tmlattice.observe.split import split_columns
 
 CROWDED = {"QF::2": 0.04, "QF::9": -0.04, "QD::5": -0.04, "QD::12": 0.04}
 

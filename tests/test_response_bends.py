@@ -8,14 +8,13 @@ from shared import small_steps
 
 from tmlattice.diagnosis.families.fields import BendGradient, EdgeFocusing
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.state import allow
+from tmlattice.diagnosis.response.stated import fitted_causes
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 GRADIENT = -0.05
 WRONG = {"QD::5": 0.003, "QF::9": -0.003, "QF::3": 0.002, "QD::12": 0.003}

@@ -26,8 +26,7 @@ from tmlattice.measurement import OrbitResponse, read_measurement, write_measure
 from tmlattice.network import TaylorNetwork
 from tmlattice.observe.noise import Places, estimated_noise
 from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.optics import ring_tunes, twiss
 from tmlattice.report.plain import report_text
 

@@ -17,8 +17,7 @@ from tmlattice.inference import normal as blocks
 from tmlattice.inference.normal import Normal, Slopes, normal_equations, solve
 from tmlattice.inference.priors import Group
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 
 @pytest.fixture

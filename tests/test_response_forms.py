@@ -11,15 +11,13 @@ from tests.scenarios import ring_of
 from tmlattice import diagnose, load_ring
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.assumed import assumed_of
-from tmlattice.diagnosis.response.hypotheses import HYPOTHESES
 from tmlattice.diagnosis.response.labels import reversed_ones
-from tmlattice.diagnosis.response.missing_effects import control, weigh
+from tmlattice.diagnosis.response.missing_effects import HYPOTHESES, control, weigh
 from tmlattice.diagnosis.response.outlier_readings import without_gross
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 GRADIENTS = {"QD::5": 0.01, "QF::9": -0.008, "QF::3": 0.006, "QD::12": 0.005}
 

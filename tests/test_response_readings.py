@@ -8,14 +8,13 @@ from shared import parted, small_steps
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.linear import linear
+from tmlattice.diagnosis.response.stated import fitted_causes
 from tmlattice.diagnosis.response.stepwise import fit_steps, taken_back
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 WITH_ROLLS = {"corrector_calibration", "monitor_gain", "quadrupole_gradient", "monitor_roll",
               "corrector_roll"}  # fmt: skip

@@ -17,10 +17,9 @@ from tmlattice.effects import background_rms
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_data import response_data
+from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.observe.response_problem import Response
-from tmlattice.observe.split import split_columns
-from tmlattice.observe.steady import NOTHING
+from tmlattice.observe.stored import NOTHING
 from tmlattice.report.amounts import all_of
 
 USUAL = background_rms({"all": None})

@@ -12,7 +12,7 @@ from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.response_problem import Response, single_causes
-from tmlattice.observe.steady import SteadyMetric
+from tmlattice.observe.stored import SteadyMetric
 from tmlattice.observe.turn_by_turn import many_turns
 
 SICK = [

@@ -25,8 +25,7 @@ from tmlattice.diagnosis.families.fields import VerticalFocusing
 from tmlattice.diagnosis.families.steps import MonitorGain, Trial
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.importers import Options, bring_in
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 TURNS = ("diagnose", "ring.json", "turns")
 RESPONSE = ("diagnose", "ring.json", "response")

@@ -18,8 +18,8 @@ from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
 from tmlattice.effects import Cause, RingEffect, apply, find
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
-from tmlattice.inference.metric import Hypothesis
 from tmlattice.inference.newton import STEP_SHARES
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, offset_of, read_calibration
 

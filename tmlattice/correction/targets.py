@@ -19,7 +19,7 @@ from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.errors import TmlatticeError, unknown_choice
-from tmlattice.inference.metric import Hypothesis
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.optics import short_way
 

@@ -35,10 +35,9 @@ from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import scatter
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
-from tmlattice.observe.response_data import response_data
+from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.spectra import Lines
-from tmlattice.observe.split import split_columns
 from tmlattice.observe.stored import ModelCache, Stored
 from tmlattice.observe.tune_readings import CHROMATICITY, TUNE, tune_readings
 from tmlattice.observe.turn_by_turn import ManyTurns, many_turns

@@ -21,7 +21,7 @@ from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, f
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors, DistributedProblem, posterior
 from tmlattice.inference.errors import KNOWN_MEMBERS
-from tmlattice.inference.metric import Hypothesis
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
 from tmlattice.observe.orbit_response import Errors, Predicted

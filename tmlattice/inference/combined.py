@@ -17,8 +17,15 @@ from numpy.typing import NDArray
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.effects import Cause
-from tmlattice.inference.metric import Hypothesis, Metric, Products
-from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
+from tmlattice.inference.problem import (
+    NO_KICKS,
+    Hypothesis,
+    Kicks,
+    Metric,
+    Point,
+    Problem,
+    Products,
+)
 from tmlattice.inference.whitening import Blocks, Projection, Root
 
 

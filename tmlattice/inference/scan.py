@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 from tmlattice.arrays import INVISIBLE, TINY, Array, Indices
 from tmlattice.effects import find
 from tmlattice.inference import chi2
-from tmlattice.inference.metric import Hypothesis, Metric
+from tmlattice.inference.problem import Hypothesis, Metric
 
 DRAWS = 64
 """Simulations of pure noise for the threshold: the effective number is known to 12 %."""

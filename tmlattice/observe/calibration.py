@@ -28,7 +28,7 @@ Channel = tuple[str, str | None]
 
 @dataclass(frozen=True)
 class Calibration:
-    """What is beside the lattice file of an estimated ring.
+    """Errors of BPMs, correctors and beam with the lattice file of an estimated ring.
 
     Attributes:
         causes: effects on monitors, correctors and the beam.

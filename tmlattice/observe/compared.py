@@ -30,7 +30,7 @@ from tmlattice.observe.orbits import closed_orbits, dispersion
 from tmlattice.observe.response_data import NO_RF
 from tmlattice.observe.response_data import read as read_rf
 from tmlattice.observe.sections import mean_pass
-from tmlattice.observe.steady import NOTHING
+from tmlattice.observe.stored import NOTHING
 from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
 from tmlattice.optics import ring_tunes
 

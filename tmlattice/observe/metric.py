@@ -14,7 +14,7 @@ import numpy as np
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model, Paths
 from tmlattice.effects import ReadingEffect, find
-from tmlattice.inference.metric import Hypothesis, Metric, Products
+from tmlattice.inference.problem import Hypothesis, Metric, Products
 from tmlattice.inference.whitening import Projection, Whitening
 
 

@@ -23,11 +23,10 @@ from tmlattice.arrays import AT_ONCE, Array, Flags, Indices
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
 from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
-from tmlattice.inference.metric import Hypothesis, Metric, Products
-from tmlattice.inference.problem import Point
+from tmlattice.inference.problem import Hypothesis, Metric, Point, Products
 from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.steady import Steady, SteadyMetric
+from tmlattice.observe.stored import Steady, SteadyMetric
 
 
 def single_causes(data: ResponseData, effects: Sequence[str] | None = None) -> list[Hypothesis]:

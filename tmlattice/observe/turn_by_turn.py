@@ -36,13 +36,11 @@ from tmlattice.beam.nonlinear import nonlinear_turn, track
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.inference.metric import Metric, Products
-from tmlattice.inference.problem import Hypothesis, Point
+from tmlattice.inference.problem import Hypothesis, Metric, Point, Products
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
-from tmlattice.observe.steady import SteadyMetric
-from tmlattice.observe.stored import Beams, Stored, rf_of, seen_by, stacked
+from tmlattice.observe.stored import Beams, SteadyMetric, Stored, rf_of, seen_by, stacked
 
 TUNE = 3e-4
 """Smallest error of a tune: it moves with the unknown energy."""

@@ -27,8 +27,7 @@ from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 CALIBRATION, GAIN = CorrectorCalibration(), MonitorGain()
 RMS = {

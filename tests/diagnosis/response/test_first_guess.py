@@ -14,8 +14,7 @@ from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.observe.compared import ANOTHER, OfResponse
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 NOISE = 2e-8
 

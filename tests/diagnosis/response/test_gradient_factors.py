@@ -19,8 +19,7 @@ from tmlattice.diagnosis.response.state import allow, begin
 from tmlattice.effects import Cause
 from tmlattice.lattice.alike import families
 from tmlattice.lattice.supplies import magnets, supplied_alike
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 SINGLE = QuadrupoleGradient()
 

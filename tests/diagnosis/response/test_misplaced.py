@@ -9,8 +9,7 @@ from shared import small_steps, valid
 from tmlattice import diagnose, load_ring
 from tmlattice.effects import Cause
 from tmlattice.lattice import save_ring
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 BY = 0.2
 

@@ -12,8 +12,7 @@ from shared import gradients, small_steps
 
 from tmlattice import Cause, write_measurement
 from tmlattice.lattice import save_ring
-from tmlattice.observe.response_data import response_data
-from tmlattice.observe.split import split_columns
+from tmlattice.observe.response_data import response_data, split_columns
 
 KICK = 2e-5
 BOTH, ONE, SWAPPED, CORRECTOR = "end_3", "end_8", "end_11", "v6"

@@ -25,9 +25,10 @@ from tmlattice.beam.kicks import (
     kicking,
     orbits_of_kicks,
 )
-from tmlattice.diagnosis.families.family import Family, RingFamily, StatedCause
+from tmlattice.diagnosis.families.fields import Family, RingFamily, StatedCause
 from tmlattice.effects import Cause, background_rms, directions, find
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
+from tmlattice.inference.problem import Hypothesis
+from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 
 LEAST = 3e-3

@@ -20,22 +20,25 @@ from tmlattice.diagnosis.families.dispersion import (
     VerticalKicks,
     VerticalOrbit,
 )
-from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.diagnosis.families.fields import (
+    TAILS,
     BendGradient,
     CorrectorPosition,
     EdgeFocusing,
+    Family,
     FamilyGradient,
     FocusingChange,
     OtherGradient,
     QuadrupoleGradient,
     SkewGradient,
+    StatedCause,
     VerticalFocusing,
 )
 from tmlattice.effects import Cause, Monitors, expected_spread, find
 from tmlattice.inference.priors import Group
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice.alike import families
-from tmlattice.observe.orbit_response import DELTA, Errors, Hypothesis, Predicted
+from tmlattice.observe.orbit_response import DELTA, Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 
 USUAL_OFFSET = 1e-3

@@ -2,7 +2,7 @@
 
 The order of the procedure: a sparse fit is tried (`sparse`). A fit of all errors begins
 (`first_guess`, `state`), families are added one by one in damped rounds (`stepwise`, `rounds`,
-`weights`, `jitter`), outliers and wrong labels are rejected (`outlier_readings`, `outlier_steps`,
+`weights`, `jitter`), outliers and wrong labels are rejected (`outlier_readings`,
 `labels`), each family is validated by evidence and held-out readings (`linear`, `validation`), and
 single faults are sought given distributed errors (`detected_faults`). The result has its errors
 (`stated`), common factors of many numbers (`common_factors`), and missing effects

@@ -27,8 +27,12 @@ from tmlattice.diagnosis.families.dispersion import (
     dispersion_by_kicks,
     fitted_orbit_kicks,
 )
-from tmlattice.diagnosis.families.family import StatedCause
-from tmlattice.diagnosis.families.fields import REPRODUCED, FamilyGradient, QuadrupoleGradient
+from tmlattice.diagnosis.families.fields import (
+    REPRODUCED,
+    FamilyGradient,
+    QuadrupoleGradient,
+    StatedCause,
+)
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, EnergyOffset, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
@@ -39,14 +43,13 @@ from tmlattice.diagnosis.findings import (
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
-from tmlattice.diagnosis.response.fitted_causes import with_support
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
-from tmlattice.diagnosis.response.stated import unwidened
+from tmlattice.diagnosis.response.stated import unwidened, with_support
 from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.validation import score
@@ -62,10 +65,8 @@ from tmlattice.inference.common_factors import MAX_CHOSEN
 from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
-from tmlattice.observe.orbit_response import Errors, Predicted
-from tmlattice.observe.response_change import alike, response_change
-from tmlattice.observe.response_data import ResponseData, response_data
-from tmlattice.observe.split import Split, split_columns
+from tmlattice.observe.orbit_response import Errors, Predicted, alike, response_change
+from tmlattice.observe.response_data import ResponseData, Split, response_data, split_columns
 
 DRIFT, OUTSTANDING = 0.03, 8.0
 """Least change of a BPM or corrector that is a finding, and its least ratio to the typical one."""

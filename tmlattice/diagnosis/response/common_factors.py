@@ -22,10 +22,9 @@ from tmlattice.diagnosis.families.fields import (
     QuadrupoleGradient,
 )
 from tmlattice.diagnosis.records import named, of
-from tmlattice.diagnosis.response.fitted_causes import SHOWN
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.stated import of_readings, of_sizes
+from tmlattice.diagnosis.response.stated import SHOWN, of_readings, of_sizes
 from tmlattice.diagnosis.support import share_from_data
 from tmlattice.inference.common_factors import (
     MAX_CHOSEN,

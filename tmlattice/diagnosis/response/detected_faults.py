@@ -29,11 +29,12 @@ from scipy.stats import t as student
 from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, OrbitFamily, VerticalOrbit
-from tmlattice.diagnosis.families.family import Family, RingFamily
 from tmlattice.diagnosis.families.fields import (
+    Family,
     FamilyGradient,
     OtherGradient,
     QuadrupoleGradient,
+    RingFamily,
     SkewGradient,
 )
 from tmlattice.diagnosis.families.steps import (
@@ -60,11 +61,11 @@ from tmlattice.inference.common_factors import MIN_CHI2
 from tmlattice.inference.judgement import BEYOND, SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import SMALLEST, Group
+from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import Scan
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
-from tmlattice.observe.response_data import ResponseData
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import ResponseData, Split
 from tmlattice.observe.response_problem import Response
-from tmlattice.observe.split import Split
 
 log = logging.getLogger(__name__)
 

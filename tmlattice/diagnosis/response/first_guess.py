@@ -19,8 +19,7 @@ from tmlattice.diagnosis.families.steps import Trial
 from tmlattice.diagnosis.response.state import State, allow, begin
 from tmlattice.errors import UnstableRingError
 from tmlattice.lattice.supplies import magnets
-from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.split import Split
+from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from tmlattice.diagnosis.families.dispersion import (
     dispersion_by_kicks,
     orbits_in_sextupoles,
 )
-from tmlattice.diagnosis.families.family import StatedCause
+from tmlattice.diagnosis.families.fields import StatedCause
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,
@@ -40,7 +40,6 @@ from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.common_factors import explain_gradients
 from tmlattice.diagnosis.response.detected_faults import detected_faults, given_faults
 from tmlattice.diagnosis.response.first_guess import FAR, first_guess, strange
-from tmlattice.diagnosis.response.fitted_causes import fitted_causes
 from tmlattice.diagnosis.response.inconsistencies import inconsistencies
 from tmlattice.diagnosis.response.labels import (
     Label,
@@ -56,6 +55,7 @@ from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.outlier_readings import outlier_readings, without_gross
 from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
+from tmlattice.diagnosis.response.stated import fitted_causes
 from tmlattice.diagnosis.response.stepwise import (
     StepwiseFit,
     fit_chi2,
@@ -71,9 +71,8 @@ from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.noise import overstated
-from tmlattice.observe.response_data import response_data
+from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.observe.response_problem import single_causes
-from tmlattice.observe.split import split_columns
 from tmlattice.optics import ring_tunes
 
 PATTERNS = 8

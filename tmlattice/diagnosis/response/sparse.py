@@ -12,13 +12,12 @@ import numpy as np
 
 from tmlattice.arrays import AT_ONCE, Array, Flags
 from tmlattice.diagnosis.assessment import MISSING
-from tmlattice.diagnosis.families.family import StatedCause
+from tmlattice.diagnosis.families.fields import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.missing_effects import HELPS
-from tmlattice.diagnosis.response.single_change import SingleChange
 from tmlattice.diagnosis.response.state import begin, bend
 from tmlattice.diagnosis.response.stepwise import StepwiseFit
-from tmlattice.diagnosis.response.undetermined import Blur, Undetermined
+from tmlattice.diagnosis.response.undetermined import Blur, SingleChange, Undetermined
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import LaunchEffect, find, rare
@@ -28,13 +27,12 @@ from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection, leading
 from tmlattice.inference.judgement import BEYOND, Judgement
 from tmlattice.inference.newton import AGAIN, ITERATIONS, Fit, fit
-from tmlattice.inference.problem import Problem
+from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Identified, Search, explain
-from tmlattice.observe.orbit_response import Hypothesis, Predicted
-from tmlattice.observe.response_data import ResponseData
+from tmlattice.observe.orbit_response import Predicted
+from tmlattice.observe.response_data import ResponseData, Split
 from tmlattice.observe.response_problem import Response, single_causes
-from tmlattice.observe.split import Split
 
 MOST = 3
 """Most causes of a sparse solution: each costs a search of its own."""

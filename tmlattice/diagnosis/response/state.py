@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
-from tmlattice.diagnosis.families.family import Family
+from tmlattice.diagnosis.families.fields import Family
 from tmlattice.effects import find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW
 from tmlattice.inference.priors import SCALE_SPREAD, Group
-from tmlattice.observe.orbit_response import Errors, Hypothesis, Predicted
-from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.split import Split
+from tmlattice.inference.problem import Hypothesis
+from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
 

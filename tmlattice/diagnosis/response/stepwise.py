@@ -20,11 +20,15 @@ from tmlattice.diagnosis.assessment import Block, combined_p_value
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
 from tmlattice.diagnosis.response.jitter import Jitter, sought
-from tmlattice.diagnosis.response.labels import Label, label_messages
+from tmlattice.diagnosis.response.labels import (
+    Label,
+    label_messages,
+    outlier_steps,
+    rejected,
+    without_readings,
+)
 from tmlattice.diagnosis.response.linear import Linear, linear, rf_by_others
 from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
-from tmlattice.diagnosis.response.outlier_steps import outlier_steps, rejected, without_readings
-from tmlattice.diagnosis.response.remainder import remainder
 from tmlattice.diagnosis.response.rounds import (
     Evidence,
     evidence_of,
@@ -47,14 +51,14 @@ from tmlattice.diagnosis.response.validation import (
     in_favour,
     inner,
     lost,
+    remainder,
     score,
 )
 from tmlattice.diagnosis.response.weights import good_monitors
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import GROSS
 from tmlattice.inference.normal import Posterior
-from tmlattice.observe.response_data import ResponseData
-from tmlattice.observe.split import Split
+from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
 
