@@ -25,7 +25,7 @@ from tmlattice.beam.kicks import (
     kicking,
     orbits_of_kicks,
 )
-from tmlattice.diagnosis.families.fields import Family, RingFamily, StatedCause
+from tmlattice.diagnosis.families.family import Family, RingFamily, StatedCause
 from tmlattice.effects import Cause, background_rms, directions, find
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.observe.orbit_response import Errors, Predicted

@@ -1,145 +1,23 @@
-"""Families of errors of a hierarchical fit: their interface, and those of fields in the ring.
+"""Families of errors of fields in the ring: gradients, skew gradients, vertical focusing.
 
 All pieces of a magnet share one number.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.effects import Cause, find
+from tmlattice.diagnosis.families.family import TAILS, RingFamily
 from tmlattice.inference.priors import Group
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
 from tmlattice.lattice.supplies import magnets, supplied_alike
-from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
-
-StatedCause = tuple[Cause, float]
-"""A cause and the posterior rms of its amount."""
-
-TAILS = 4.0
-"""Degrees of freedom of heavy-tailed priors: one magnet in a hundred may be an outlier."""
-
-
-class Family(ABC):
-    """One kind of error, at all of its places.
-
-    Attributes:
-        name: in options and logs; the names of its priors begin with it.
-        effects: of the catalogue, as which it is reported.
-        block: 0 in-plane, 1 coupling.
-        per: what has a number each: "monitor", "column" or "ring".
-        variable: the numbers that it changes; families that share one add up.
-        trust: step bound of a number in one round, rms.
-        gross: limit above which a column's number starts from its own estimate; otherwise the
-            column would have no weight until the rounds reach that value.
-        single: whether one member may be faulty; not a pattern, or a type with one design.
-        rms, tails, most: prior of a single number: rms, degrees of freedom, largest rms.
-    """
-
-    name: ClassVar[str]
-    effects: ClassVar[tuple[str, ...]]
-    block: ClassVar[int]
-    per: ClassVar[str]
-    variable: ClassVar[str]
-    trust: ClassVar[float]
-    gross: ClassVar[float] = np.inf
-    single: ClassVar[bool] = True
-    rms: ClassVar[float]
-    tails: ClassVar[float] = np.inf
-    most: ClassVar[float] = np.inf
-
-    @property
-    def title(self) -> str:
-        """The names of its effects."""
-        return ", ".join(self.effects)
-
-    @property
-    def largest(self) -> float:
-        """The largest fault of one member, in the unit of the numbers; 0: no single faults."""
-        return find(self.effects[0]).largest if self.single else 0.0
-
-    @abstractmethod
-    def size(self, data: ResponseData) -> int:
-        """The number of parameters of its variable."""
-
-    def groups(self, data: ResponseData) -> list[Group]:
-        """Its priors, over the variable's numbers; here that of single numbers."""
-        return [Group(self.name, np.eye(self.size(data)), self.rms, self.tails, most=self.most)]
-
-    @abstractmethod
-    def rows(self, at: Predicted, values: Array) -> Array:
-        """Derivatives of the readings of its block, m: [number, column, monitor]; or, for numbers
-        of one column or BPM, [column, monitor]."""
-
-    @abstractmethod
-    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The errors with these values."""
-
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """The values as causes, with errors; here by `moves`."""
-        return [
-            (Cause(*cause, share * float(value)), abs(share) * float(error))
-            for moves, value, error in zip(self.moves(data), values, sigma, strict=True)
-            for cause, share in moves.items()
-        ]
-
-    @abstractmethod
-    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """Amounts of effects, to their powers, of a unit of each number, for small numbers."""
-
-    def count(self, data: ResponseData) -> int:
-        """The number of its parameters for a report."""
-        return self.size(data)
-
-    def lowest(self, data: ResponseData) -> Array | float:
-        """The lower bounds of the numbers, at most zero."""
-        return -np.inf
-
-    def doubt(self, values: Array, data: ResponseData) -> str | None:
-        """The reason why fitted values are implausible for the family; None: they are plausible."""
-        return None
-
-
-class RingFamily(Family):
-    """Causes in the ring: each number is the amount of one, or of several in fixed shares."""
-
-    per = "ring"
-
-    def size(self, data: ResponseData) -> int:
-        """The number of causes, or of sets of them."""
-        return len(self.moves(data))
-
-    def units(self, values: Array) -> Array:
-        """Derivative of each number's causes by the number, over their shares."""
-        return np.ones(len(values))
-
-    def rows(self, at: Predicted, values: Array) -> Array:
-        """Derivatives of the response, with gains."""
-        each = self.moves(at.data)
-        gain = at.gain(self.block)
-        slopes = at.slopes_of(self.block, [cause for moves in each for cause in moves])
-        out = np.empty((len(each), *at.data.shape))
-        for own, moves, unit in zip(out, each, self.units(values), strict=True):
-            first, *others = moves.values()
-            np.multiply(next(slopes), first * unit * gain, out=own)
-            for share in others:
-                np.add(own, next(slopes) * (share * unit * gain), out=own)
-        return out
-
-    def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
-        """The errors with these causes in the ring."""
-        causes = (own for own, _ in self.causes_of(errors, values, np.zeros(len(values)), data))
-        return replace(errors, ring=(*errors.ring, *(own for own in causes if own.amount)))
-
 
 USUAL, REPRODUCED = 1e-2, 1e-4
 """Prior rms of a change, or of an error that magnets share, relative or in 1/m; and the relative

@@ -20,18 +20,16 @@ from tmlattice.diagnosis.families.dispersion import (
     VerticalKicks,
     VerticalOrbit,
 )
+from tmlattice.diagnosis.families.family import TAILS, Family, StatedCause
 from tmlattice.diagnosis.families.fields import (
-    TAILS,
     BendGradient,
     CorrectorPosition,
     EdgeFocusing,
-    Family,
     FamilyGradient,
     FocusingChange,
     OtherGradient,
     QuadrupoleGradient,
     SkewGradient,
-    StatedCause,
     VerticalFocusing,
 )
 from tmlattice.effects import Cause, Monitors, expected_spread, find

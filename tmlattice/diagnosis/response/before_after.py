@@ -27,12 +27,8 @@ from tmlattice.diagnosis.families.dispersion import (
     dispersion_by_kicks,
     fitted_orbit_kicks,
 )
-from tmlattice.diagnosis.families.fields import (
-    REPRODUCED,
-    FamilyGradient,
-    QuadrupoleGradient,
-    StatedCause,
-)
+from tmlattice.diagnosis.families.family import StatedCause
+from tmlattice.diagnosis.families.fields import REPRODUCED, FamilyGradient, QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS, EnergyOffset, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from tmlattice.arrays import Array
+from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.families.fields import (
     REPRODUCED,
     USUAL,
-    Family,
     FamilyGradient,
     QuadrupoleGradient,
 )

@@ -29,12 +29,11 @@ from scipy.stats import t as student
 from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, OrbitFamily, VerticalOrbit
+from tmlattice.diagnosis.families.family import Family, RingFamily
 from tmlattice.diagnosis.families.fields import (
-    Family,
     FamilyGradient,
     OtherGradient,
     QuadrupoleGradient,
-    RingFamily,
     SkewGradient,
 )
 from tmlattice.diagnosis.families.steps import (

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from tmlattice.arrays import INVISIBLE, Array, Indices
-from tmlattice.diagnosis.families.fields import Family
+from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.response.state import Kept, State
 from tmlattice.diagnosis.response.weights import taken, weighed, weight
 from tmlattice.inference.normal import Normal, Posterior, Slopes, normal_equations, solve, whole

@@ -27,7 +27,7 @@ from tmlattice.diagnosis.families.dispersion import (
     dispersion_by_kicks,
     orbits_in_sextupoles,
 )
-from tmlattice.diagnosis.families.fields import StatedCause
+from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.findings import (
     cause_of,

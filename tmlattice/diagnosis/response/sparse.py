@@ -12,7 +12,7 @@ import numpy as np
 
 from tmlattice.arrays import AT_ONCE, Array, Flags
 from tmlattice.diagnosis.assessment import MISSING
-from tmlattice.diagnosis.families.fields import StatedCause
+from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.state import begin, bend

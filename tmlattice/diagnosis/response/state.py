@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
-from tmlattice.diagnosis.families.fields import Family
+from tmlattice.diagnosis.families.family import Family
 from tmlattice.effects import find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from tmlattice.arrays import TINY, Array
-from tmlattice.diagnosis.families.fields import Family, StatedCause
+from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import Candidate, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
