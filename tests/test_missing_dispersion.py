@@ -36,7 +36,7 @@ from tmlattice.observe.response_data import response_data, split_columns
 STEP = -2000.0
 """Hz."""
 WITHOUT = STEPS[:3]
-WITH = [*WITHOUT, *(step for step in STEPS if isinstance(step.families[0], HorizontalKicks))]
+WITH = [*WITHOUT, *(step for step in STEPS if isinstance(step[0], HorizontalKicks))]
 
 
 def simulated(ring, causes, **how):

@@ -7,9 +7,9 @@ from shared import valid
 
 from tmlattice import Cause, diagnose
 from tmlattice.challenge.kinds import measure
-from tmlattice.diagnosis import next_kind as module
+from tmlattice.diagnosis import next_measurement as module
 from tmlattice.diagnosis.kinds import KINDS, PartOptions
-from tmlattice.diagnosis.next_kind import next_kind
+from tmlattice.diagnosis.next_measurement import next_kind
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.report.action_texts import next_text

@@ -7,7 +7,7 @@ from scipy.optimize import lsq_linear
 from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.fields import FocusingChange, VerticalFocusing
-from tmlattice.diagnosis.families.steps import STEPS, Trial
+from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response import rounds, stepwise
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import begin
@@ -191,6 +191,6 @@ def test_a_device_focuses_and_a_change_of_one_may_do_less(small_ring):
             engine="ocelot", progress=False,
         ).measured  # fmt: skip
         data, split = parted(small_ring, measured, 1)
-        *_, (_, state) = one_by_one(begin(data, split), [STEPS[0], Trial((family,), 2, 0)])
+        *_, (_, state) = one_by_one(begin(data, split), [STEPS[0], (family,)])
         amounts.append(state.values["device"][family.places(data).index("d::95")])
     assert amounts == pytest.approx([0.0, -0.01, 0.01], rel=0.02, abs=0.0)

@@ -76,7 +76,7 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     moved[:, :, moves] += amounts[:-1, None] * orbit
     rf[:, moves] += amounts[-1] * orbit
     moved = replace(measured, response=moved, rf=replace(measured.rf, orbit=rf))
-    steps = [step for step in STEPS if step.families[0].name in WITH_ROLLS]
+    steps = [step for step in STEPS if step[0].name in WITH_ROLLS]
 
     def found(response):
         data = response_data(ring, response)

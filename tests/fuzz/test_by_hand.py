@@ -22,7 +22,7 @@ from inputs import ring, write_all
 
 from tmlattice import batch, diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.families.fields import VerticalFocusing
-from tmlattice.diagnosis.families.steps import MonitorGain, Trial
+from tmlattice.diagnosis.families.steps import MonitorGain
 from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.importers import Options, bring_in
 from tmlattice.observe.response_data import response_data, split_columns
@@ -149,9 +149,9 @@ def test_what_a_ring_has_no_places_of_is_no_step_of_a_fit(whole):
     """Linear algebra of no numbers at all prints what nobody asked for, past Python."""
     data = response_data(load_ring(whole / "ring.json"), read_measurement(whole / "response"))
     split = split_columns(data, 0.2, np.random.default_rng(1))
-    straights = Trial((VerticalFocusing(),), 2, 0)
-    assert not straights.families[0].count(data)
-    found = fit_steps(data, split, (straights, Trial((MonitorGain(),), 2, 0)))
+    straights = (VerticalFocusing(),)
+    assert not straights[0].count(data)
+    found = fit_steps(data, split, (straights, (MonitorGain(),)))
     tried = [step.effect for step in (*found.steps[1:], *found.rejected_steps)]
     assert tried == [MonitorGain().title]
 

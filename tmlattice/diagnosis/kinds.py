@@ -35,7 +35,7 @@ from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import scatter
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
-from tmlattice.observe.response_data import response_data, split_columns
+from tmlattice.observe.response_data import HELD, response_data, split_columns
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.spectra import Lines
 from tmlattice.observe.stored import ModelCache, Stored
@@ -202,7 +202,7 @@ def _response(label: str, kind: str, measured: Any, options: PartOptions) -> Par
     if not options.holdout:
         whole = Response(base=base, used=there, places=options.places, judgement=options.judgement)
         return Part(label, kind, whole, messages=messages)
-    split = split_columns(data, min(options.holdout, 0.2), np.random.default_rng(options.seed))
+    split = split_columns(data, min(options.holdout, HELD), np.random.default_rng(options.seed))
     held = np.append(split.held[:-1], False)[:, None]
     # half of a held-out corrector's BPMs is fitted, to determine its own kick
     fitted, judges = (

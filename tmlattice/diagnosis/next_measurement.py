@@ -1,27 +1,40 @@
 """The measurement that best separates two explanations.
 
-Candidates are launches of other phases and amplitudes, another energy, and a changed setting of a
-suspected magnet. For each the readings are predicted under both explanations. The separation is the
-difference that neither the launch nor the amount can absorb.
+Of first turns it is one more shot. Candidates are launches of other phases and amplitudes, another
+energy, and a changed setting of a suspected magnet. For each the readings are predicted under both
+explanations. The separation is the difference that neither the launch nor the amount can absorb.
+
+Of other measurements it is one of another kind, which is predicted with the usual noise.
+Distributed errors cannot absorb the difference either. Its square grows with machine time, so
+kinds compare by that square per minute.
 """
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 
 from tmlattice.arrays import TINY, Array
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.model import LAUNCH, Model
-from tmlattice.diagnosis.records import OPTIONAL, named, record_of
+from tmlattice.diagnosis.findings import credible
+from tmlattice.diagnosis.kinds import KINDS, PartOptions
+from tmlattice.diagnosis.recommended_actions import recommended_action
+from tmlattice.diagnosis.result import NextMeasurement
 from tmlattice.effects import Cause, Settings, find
-from tmlattice.errors import UnstableRingError
+from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.inference.alternatives import Alternative
+from tmlattice.inference.distributed import MAX_ELEMENTS, DistributedProblem, fit_distributed_errors
+from tmlattice.inference.newton import fit_nuisances
 from tmlattice.inference.problem import Point, Problem
+from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Ring
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import one_turn_optics
+
+log = logging.getLogger(__name__)
 
 PHASES = 12
 CHANGES = {
@@ -37,34 +50,6 @@ LEAST = 2.0
 
 AMPLITUDE = 1e-3
 """Amplitude of the proposed launches where those measured are on the axis, m."""
-
-
-@dataclass(frozen=True)
-class NextMeasurement:
-    """A recommended measurement, and its separation.
-
-    Attributes:
-        launch: x, px, y, py, delta of one more shot; None of another kind of measurement.
-        settings: of the shot.
-        parts: the two hypotheses, as texts.
-        separation: between them, in standard deviations.
-        kind: of measurement.
-        minutes: of machine time that it takes; None of a shot.
-    """
-
-    launch: dict[str, float] | None
-    settings: Settings
-    parts: tuple[str, str] = field(metadata=named("between"))
-    separation: float = field(metadata=named("separation_sigma"))
-    kind: str = "trajectory"
-    minutes: float | None = field(default=None, metadata=OPTIONAL)
-
-    def as_json(self) -> dict[str, object]:
-        """The entry in the file of the diagnosis."""
-        own = record_of(self)
-        if self.minutes is None:
-            del own["kind"]
-        return own
 
 
 def next_measurement(
@@ -112,13 +97,14 @@ def next_measurement(
     best = int(separation.argmax())
     if not separation[best] >= LEAST:
         return None
-    names = [" ".join(w for w in rival.hypothesis if w) for rival in (first, second)]
-    return NextMeasurement(
-        dict(zip(LAUNCH, map(float, launches[best]), strict=True)),
-        settings[best],
-        (names[0], names[1]),
-        float(separation[best]),
-    )
+    launch = dict(zip(LAUNCH, map(float, launches[best]), strict=True))
+    return NextMeasurement(launch, settings[best], _names((first, second)), float(separation[best]))
+
+
+def _names(pair: tuple[Alternative, Alternative]) -> tuple[str, str]:
+    """Two explanations, as texts."""
+    first, second = (" ".join(word for word in one.hypothesis if word) for one in pair)
+    return first, second
 
 
 def separations(
@@ -184,3 +170,82 @@ def _candidates(
             launches.append(usual.copy())
             settings.append({element.name: CHANGES[element.kind]})
     return np.array(launches), settings
+
+
+# --- another kind ---
+def leading(
+    ring: Ring, explanation: Explanation, mass: float
+) -> tuple[Alternative, Alternative] | None:
+    """The first finding's most probable explanation, and the most probable one with another
+    action."""
+    for named in explanation.named:
+        first, *others = credible(named.alternatives, mass)[0]
+        done = recommended_action(ring, first.cause)
+        other = next(
+            (rival for rival in others if recommended_action(ring, rival.cause) != done), None
+        )
+        if other is not None:
+            return first, other
+    return None
+
+
+def next_kind(
+    ring: Ring,
+    explanation: Explanation,
+    taken: Sequence[str],
+    options: PartOptions,
+    fixed: tuple[Cause, ...],
+) -> NextMeasurement | None:
+    """Recommend the next measurement; None where nothing is ambiguous or no kind separates it by
+    `LEAST`.
+
+    Args:
+        ring: the design.
+        explanation: of what was measured.
+        taken: kinds that were measured.
+        options: of the diagnosis.
+        fixed: causes that are known.
+    """
+    pair = leading(ring, explanation, options.judgement.mass)
+    if pair is None:
+        return None
+    found, best = None, 0.0
+    for name, kind in KINDS.items():
+        if name in taken or kind.proposal is None:
+            continue
+        try:
+            problem = replace(kind.proposal(ring, options), fixed=fixed)
+            apart = separation(_among(problem, explanation, pair[0]), pair)
+        except TmlatticeError:  # no cavity, no corrector, no beam
+            log.info("no %s can be proposed", name, exc_info=True)
+            continue
+        minutes = kind.minutes(ring)
+        if apart >= LEAST and apart**2 / minutes > best:
+            best = apart**2 / minutes
+            found = NextMeasurement(None, {}, _names(pair), apart, name, minutes)
+    return found
+
+
+def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Problem:
+    """The separation given the undetermined distributed errors."""
+    among = explanation.problem
+    if not isinstance(among, DistributedProblem):
+        return problem
+    rows = int(problem.valid.sum())
+    if rows * len(among.known.hypotheses) > MAX_ELEMENTS:
+        raise TmlatticeError("too many readings for the distributed errors")
+    known = among.learnt(explanation.fit)
+    causes = [c for c in first.fit.causes if problem.sees((c.effect, c.element))]
+    return fit_distributed_errors(problem, known, problem.first, causes, learn=False).problem
+
+
+def separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> float:
+    """The separation in standard deviations; 0 where one of the explanations has no stored beam."""
+    each = [
+        [c for c in one.fit.causes if problem.sees((c.effect, c.element))] for one in pair
+    ]  # fmt: skip
+    first = fit_nuisances(problem, each[0], problem.first)
+    second = problem.at(each[1], first.nuisances)
+    if first.lost or second.lost:
+        return 0.0
+    return float(separations(problem, pair, (first, second))[0])

@@ -25,10 +25,9 @@ from tmlattice.diagnosis.findings import (
     with_consequences,
 )
 from tmlattice.diagnosis.kinds import Measured, Part, PartOptions, kind_of, part_of, stacked
-from tmlattice.diagnosis.next_kind import leading, next_kind
-from tmlattice.diagnosis.next_measurement import NextMeasurement, next_measurement
+from tmlattice.diagnosis.next_measurement import leading, next_kind, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
-from tmlattice.diagnosis.result import MOST, Diagnosis, Finding
+from tmlattice.diagnosis.result import MOST, Diagnosis, Finding, NextMeasurement
 from tmlattice.diagnosis.selection import freedom, select, select_changes
 from tmlattice.diagnosis.stages import (
     held_out,

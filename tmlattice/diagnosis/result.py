@@ -12,7 +12,6 @@ from tmlattice.arrays import Array
 from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.kinds import KINDS
-from tmlattice.diagnosis.next_measurement import NextMeasurement
 from tmlattice.diagnosis.recommended_actions import RecommendedAction, compensated
 from tmlattice.diagnosis.records import HIDDEN, OPTIONAL, encoded, named, of, record_of
 from tmlattice.diagnosis.support import FREE, Correlation, Support, share_of_fault
@@ -24,7 +23,7 @@ from tmlattice.diagnosis.views import (
     StoredView,
     TrajectoryView,
 )
-from tmlattice.effects import Cause, apply
+from tmlattice.effects import Cause, Settings, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.alternatives import Detection
 from tmlattice.inference.judgement import DEFAULT
@@ -161,6 +160,34 @@ class Finding(Speaks):
             "recommended_action": first,
             "alternative_actions": others,
         }
+
+
+@dataclass(frozen=True)
+class NextMeasurement:
+    """A recommended measurement, and its separation.
+
+    Attributes:
+        launch: x, px, y, py, delta of one more shot; None of another kind of measurement.
+        settings: of the shot.
+        parts: the two hypotheses, as texts.
+        separation: between them, in standard deviations.
+        kind: of measurement.
+        minutes: of machine time that it takes; None of a shot.
+    """
+
+    launch: dict[str, float] | None
+    settings: Settings
+    parts: tuple[str, str] = field(metadata=named("between"))
+    separation: float = field(metadata=named("separation_sigma"))
+    kind: str = "trajectory"
+    minutes: float | None = field(default=None, metadata=OPTIONAL)
+
+    def as_json(self) -> dict[str, object]:
+        """The entry in the file of the diagnosis."""
+        own = record_of(self)
+        if self.minutes is None:
+            del own["kind"]
+        return own
 
 
 def faults_of(findings: Sequence[Finding], causes: Sequence[Cause]) -> tuple[Cause, ...]:

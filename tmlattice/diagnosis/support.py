@@ -15,6 +15,8 @@ from tmlattice.effects import find
 from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.problem import Hypothesis
 
+SHOWN = 3
+"""Alternatives, suspects of a kind, and elements of a message that are named."""
 DETERMINED = 0.5
 """Share from the data below which a number is undetermined (1 - posterior variance / prior
 variance)."""

@@ -17,15 +17,13 @@ import numpy as np
 from tmlattice.arrays import TINY
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.records import OPTIONAL, of
+from tmlattice.diagnosis.support import SHOWN
 from tmlattice.effects import Cause
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import ENOUGH, SIGNIFICANT, Judgement
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Element, Ring
-
-MOST = 3
-"""Suspects of each kind."""
 
 SuspectKind = Literal["monitor", "corrector", "magnet", "section"]
 
@@ -88,7 +86,7 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
         key: object = name
         if kind == "magnet":
             kind, key = "section", where
-        if (kind, key) not in found and sum(k == kind for k, _ in found) < MOST:
+        if (kind, key) not in found and sum(k == kind for k, _ in found) < SHOWN:
             found[kind, key] = Suspect(
                 kind, effect, name, where, near, statistic, threshold, elements=(name,)
             )

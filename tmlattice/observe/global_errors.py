@@ -31,6 +31,7 @@ from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
 from tmlattice.observe.sections import (
     DIVERGED_SIGMA,
+    FARTHEST,
     Passes,
     SectionFits,
     Sections,
@@ -461,7 +462,7 @@ class OfTurns(Search):
         times = _size(data) / self.scale
         open_ = square * covariance / (own**2 + np.maximum(width, 1e-12) ** 2)[:, None] / times**2
         blur = log_uncertainty(np.eye(4) + open_)
-        miss = np.clip(np.nan_to_num(fitted - stated[:, :4], nan=1e6), -1e6, 1e6)
+        miss = np.clip(np.nan_to_num(fitted - stated[:, :4], nan=FARTHEST), -FARTHEST, FARTHEST)
         planes = miss.reshape(-1, 2, 2)
         spreads = np.stack([spread[:, p, p] for p in (slice(0, 2), slice(2, 4))], axis=1)
         free = np.full(planes.shape[:2], 2)

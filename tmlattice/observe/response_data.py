@@ -198,8 +198,9 @@ def _differ(read: Array) -> float:
     return float(1 + apart.sum()) / len(there)
 
 
-INNER = 0.2
-"""Share of the fitted correctors, and of the RF's fitted monitors, that select families."""
+HELD = 0.2
+"""Share of the correctors that validate; and of the others, and of the RF's fitted monitors, that
+select families."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +230,7 @@ def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) 
     read = np.asarray(np.isfinite(data.pick(data.orbits)[:-1]).any(axis=1))
     some = int(read.sum())
     count = round(holdout * some)
-    inner = round(INNER * (some - count))
+    inner = round(HELD * (some - count))
     if not (count > 0 and inner > 0 and count + inner < some - 1):
         raise MeasurementError(
             f"{some} correctors that are read in the plane of their kick cannot be split; "
@@ -252,7 +253,7 @@ def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) 
         draw(int(c))
     near = np.flatnonzero(half[-1])
     inner_rf = np.zeros(monitors, dtype=bool)
-    inner_rf[rng.choice(near, max(1, round(INNER * len(near))), replace=False)] = True
+    inner_rf[rng.choice(near, max(1, round(HELD * len(near))), replace=False)] = True
     for c in np.flatnonzero(~(held | chooses))[:-1]:
         draw(int(c))
     return Split(held, chooses, half, inner_rf)

@@ -35,6 +35,8 @@ TWO = 2
 """Coordinates of a trajectory in a plane, and so readings that determine it."""
 DIVERGED_SIGMA = 1e15
 """Residual in sigma of a trajectory that diverges."""
+FARTHEST = 1e6
+"""Largest coordinate of a trajectory, m or rad: beyond, it diverges."""
 ENERGY = 5e-3
 """Relative; prior rms of a pass's energy deviation."""
 MOST = 8
@@ -221,7 +223,8 @@ def distance(miss: Array, covariance: Array) -> Array:
 
 def log_uncertainty(covariance: Array) -> float:
     """Sum of the log root determinants of covariances [..., n, n]."""
-    covariance = np.nan_to_num(covariance, nan=1e30, posinf=1e30, neginf=-1e30)
+    limit = DIVERGED_SIGMA**2
+    covariance = np.nan_to_num(covariance, nan=limit, posinf=limit, neginf=-limit)
     sign, log = np.linalg.slogdet(covariance)
     diagonal = np.log(np.maximum(np.einsum("...ii->...i", covariance), TINY)).sum(axis=-1)
     return float(np.where(sign > 0, log, diagonal).sum()) / 2  # singular: use the diagonal
@@ -353,9 +356,11 @@ class Sections:
                 moved = max(moved, float(np.nanmax(np.abs(change) * np.sqrt(known))))
                 moved /= max(1.0, float(np.nanmedian(np.abs(left - fitted))))
                 step_4 = step_4 + drift * change[:, None, None]
-                x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -1e6, 1e6)
+                x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -FARTHEST, FARTHEST)
                 x[..., 4] += change[:, None]
-        whole: Array = np.nan_to_num((left**2).sum(axis=2), nan=1e30, posinf=1e30)
+        whole: Array = np.nan_to_num(
+            (left**2).sum(axis=2), nan=DIVERGED_SIGMA**2, posinf=DIVERGED_SIGMA**2
+        )
         covariance = _inverse(curvature)
         end, slope = way[group[:, None], np.arange(W)](x)
         J = slope[..., :4, :4]

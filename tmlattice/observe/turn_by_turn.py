@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from tmlattice.arrays import Array, ComplexArray, Flags, Indices
+from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.nonlinear import nonlinear_turn, track
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
@@ -133,17 +133,17 @@ def _amplitudes(found: Lines, shot: int, beam: StoredBeam) -> ComplexArray:
     """Amplitude of each mode in a shot, 0 without a line, [mode]."""
     read, error = found.amplitude[shot], found.error[shot]
     there = np.isfinite(read) & np.isfinite(error)
-    weight = np.where(there, 1 / np.maximum(np.where(there, error, 1.0), 1e-300) ** 2, 0.0)
+    weight = np.where(there, 1 / np.maximum(np.where(there, error, 1.0), TINY) ** 2, 0.0)
     inner = (weight * beam.modes.conj() * np.where(there, read, 0.0)).sum(axis=(0, 1))
     whole = (weight * np.abs(beam.modes) ** 2).sum(axis=(0, 1))
-    return np.asarray(inner / np.maximum(whole, 1e-300))
+    return np.asarray(inner / np.maximum(whole, TINY))
 
 
 def _spread(found: Lines, shots: Sequence[int]) -> Array:
     """Squared envelope over the line's mean power: its maximum, and its power-weighted mean, [shot,
     mode, 2]. The first holds for particles that decohere, the second for a damped beam."""
     g = np.abs(found.envelope[shots]) ** 2
-    mean = (g**2).sum(axis=2) / np.maximum(g.sum(axis=2), 1e-300)
+    mean = (g**2).sum(axis=2) / np.maximum(g.sum(axis=2), TINY)
     return np.stack([g.max(axis=2), mean], axis=2)
 
 
@@ -157,9 +157,9 @@ def _faded(found: Lines) -> Array:
         if parts:
             high[i], low[i] = np.max(parts, axis=0), np.min(parts, axis=0)
     seen = np.nansum((np.abs(found.amplitude) / found.noise[..., None]) ** 2, axis=(1, 2))
-    noise = np.sqrt(2 * PARTS / np.maximum(found.turns[:, None] * seen, 1e-300))
+    noise = np.sqrt(2 * PARTS / np.maximum(found.turns[:, None] * seen, TINY))
     # eight parts of a steady line differ by 2.8 +- 0.8 of this noise
-    faded = (high - low) / np.maximum(high + low, 1e-300) - 5 * noise
+    faded = (high - low) / np.maximum(high + low, TINY) - 5 * noise
     return np.asarray(np.sqrt(np.clip(faded, 0.0, 1.0)))
 
 
@@ -204,7 +204,7 @@ def _fill(
     tune, tune_half, tune_first = ((tunes[i] - tunes[-1] + 0.5) % 1.0 - 0.5 for i in range(3))
     # tracked actions over the measured ones; a mode that was not kicked makes no shift
     alone = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0)])[:, None]
-    over = np.where(size == 0, alone, actions[:3] / np.maximum(np.abs(size) ** 2, 1e-300))
+    over = np.where(size == 0, alone, actions[:3] / np.maximum(np.abs(size) ** 2, TINY))
     (a, b), (c, d) = over[0].T, over[2].T
     inverse = np.array([(d, -b), (-c, a)]) / np.where(a * d == b * c, np.nan, a * d - b * c)
 
@@ -226,7 +226,7 @@ def _fill(
     of_parts = rms(parts)
     there = np.isfinite(of_parts.sum(axis=1) + rms(half) + tune_parts.sum(axis=1)) & (size != 0)
     large = there & (rms(whole) > SEEN)
-    share = np.where(large, rms(beyond) / np.maximum(rms(whole), 1e-300), 0.0)
+    share = np.where(large, rms(beyond) / np.maximum(rms(whole), TINY), 0.0)
     orders = np.concatenate([parts, beyond[:, None]], axis=1)
     tune_orders = np.concatenate([tune_parts, beyond_tune[:, None]], axis=1)
     shift.modes[shots] = np.where(there[:, None, None, None], orders, 0.0)
@@ -235,8 +235,8 @@ def _fill(
     seen = there[:, None]
     squares = np.where(seen, of_parts, 0.0) ** 2
     usual = np.sqrt(squares.sum(axis=2, keepdims=True) / np.maximum(seen.sum(axis=2), 1)[..., None])
-    decohered = (spread[..., 0] - spread[..., 1]) / np.maximum(spread.sum(axis=2), 1e-300)
-    terms = SHARE * np.fmax(usual / np.maximum(of_parts, 1e-300), 1.0)
+    decohered = (spread[..., 0] - spread[..., 1]) / np.maximum(spread.sum(axis=2), TINY)
+    terms = SHARE * np.fmax(usual / np.maximum(of_parts, TINY), 1.0)
     own = np.sqrt(terms**2 + (decohered**2 + (2 * SHARE * share) ** 2)[:, None])
     # an action with an error of SHARE makes twice that of its square
     shift.error[shots, :2], shift.error[shots, 2] = np.where(seen, own, SHARE), 2 * SHARE

@@ -9,7 +9,7 @@ Families with the same numbers (single gradients, and gradients of whole familie
 """
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -305,47 +305,23 @@ class CorrectorRoll(_Columns):
         )
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Families that are tried together.
+Trial = tuple[Family, ...]
+"""Families that are tried together; the block of the first one determines which readings validate
+them."""
 
-    Attributes:
-        families: the block of the first one determines which readings validate them.
-        own, across: rounds in-plane, and rounds of coupling before them.
-    """
+STEPS: tuple[Trial, ...] = (
+    (CorrectorCalibration(), FamilyGradient()), (MonitorGain(),), (QuadrupoleGradient(),),
+    (BendGradient(),), (VerticalFocusing(),), (EdgeFocusing(),), (CorrectorPosition(),),
+    (EnergySpread(),), (MonitorRoll(),), (CorrectorRoll(),), (SkewGradient(),),
+    (HorizontalOrbit(),), (VerticalOrbit(),), (HorizontalKicks(),), (EnergyOffset(),),
+    (VerticalKicks(),),
+)  # fmt: skip
+"""The trials, in order. The energy offset changes the dispersion, and comes after the kicks that do
+so, too."""
 
-    families: tuple[Family, ...]
-    own: int
-    across: int
-
-
-STEPS = (
-    Trial((CorrectorCalibration(), FamilyGradient()), 3, 0),
-    Trial((MonitorGain(),), 2, 0),
-    Trial((QuadrupoleGradient(),), 4, 0),
-    Trial((BendGradient(),), 2, 0),
-    Trial((VerticalFocusing(),), 2, 0),
-    Trial((EdgeFocusing(),), 2, 0),
-    Trial((CorrectorPosition(),), 2, 0),
-    Trial((EnergySpread(),), 2, 0),
-    Trial((MonitorRoll(),), 0, 1),
-    Trial((CorrectorRoll(),), 0, 1),
-    Trial((SkewGradient(),), 2, 2),
-    Trial((HorizontalOrbit(),), 2, 0),
-    Trial((VerticalOrbit(),), 0, 2),
-    Trial((HorizontalKicks(),), 2, 0),
-    Trial((EnergyOffset(),), 2, 0),
-    Trial((VerticalKicks(),), 0, 2),
-)
-"""The trials, in order. Skew gradients move the tunes to second order, which the gradients correct.
-The energy offset changes the dispersion, and comes after the kicks that do so, too."""
-
-CHANGES = (
-    Trial((CorrectorCalibration(),), 3, 0),
-    Trial((MonitorGain(),), 2, 0),
-    Trial((FamilyGradient(), QuadrupoleGradient(), OtherGradient(), FocusingChange()), 4, 0),
-    Trial((MonitorRoll(),), 0, 1),
-    Trial((CorrectorRoll(),), 0, 1),
-    Trial((SkewGradient(),), 2, 2),
-)
+CHANGES: tuple[Trial, ...] = (
+    (CorrectorCalibration(),), (MonitorGain(),),
+    (FamilyGradient(), QuadrupoleGradient(), OtherGradient(), FocusingChange()),
+    (MonitorRoll(),), (CorrectorRoll(),), (SkewGradient(),),
+)  # fmt: skip
 """Families that may change between two measurements of one ring."""

@@ -62,7 +62,7 @@ from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT, Judgement
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted, alike, response_change
-from tmlattice.observe.response_data import ResponseData, Split, response_data, split_columns
+from tmlattice.observe.response_data import HELD, ResponseData, Split, response_data, split_columns
 
 DRIFT, OUTSTANDING = 0.03, 8.0
 """Least change of a BPM or corrector that is a finding, and its least ratio to the typical one."""
@@ -77,7 +77,7 @@ def diagnose_change(
     before: OrbitResponse,
     after: OrbitResponse,
     *,
-    holdout: float = 0.2,
+    holdout: float = HELD,
     effects: Sequence[str] | None = None,
     max_effects: int = MAX_CHOSEN,
     false_alarm: float = DEFAULT.false_alarm,
@@ -122,9 +122,7 @@ def diagnose_change(
     progress("the reference")
     rng = np.random.default_rng(seed)
     # a changed gradient would move a closed orbit of the reference's ring, which operators correct
-    still = [
-        trial for trial in STEPS if not any(isinstance(f, OrbitFamily) for f in trial.families)
-    ]
+    still = [trial for trial in STEPS if not any(isinstance(f, OrbitFamily) for f in trial)]
     steps = () if same else trials_of(effects, still)
     fitted, more = _reference(first, split_columns(first, holdout, rng), steps, progress)
     orbit_kicks = fitted_orbit_kicks(fitted.at)
@@ -276,8 +274,8 @@ def _fit_change(
     state = design
     for trial, settled in one_by_one(design, trials, progress):
         state = settled
-        count = sum(family.count(data) for family in trial.families)
-        title = ", ".join(family.title for family in trial.families)
+        count = sum(family.count(data) for family in trial)
+        title = ", ".join(family.title for family in trial)
         steps.append(score(state, title, count))
     state = settle(bend(jump(state)))
     state = settle(_learnt_noise(state))
@@ -347,7 +345,7 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
 
 def is_drift(cause: Cause) -> bool:
     """Return whether a change of a BPM or a corrector is within the usual drift from day to day."""
-    of_each = {name for trial in CHANGES for family in trial.families if family.per != "ring"
+    of_each = {name for trial in CHANGES for family in trial if family.per != "ring"
                for name in family.effects}  # fmt: skip
     return cause.effect in of_each and abs(cause.amount) <= DRIFT
 

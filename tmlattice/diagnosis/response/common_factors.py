@@ -24,8 +24,8 @@ from tmlattice.diagnosis.families.fields import (
 from tmlattice.diagnosis.records import named, of
 from tmlattice.diagnosis.response.linear import linear, marginal
 from tmlattice.diagnosis.response.state import State
-from tmlattice.diagnosis.response.stated import SHOWN, of_readings, of_sizes
-from tmlattice.diagnosis.support import share_from_data
+from tmlattice.diagnosis.response.stated import of_readings, of_sizes
+from tmlattice.diagnosis.support import SHOWN, share_from_data
 from tmlattice.inference.common_factors import (
     MAX_CHOSEN,
     MIN_CHI2,

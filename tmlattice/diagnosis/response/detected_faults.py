@@ -62,6 +62,7 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import SMALLEST, Group
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import Scan
+from tmlattice.inference.search import Search
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData, Split
 from tmlattice.observe.response_problem import Response
@@ -85,8 +86,6 @@ SHARED = {
 COUNTS = 4
 AFFORDABLE = 4e9
 """Most products of signatures and derivatives; above it only numbers of families are compared."""
-FAULTS = 8
-"""Most faults: more of them are distributed errors."""
 WORTH, HIDDEN = 15.0, 8.0
 """Least statistic of a candidate, with scales not yet learnt without it: for one number of a
 family, and for other causes, which increase the scales of all patterns of an orbit."""
@@ -414,7 +413,7 @@ def detected_faults(
     search = _Search(small_errors(data, split, fitted), hypotheses, judgement)
     progress("detected faults")
     seen_before: list[set[Hypothesis]] = []
-    while not search.drowned() and len(search.state.apart) < min(most, FAULTS):
+    while not search.drowned() and len(search.state.apart) < min(most, Search.most):
         state = search.next()
         if state is None:
             break

@@ -41,7 +41,7 @@ def begun(design: State, trials: Sequence[Trial]) -> State:
         trials: to be fitted; without quadrupole gradients the result is the design.
     """
     family = QuadrupoleGradient()
-    if not any(own.name == family.name for trial in trials for own in trial.families):
+    if not any(own.name == family.name for trial in trials for own in trial):
         return design
     guess = first_guess(design)
     return design if guess is None else allow(replace(design, values=guess.values), [family])

@@ -14,6 +14,7 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.support import SHOWN
 from tmlattice.errors import first_of
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW, GROSS, OUTLIERS, SIGNIFICANT
@@ -21,8 +22,6 @@ from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 
-NAMED = 3
-"""Most BPMs, and correctors, named in a message."""
 DISPERSION = "quadrupole_gradient"
 """The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
 many times all others, and would bias the BPM gains."""
@@ -103,7 +102,7 @@ def _most(*tables: Counter[str]) -> str:
     most = [
         f"{name} ({own})"
         for table in tables
-        for name, own in table.most_common(NAMED)
+        for name, own in table.most_common(SHOWN)
         if own >= OFTEN
     ]
     return f"; most at {', '.join(most)}" if most else ""

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import TINY, Array
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks
 from tmlattice.diagnosis.families.dispersion import (
     dispersion_beside,
@@ -71,7 +71,7 @@ from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.noise import overstated
-from tmlattice.observe.response_data import response_data, split_columns
+from tmlattice.observe.response_data import HELD, response_data, split_columns
 from tmlattice.observe.response_problem import single_causes
 from tmlattice.optics import ring_tunes
 
@@ -88,7 +88,7 @@ def diagnose_response(
     ring: Ring,
     measured: OrbitResponse,
     *,
-    holdout: float = 0.2,
+    holdout: float = HELD,
     effects: Sequence[str] | None = None,
     max_effects: int = len(STEPS),
     false_alarm: float = DEFAULT.false_alarm,
@@ -327,18 +327,15 @@ def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> 
     if effects is None:
         return list(steps)
     wanted = set(names(effects))
-    kept = [
-        replace(trial, families=tuple(f for f in trial.families if wanted & set(f.effects)))
-        for trial in steps
-    ]
-    known = {effect for trial in steps for family in trial.families for effect in family.effects}
+    kept = [tuple(f for f in trial if wanted & set(f.effects)) for trial in steps]
+    known = {effect for trial in steps for family in trial for effect in family.effects}
     known |= {name for name in names() if find(name).responds}
     if not known & wanted:
         raise MeasurementError(
             f"an orbit response is not sensitive to {', '.join(sorted(wanted)) or 'no effect'}; "
             f"name some of {', '.join(sorted(known))}"
         )
-    return [trial for trial in kept if trial.families]
+    return [trial for trial in kept if trial]
 
 
 def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
@@ -387,7 +384,7 @@ def _patterns(fit: StepwiseFit) -> dict[str, Any]:
         seen = np.isfinite(miss)
         miss = np.where(seen, miss, 0.0)
         size = np.linalg.svd(miss, compute_uv=False) ** 2
-        shares.append(float(size[:PATTERNS].sum() / max(size.sum(), 1e-300)))
+        shares.append(float(size[:PATTERNS].sum() / max(size.sum(), TINY)))
         total += float(np.sum((miss / data.noise[state.good, p]) ** 2))
         count += int(seen.sum())
     return {"chi2_per_dof": total / max(count, 1), "low_rank": shares}

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags
+from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import log_scale, look, weighed, weight
@@ -175,7 +175,7 @@ def settle(
             if after > before:
                 continue
             bold[block] = min(BOLDER * bold[block], BOLDEST)
-            gained = max(gained, (before - after) / max(after, 1e-300))
+            gained = max(gained, (before - after) / max(after, TINY))
             state = moved
             for seen in (0, 1):
                 if state.of_block(seen):

@@ -53,8 +53,8 @@ SETTLED = 0.99
 """Least gain of chi-square in a round of filling in missing readings."""
 
 
-LEADING, NEAR = 3, 12
-"""Hypotheses that are tried, before and after one of them explains the readings."""
+NEAR = 12
+"""Hypotheses that are tried once one of them explains the readings; before, as many as causes."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def _among_open(
     starts: dict[Hypothesis, float | None] = {
         h: None for h in search.hypotheses if isinstance(find(h[0]), FamilyEffect)
     }
-    starts |= leading(plain, seen, LEADING)
+    starts |= leading(plain, seen, MOST)
     if found is not None:
         starts |= {(c.effect, c.element): c.amount for c in found.fit.causes}
     tried = changes.all_of(starts)

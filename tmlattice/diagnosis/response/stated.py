@@ -16,7 +16,13 @@ from tmlattice.diagnosis.families.family import Family, StatedCause
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import Candidate, State, allow
 from tmlattice.diagnosis.response.weights import taken, weight
-from tmlattice.diagnosis.support import Correlation, Support, correlations_of, share_from_data
+from tmlattice.diagnosis.support import (
+    SHOWN,
+    Correlation,
+    Support,
+    correlations_of,
+    share_from_data,
+)
 from tmlattice.inference import errors
 from tmlattice.inference.errors import MAX_MEMBERS, LinearFit, Rows, cluster_robust_errors, moments
 from tmlattice.inference.normal import Posterior
@@ -113,8 +119,8 @@ def _widened(
     return cluster_robust_errors(rows, weights, left, found, taken(state, block))
 
 
-AGAINST, SHOWN = 0.4, 3
-"""Posterior correlation above which numbers are degenerate, and how many of them are named."""
+AGAINST = 0.4
+"""Posterior correlation above which numbers are degenerate."""
 
 
 def fitted_causes(

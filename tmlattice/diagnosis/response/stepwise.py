@@ -54,7 +54,7 @@ from tmlattice.diagnosis.response.validation import (
     remainder,
     score,
 )
-from tmlattice.diagnosis.response.weights import good_monitors
+from tmlattice.diagnosis.response.weights import COUPLING, good_monitors
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import GROSS
 from tmlattice.inference.normal import Posterior
@@ -159,7 +159,7 @@ def fit_steps(
         trial: score(
             without_readings(own, odd),
             _title(trial),
-            sum(family.count(state.data) for family in trial.families),
+            sum(family.count(state.data) for family in trial),
         )
         for trial, own in stages.items()
     }
@@ -222,7 +222,7 @@ def _needed(
     The least needed one by the linearised evidence is tested first. Once one is removed, those that
     were not tested are linearised again."""
     there = {family.name for family in state.families}
-    untested = [own for own in trials if there & {family.name for family in own.families}]
+    untested = [own for own in trials if there & {family.name for family in own}]
     gone = [own for own in trials if own not in untested]
     doubts: list[str] = []
     worth: dict[Trial, float] = {}
@@ -275,7 +275,7 @@ def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
         if not doubted:
             return settled, doubts
         doubts += _doubts(settled, doubted[-1])
-        state = forbid(state, doubted[-1].families)
+        state = forbid(state, doubted[-1])
 
 
 def taken_back(state: State) -> State:
@@ -328,25 +328,25 @@ def one_by_one(
     """Yield each trial, and the state with its families fitted together with those before. Families
     without places in the ring, or without readings, are omitted."""
     for given in trials:
-        present = tuple(
-            family for family in given.families
+        trial = tuple(
+            family for family in given
             if state.reads(family.block) and family.size(state.data)
         )  # fmt: skip
-        trial = replace(given, families=present)
-        if not any(family.count(state.data) for family in trial.families):
+        if not any(family.count(state.data) for family in trial):
             continue
         progress(_title(trial))
-        state = bend(state) if trial.own else state
-        state = settle(jump(allow(state, trial.families)), _blocks(trial), FIRST, ROUGH)
+        state = bend(state) if 0 in _blocks(trial) else state
+        state = settle(jump(allow(state, trial)), _blocks(trial), FIRST, ROUGH)
         yield trial, state
 
 
 def _title(trial: Trial) -> str:
-    return ", ".join(family.title for family in trial.families)
+    return ", ".join(family.title for family in trial)
 
 
 def _blocks(trial: Trial) -> list[int]:
-    return [1] * (trial.across > 0) + [0] * (trial.own > 0)
+    """Blocks that are fitted: skew gradients move the tunes to second order."""
+    return [1, 0] if any(own.name == COUPLING for own in trial) else [trial[0].block]
 
 
 def _tested(
@@ -386,7 +386,7 @@ def _tested(
 
 def _doubts(state: State, trial: Trial) -> list[str]:
     """Messages about implausible values of a trial's families."""
-    own = [family for family in trial.families if state.allows(family.name)]
+    own = [family for family in trial if state.allows(family.name)]
     doubts = (family.doubt(state.values[family.variable], state.data) for family in own)
     return [doubt for doubt in doubts if doubt is not None]
 
@@ -397,12 +397,12 @@ def _of_rf(own: Evidence) -> Array:
 
 
 def _priors(trial: Trial, state: State) -> set[str]:
-    return {group.name for family in trial.families for group in family.groups(state.data)}
+    return {group.name for family in trial for group in family.groups(state.data)}
 
 
 def _asked(trial: Trial) -> bool:
     """Whether held-out correctors can validate a trial: not numbers of fitted correctors."""
-    return any(family.per != "column" for family in trial.families)
+    return any(family.per != "column" for family in trial)
 
 
 def _quickly(
@@ -413,7 +413,7 @@ def _quickly(
     worth: dict[Trial, float] = {}
     unwanted: dict[Trial, bool] = {}
     blocks: dict[int, tuple[Linear, tuple[float, dict[str, Array], Posterior | None]]] = {}
-    for block in {trial.families[0].block for trial in trials} | {0}:
+    for block in {trial[0].block for trial in trials} | {0}:
         if state.of_block(block):
             there = linear(state, block)
             blocks[block] = there, linear_evidence(there)
@@ -422,11 +422,11 @@ def _quickly(
     validated = inner(state, of_rf)
     for trial in trials:
         progress(f"is {_title(trial)} needed")
-        at_zero = not any(state.values[family.variable].any() for family in trial.families)
+        at_zero = not any(state.values[family.variable].any() for family in trial)
         if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
             worth[trial], unwanted[trial] = -np.inf, False
             continue
-        block = trial.families[0].block
+        block = trial[0].block
         there, (evidence, _, _) = blocks[block]
         other, values, found = linear_evidence(there, _priors(trial, state))
         worth[trial] = evidence - other - LEAST
@@ -448,4 +448,4 @@ def _quickly(
 def _without(state: State, trial: Trial) -> State:
     """The state without a trial's families and the others fitted again; the other block is
     unchanged to first order."""
-    return settle(forbid(state, trial.families), _blocks(trial), FIRST, ROUGH)
+    return settle(forbid(state, trial), _blocks(trial), FIRST, ROUGH)
