@@ -55,7 +55,7 @@ def simulate_response(
         background: distributed errors: effect -> rms (None: the catalogue's), or "all".
         noise: rms of one orbit change, m, one number or (x, y).
         engine: "at": closed orbits of thick symplectic elements; "ocelot": of the second-order
-            maps. Neither linearises.
+            maps, with sextupole fields as kicks. Neither linearises.
         machine_seed: of the background; else `seed`.
     """
     check_engine(engine)

@@ -13,8 +13,9 @@ readings, each with its weight. An error of a monitor affects that monitor's rea
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from tmlattice.arrays import AT_ONCE, Array, Flags, Indices
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
 from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference.metric import Hypothesis, Metric, Products
 from tmlattice.inference.problem import Point
 from tmlattice.observe.orbit_response import Predicted
@@ -78,6 +80,15 @@ class Response(Steady):
         """Whether a cause acts on a closed orbit; of the beam's, the energies do."""
         effect = find(hypothesis[0])
         return effect.responds or not isinstance(effect, LaunchEffect)
+
+    def near(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem with the third order of the steps at these causes, if the ring stores
+        a beam with each step there."""
+        try:
+            bent = self.view((*self.fixed, *causes)).bend().bent
+        except UnstableRingError:
+            return self
+        return replace(self, base=replace(self.base, bent=bent))
 
     def view(self, causes: Sequence[Cause]) -> Predicted:
         """Return the prediction with these causes."""
