@@ -37,6 +37,22 @@ def measured_with(small_ring):
     return measured
 
 
+@pytest.mark.parametrize("causes", [(), (Cause("quadrupole_gradient", "QD::3", -0.02),)])
+def test_the_third_order_of_large_steps_is_no_fault(small_ring, causes):
+    """Orbits of millimetres, whose third order is a hundred times the noise, in the ring with the
+    fault as in the design."""
+    measured = simulate_response(
+        small_ring, causes, kick=6e-4, noise=5e-8, progress=False, seed=1
+    ).measured
+    found = diagnose(small_ring, measured)
+    assert found.verdict == ("identified" if causes else "none")
+    assert [(own.effect, own.element) for own in found.findings] == [
+        (own.effect, own.element) for own in causes
+    ]
+    for own, cause in zip(found.findings, causes, strict=True):
+        assert abs(own.amount - cause.amount) < 4 * own.amount_sigma
+
+
 def test_a_corrector_that_is_off_is_not_turned(small_ring, measured_with):
     """It kicks in neither plane: what is larger of two noises says nothing."""
     cause = Cause("corrector_calibration", "v2", -1.0)

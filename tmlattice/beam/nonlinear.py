@@ -1,4 +1,4 @@
-"""Turns at a finite amplitude: sextupole and octupole fields as kicks, the rest as maps.
+"""Orbits and turns at a finite amplitude: sextupole and octupole fields as kicks, the rest as maps.
 
 A second-order map of a long sextupole lacks the effect of the field on its own kick, and is
 symplectic to second order only; of an octupole it has nothing. Over many turns both change the
@@ -23,9 +23,13 @@ from tmlattice.beam.sweeps import curved
 from tmlattice.beam.threads import share
 from tmlattice.compiled import jit
 from tmlattice.lattice import Element
-from tmlattice.lattice.ring import NO_ERRORS
 from tmlattice.maps import LayerMaps, RingMaps
-from tmlattice.maps.quadratic import Quadratic, halves_without_sextupole
+from tmlattice.maps.quadratic import (
+    Quadratic,
+    composed,
+    halves_without_sextupole,
+    parts_of_errors,
+)
 
 THIN = 1e-3
 """m; for shorter sextupoles the second-order map is complete."""
@@ -59,10 +63,15 @@ def nonlinear_turn(layers: LayerMaps) -> NonlinearTurn:
     nothing = (0j, 0j, 0.0)
     for k, magnet in enumerate(ring.magnets):
         k2, k3 = _fields(magnet)
-        if magnet.length > THIN and (k2 or k3) and magnet.errors == NO_ERRORS:
+        if magnet.length > THIN and (k2 or k3):
             key = layers.physics(magnet)
             if key not in known:
-                known[key] = halves_without_sextupole(magnet, ring.map_energy, n)
+                entry, one, other, exit_ = halves_without_sextupole(magnet, ring.map_energy, n)
+                before, middle, behind = parts_of_errors(magnet, ring.map_energy, n)
+                known[key] = [
+                    composed([*before, entry]), one, composed([*middle, other]),
+                    composed([exit_, *behind]),
+                ]  # fmt: skip
             first, *rest = known[key]
             maps += [one.reduced() for one in (first.after(layers.way(k)), *rest)]
             L = magnet.length
@@ -107,6 +116,18 @@ def track(
         readings,
     )  # fmt: skip
     return readings
+
+
+@jit
+def kick(x, fields, second):  # type: ignore[no-untyped-def]
+    """Add the kick of the fields behind a step to the state, see `NonlinearTurn`."""
+    if fields[0] != 0 or fields[1] != 0:
+        z = x[0] + 1j * x[2]
+        own = (fields[0] + fields[1] * z) * z * z
+        slope = (2 * fields[0] + 3 * fields[1] * z) * z
+        further = second * own * slope.conjugate()
+        x[1] += further.real - own.real
+        x[3] += further.imag + own.imag
 
 
 @jit
@@ -165,13 +186,7 @@ def _track(  # type: ignore[no-untyped-def]
                         total += slope * x[i]
                     y[a] = total
                 x[:] = y
-                if fields[k, 0] != 0 or fields[k, 1] != 0:
-                    z = x[0] + 1j * x[2]
-                    kick = (fields[k, 0] + fields[k, 1] * z) * z * z
-                    bend = (2 * fields[k, 0] + 3 * fields[k, 1] * z) * z
-                    own = second[k] * kick * bend.conjugate()
-                    x[1] += own.real - kick.real
-                    x[3] += own.imag + kick.imag
+                kick(x, fields[k], second[k])
             x[4] += rf[3]
             if not (abs(x[0]) < aperture and abs(x[2]) < aperture):
                 readings[shot, turn] = np.nan

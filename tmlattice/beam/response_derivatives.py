@@ -14,13 +14,15 @@ each monitor (its reading of a launch changes) and for each column (its launch c
 """
 
 from collections.abc import Hashable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
-from tmlattice.arrays import Array, Indices
+from tmlattice.arrays import AT_ONCE, Array, Indices
 from tmlattice.beam.closed_orbit import KICK, ResponseModel, feed_down
+from tmlattice.compiled import jit_sums
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions, ring_effect
 from tmlattice.errors import EffectError
@@ -48,25 +50,42 @@ def derivatives(
         the last row the RF's, m per relative step per unit, 0 in four coordinates.
     """
     slopes = ResponseSlopes(model, correctors)
-    return map(slopes.whole, slopes.factors(hypotheses))
+    _check(hypotheses)
+    return (slopes.whole(slopes.factors([hypothesis]))[0] for hypothesis in hypotheses)
 
 
-@dataclass(frozen=True)
-class Factors:
-    """d (orbit response) / d amount of one error.
+def _check(hypotheses: Sequence[Hypothesis]) -> None:
+    for name, _ in hypotheses:
+        if not isinstance(find(name), RingEffect):
+            raise EffectError(f"'{name}' does not act on the ring; it has no such derivative")
+
+
+class Factors(NamedTuple):
+    """d (orbit response) / d amount of errors.
 
     With the slopes' `start`, `launch_kick` and `readings` (u, p and G) a monitor before a column's
     corrector changes by seen u + G before, one behind it by seen (u + p) + G (before + behind).
 
     Attributes:
-        seen: change of each monitor's reading of the launch, [monitor, 2, n].
+        seen: change of each monitor's reading of the launch, [error, monitor, 2, n].
         before, behind: change of each column's launch, and of its kick as a launch, per unit of the
-            column's kick, [column, n].
+            column's kick, [error, column, n].
     """
 
     seen: Array
     before: Array
     behind: Array
+
+    def combined(self, shares: Array | csr_array) -> "Factors":
+        """Factors of sums of errors with shares [sum, error]."""
+        return Factors(
+            *((shares @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:]) for own in self)
+        )
+
+    def products(self, sums: "Factors") -> Array:
+        """Products with sums over data in place of the errors, [error, data]."""
+        pairs = zip(self, sums, strict=True)
+        return np.asarray(sum(a.reshape(len(a), -1) @ b.reshape(len(b), -1).T for a, b in pairs))
 
 
 class ResponseSlopes:
@@ -80,6 +99,7 @@ class ResponseSlopes:
             change behind it; the RF's last, [column, n].
         readings: the monitors' readings of the launch, [monitor, 2, n].
         first: the first monitor behind each column's kick; none behind the RF's, [column].
+        at_once: number of errors whose factors need little memory.
 
     Raises:
         UnknownNameError, MeasurementError: see `ResponseModel.columns`.
@@ -94,66 +114,98 @@ class ResponseSlopes:
         self.launch_kick = np.vstack([columns.launch_kick, np.zeros(n)])
         self.readings = model.reading_slopes
         self.first = np.append(np.searchsorted(at, columns.layer, side="right"), len(at))
+        self.at_once = max(AT_ONCE // (8 * (self.readings.size + self.start.size)), 1)
         self._exits = np.append(columns.layer + 1, 0)
         self._mixes: dict[Hashable, Quadratic] = {}
 
     def whole(self, change: Factors) -> Array:
-        """Derivative of the whole response, [column, monitor, 2]: see `derivatives`."""
-        n, shape = self.model.dimension, (len(self.start), *self.readings.shape[:2])
-        seen = np.concatenate([change.seen, self.readings], axis=2).reshape(-1, 2 * n).T
-        out = np.hstack([self.start, change.before]) @ seen
-        behind = np.hstack([self.launch_kick, change.behind]) @ seen
-        there = np.arange(shape[1]) >= self.first[:, None]
-        return np.asarray(out.reshape(shape) + there[:, :, None] * behind.reshape(shape))
+        """Derivatives of the whole response, [error, column, monitor, 2]: see `derivatives`."""
+        at = np.arange(len(self.readings))
+        return np.stack(
+            [self.picked(change, at, np.full(len(self.start), p)) for p in (0, 1)], axis=3
+        )
 
     def picked(
-        self, hypotheses: Sequence[Hypothesis], at: Indices, plane: Indices
-    ) -> Iterator[Array]:
-        """Yield the derivative by each hypothesis, as `whole`, of some readings, [column, monitor].
+        self,
+        change: Factors,
+        at: Indices,
+        plane: Indices,
+        scale: Array | float = 1.0,
+        gain: Array | None = None,
+    ) -> Array:
+        """Derivatives of some readings, [error, column, monitor].
 
         Args:
-            hypotheses: see `factors`.
+            change: the errors' factors.
+            at: monitors in beam order, [monitor].
             plane: of each column's readings, the RF's last, [column].
+            scale: factor of each column, [column].
+            gain: of each monitor in each plane, [monitor, 2].
         """
-        parts = []
-        for p in (0, 1):
-            rows = np.flatnonzero(plane == p)
-            there = (at >= self.first[rows, None]).astype(float)
-            parts.append((p, rows, there, self.readings[at, p]))
-        out = np.empty((len(plane), len(at)))
-        for change in self.factors(hypotheses):
-            for p, rows, there, readings in parts:
-                seen = np.hstack([change.seen[at, p], readings]).T
-                behind = np.hstack([self.launch_kick[rows], change.behind[rows]]) @ seen
-                out[rows] = np.hstack([self.start[rows], change.before[rows]]) @ seen
-                out[rows] += there * behind
-            yield out
+        gain = np.ones((len(at), 2)) if gain is None else gain
+        scale = np.broadcast_to(scale, len(plane))[:, None]
+        seen = change.seen[:, at] * gain[:, :, None]
+        return np.asarray(
+            _picked(
+                np.ascontiguousarray(seen.transpose(0, 2, 3, 1)),
+                np.ascontiguousarray((self.readings[at] * gain[:, :, None]).transpose(1, 2, 0)),
+                np.stack([self.start, self.start + self.launch_kick]) * scale,
+                np.stack([change.before, change.before + change.behind]) * scale,
+                np.searchsorted(at, self.first),
+                plane,
+            )
+        )
 
-    def factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
-        """Yield the derivative by each hypothesis, in factors; EffectError: an effect that does not
-        act on the ring."""
-        for name, _ in hypotheses:
-            if not isinstance(find(name), RingEffect):
-                raise EffectError(f"'{name}' does not act on the ring; it has no such derivative")
-        return self._factors(hypotheses)
+    def factors(self, hypotheses: Sequence[Hypothesis]) -> Factors:
+        """Return the derivatives by hypotheses, in factors.
 
-    def _factors(self, hypotheses: Sequence[Hypothesis]) -> Iterator[Factors]:
-        model, d = self.model, directions(self.model.layers, hypotheses)
+        Raises:
+            EffectError: an effect that does not act on the ring.
+        """
+        _check(hypotheses)
+        n, errors = self.model.dimension, len(hypotheses)
+        out = Factors(
+            np.empty((errors, *self.readings.shape)), *np.empty((2, errors, len(self.start), n))
+        )
+        for start in range(0, errors, self.at_once):
+            some = slice(start, start + self.at_once)
+            for into, own in zip(out, self._factors(hypotheses[some]), strict=True):
+                into[some] = own
+        return out
+
+    def _factors(self, hypotheses: Sequence[Hypothesis]) -> Factors:
+        model, d, n = self.model, directions(self.model.layers, hypotheses), self.model.dimension
         kicks, sources = self._own(d)
-        rows = np.searchsorted(d.owner, np.arange(len(hypotheses) + 1))
-        for h, hypothesis in enumerate(hypotheses):
-            own = slice(*rows[h : h + 2])
-            seen, missed, end = self._stepped(d.layer[own], sources[own])
-            for r in np.flatnonzero(d.read_owner == h):
-                m = d.monitor[r]
-                bent = second_derivatives(d.E2[r][None])[0] @ model.path[model.maps.at[m]]
-                seen[m] += (d.E1[r] + bent) @ model.tangents[model.maps.at[m]]
-            behind = self._mixed(hypothesis) - missed
-            if np.abs(kicks[own]).max(initial=0.0) > STILL:
-                moved = self._moved(d.layer[own], kicks[own])
-                seen, behind, end = seen + moved[0], behind + moved[1], end + moved[2]
-            before = (self.start + self.launch_kick) @ end.T + behind
-            yield Factors(seen, before @ model.closing.T, behind)
+        G, p, errors = self.readings.reshape(-1, n), self.launch_kick, len(hypotheses)
+        behind = np.stack([self._mixed(hypothesis) for hypothesis in hypotheses])
+        later = (model.maps.at > d.layer[:, None])[:, :, None, None]  # monitors
+        ahead = (self._exits > d.layer[:, None])[:, :, None]  # columns
+        strongest = np.zeros(errors)
+        np.maximum.at(strongest, d.owner, np.abs(kicks).max(axis=1))
+        moving = strongest[d.owner] > STILL
+        seen, end = np.zeros((errors, *self.readings.shape)), np.zeros((errors, n, n))
+        if moving.any():  # the closed orbit
+            fed, seen_by, missed_by, own_by = self._fed
+            kicks *= moving[:, None]
+            sources -= (fed[d.layer + 1] @ kicks[:, None, :, None])[..., 0]  # before the kick
+            total = np.zeros((errors, n))
+            np.add.at(total, d.owner, kicks)
+            orbit = total @ model.closing.T
+            seen += np.tensordot(orbit, seen_by, (1, 3))
+            np.add.at(seen, d.owner, later * np.tensordot(kicks, seen_by, (1, 3)))
+            behind += np.tensordot(orbit, own_by - missed_by, (1, 2))
+            further = (self._exits > d.layer[:, None] + 1)[:, :, None]
+            np.add.at(behind, d.owner, further * np.tensordot(kicks, own_by, (1, 2)))
+            np.subtract.at(behind, d.owner, ahead * np.tensordot(kicks, missed_by, (1, 2)))
+            end += np.tensordot(orbit + total, fed[-1], (1, 2))
+        np.add.at(seen, d.owner, later * (G @ sources).reshape(-1, *seen.shape[1:]))
+        np.subtract.at(behind, d.owner, ahead * (p @ sources.transpose(0, 2, 1)))
+        np.add.at(end, d.owner, sources)
+        for r, (owner, m) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
+            bent = second_derivatives(d.E2[r][None])[0] @ model.path[model.maps.at[m]]
+            seen[owner, m] += (d.E1[r] + bent) @ model.tangents[model.maps.at[m]]
+        before = (self.start + p) @ end.transpose(0, 2, 1) + behind
+        return Factors(seen, before @ model.closing.T, behind)
 
     def _own(self, d: Directions) -> tuple[Array, Array]:
         """Kick of each row of directions on the closed orbit, [row, n], and its slope by the
@@ -164,33 +216,6 @@ class ResponseSlopes:
         kick = d.D0 + ((d.D1 + bent / 2) @ x[:, :, None])[..., 0]
         kicks = (back @ kick[:, :, None])[..., 0]
         return kicks, back @ (d.D1 + bent) @ model.tangents[d.layer]
-
-    def _stepped(self, layers: Indices, sources: Array) -> tuple[Array, Array, Array]:
-        """Terms of new kicks S u [row, n, n] in layers: in the monitors' readings of the launch; in
-        the columns' kicks behind the layers, [column, n]; and their sum, [n, n]."""
-        seen, missed = np.zeros_like(self.readings), np.zeros_like(self.launch_kick)
-        for k, source in zip(layers, sources, strict=True):
-            behind = np.searchsorted(self.model.maps.at, k, side="right")
-            seen[behind:] += self.readings[behind:] @ source
-            missed += (self._exits > k)[:, None] * (self.launch_kick @ source.T)
-        return seen, missed, sources.sum(axis=0)
-
-    def _moved(self, layers: Indices, kicks: Array) -> tuple[Array, Array, Array]:
-        """Terms of orbit kicks [row, n] in layers: in the monitors' readings of the launch, in the
-        columns' kicks, [column, n], and the sum of the layers' sources, [n, n]."""
-        fed, seen_by, missed_by, own_by = self._fed
-        everywhere = self.model.closing @ kicks.sum(axis=0)
-        seen, added = seen_by @ everywhere, (own_by - missed_by) @ everywhere
-        end = fed[-1] @ (everywhere + kicks.sum(axis=0))
-        for k, kick in zip(layers, kicks, strict=True):
-            earlier = fed[k + 1] @ kick  # before the kick
-            behind = np.searchsorted(self.model.maps.at, k, side="right")
-            seen[behind:] += seen_by[behind:] @ kick - self.readings[behind:] @ earlier
-            missed = missed_by @ kick - self.launch_kick @ earlier.T
-            added -= (self._exits > k)[:, None] * missed
-            added += (self._exits > k + 1)[:, None] * (own_by @ kick)
-            end -= earlier
-        return seen, added, end
 
     @cached_property
     def _fed(self) -> tuple[Array, Array, Array, Array]:
@@ -219,14 +244,22 @@ class ResponseSlopes:
         model, columns = self.model, self.columns
         mixed = np.zeros_like(self.launch_kick)
         effect, place = ring_effect(hypothesis[0]), hypothesis[1]
-        members = effect.members(model.ring, place)
-        for c in np.flatnonzero(np.isin(columns.place, members)):
-            i, k = int(columns.place[c]), int(columns.layer[c])
-            w0, w1, w2 = self._mix(effect, i).after(model.layers.way(k)).reduced()
-            x = model.path[k]
-            image = w0 + (w1 + second_derivatives(w2[None])[0] @ x / 2) @ x
-            mixed[c] = model.inverse[k + 1] @ image
+        for i in effect.members(model.ring, place):
+            for c in self._at.get(i, ()):
+                k = int(columns.layer[c])
+                w0, w1, w2 = self._mix(effect, i).after(model.layers.way(k)).reduced()
+                x = model.path[k]
+                image = w0 + (w1 + second_derivatives(w2[None])[0] @ x / 2) @ x
+                mixed[c] = model.inverse[k + 1] @ image
         return mixed
+
+    @cached_property
+    def _at(self) -> dict[int, list[int]]:
+        """Columns by the place of their corrector."""
+        found: dict[int, list[int]] = {}
+        for c, place in enumerate(self.columns.place.tolist()):
+            found.setdefault(place, []).append(c)
+        return found
 
     def _mix(self, effect: RingEffect, place: int) -> Quadratic:
         """d2 (map of a corrector) / d kick d amount; shared by equal correctors."""
@@ -241,3 +274,35 @@ class ResponseSlopes:
                 ends.append((kick * amount, layers.map(there)))
             self._mixes[key] = difference(ends, 4 * KICK * h)
         return self._mixes[key]
+
+
+# `reassoc`: the sum may follow the vector unit's order.
+@jit_sums
+def _picked(seen, readings, start, change, first, plane):  # type: ignore[no-untyped-def]
+    """seen . start + readings . change at each monitor, [error, column, monitor].
+
+    Args:
+        seen: change of the readings of a launch by an error, [error, 2, n, monitor]; n is even.
+        readings: readings of a launch, [2, n, monitor].
+        start: launches of the columns, for monitors before and behind each column's kick,
+            [2, column, n].
+        change: of these by an error, [2, error, column, n].
+        first: the first monitor behind each column's kick, [column].
+        plane: of each column's readings, [column].
+    """
+    errors, _, n, monitors = seen.shape
+    out = np.zeros((errors, len(plane), monitors))
+    for h in range(errors):
+        for c in range(len(plane)):
+            p, into = plane[c], out[h, c]
+            for side in range(2):
+                low, high = (0, first[c]) if side == 0 else (first[c], monitors)
+                for i in range(0, n, 2):
+                    u, v = start[side, c, i], start[side, c, i + 1]
+                    a, b = change[side, h, c, i], change[side, h, c, i + 1]
+                    for m in range(low, high):
+                        into[m] += (
+                            u * seen[h, p, i, m] + v * seen[h, p, i + 1, m]
+                            + a * readings[p, i, m] + b * readings[p, i + 1, m]
+                        )  # fmt: skip
+    return out

@@ -109,9 +109,13 @@ class StoredBeam:
         """Closed orbit, tunes and modes, without the axis of hypotheses."""
         return Moved(self.model.readings, self.tunes, self.modes)
 
-    def moved(self, hypotheses: Sequence[Hypothesis]) -> Moved:
-        """Return the derivatives by effects on the ring (hypotheses: (effect, place), of effects on
-        the ring)."""
+    def moved(self, hypotheses: Sequence[Hypothesis], oscillates: bool = True) -> Moved:
+        """Return the derivatives by effects on the ring.
+
+        Args:
+            hypotheses: (effect, place), of effects on the ring.
+            oscillates: whether tunes and modes are read; else theirs are 0.
+        """
         model, count = self.model, len(hypotheses)
         monitors = len(model.maps.at)
         moved = Moved(
@@ -120,12 +124,16 @@ class StoredBeam:
         )  # fmt: skip
         d = directions_nearby(model.layers, hypotheses)
         if len(d.owner):
-            orbit, total, seen = self._sources(d)
-            tunes, mixed = self._perturbed(total)
-            G = self._G.reshape(-1, model.dimension)
-            there = (G @ mixed.transpose(1, 2, 0).reshape(model.dimension, -1)).T
-            seen = seen + there.reshape(2, -1, monitors, 2).transpose(1, 2, 3, 0)
-            for out, rows in ((moved.orbit, orbit), (moved.tunes, tunes), (moved.modes, seen)):
+            orbit, w, z = self._kicks(d)
+            found = [(moved.orbit, orbit)]
+            if oscillates:
+                total, seen = self._sources(d, w, z)
+                tunes, mixed = self._perturbed(total)
+                G = self._G.reshape(-1, model.dimension)
+                there = (G @ mixed.transpose(1, 2, 0).reshape(model.dimension, -1)).T
+                seen = seen + there.reshape(2, -1, monitors, 2).transpose(1, 2, 3, 0)
+                found += [(moved.tunes, tunes), (moved.modes, seen)]
+            for out, rows in found:
                 if len(np.unique(d.owner)) == len(rows):
                     out[d.owner] = rows
                 else:  # families have one row per member
@@ -138,20 +146,30 @@ class StoredBeam:
             moved.modes[owner, m] += (d.E1[row] + bent) @ self._C[at] @ self._U
         return moved
 
-    def _sources(self, d: Directions) -> tuple[Array, Array, ComplexArray]:
-        """For each row of the directions: the closed orbit's change at the monitors, the sources of
-        the whole turn, [row, n, n], and G T U at the monitors, [row, monitor, 2, mode]."""
+    def _kicks(self, d: Directions) -> tuple[Array, Array, Array]:
+        """For each row of the directions: the closed orbit's change at the monitors, and its kick
+        as a change of the launch, alone and closed, [row, n]."""
+        model, at, n = self.model, self.model.maps.at, self.model.dimension
+        x = model.path[d.layer][..., None]
+        bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
+        kick = d.D0[..., None] + (d.D1 + bent / 2) @ x
+        w = (model.inverse[d.layer + 1] @ kick)[..., 0]
+        z = w @ model.closing.T
+        behind = at[None] > d.layer[:, None]  # the monitor reads behind the layer
+        G = model.reading_slopes.reshape(-1, n)
+        shape = (len(d.layer), len(at), 2)
+        orbit = (z @ G.T).reshape(shape) + behind[..., None] * (w @ G.T).reshape(shape)
+        return orbit, w, z
+
+    def _sources(self, d: Directions, w: Array, z: Array) -> tuple[Array, ComplexArray]:
+        """The sources of the whole turn, [row, n, n], and G T U at the monitors, [row, monitor, 2,
+        mode], of the directions and their `_kicks`."""
         model, at, U, n = self.model, self.model.maps.at, self._U, self.model.dimension
         k, rows = d.layer, len(d.layer)
-        x = model.path[k][..., None]
-        bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
+        bent = (second_derivatives(d.D2) @ model.path[k][:, None, :, None])[..., 0]
         S = self._back[k + 1] @ (d.D1 + bent) @ self._into[k]
-        w = (model.inverse[k + 1] @ (d.D0[..., None] + (d.D1 + bent / 2) @ x))[..., 0]
-        z = w @ model.closing.T
-        behind = at[None] > k[:, None]  # the monitor reads behind the layer
-        G = model.reading_slopes.reshape(-1, n)
+        behind = at[None] > k[:, None]
         shape = (rows, len(at), 2)
-        orbit = (z @ G.T).reshape(shape) + behind[..., None] * (w @ G.T).reshape(shape)
         G, bends = self._G.reshape(-1, n), self._bends
         first = (bends[k + 1] @ w[:, None, :, None])[..., 0]
         whole = S - first + ((z + w) @ bends[-1].reshape(-1, n).T).reshape(rows, n, n)
@@ -163,7 +181,7 @@ class StoredBeam:
             seen = behind[..., None, None] * seen + (z @ moves).view(complex).reshape(*shape, 2)
         else:
             seen = behind[..., None, None] * seen
-        return orbit, whole, seen
+        return whole, seen
 
     @cached_property
     def _seen_bends(self) -> Array:

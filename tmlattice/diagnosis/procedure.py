@@ -212,6 +212,7 @@ def _report(
     judgement = options.judgement
     found = finished(_by_ring(ring, problem, found))
     result = found.fit
+    problem = problem.near(result.causes)
     # what counts turns late reads nothing in the first ones
     late = {c.element for c in result.causes if find(c.effect).of_turns}
     dead = tuple(

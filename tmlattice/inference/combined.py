@@ -129,6 +129,14 @@ class CombinedProblem(Problem):
             for part in self.parts
         )
 
+    def near(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem of the parts near the causes that act in each."""
+        parts = []
+        for part, active in zip(self.parts, self.active, strict=True):
+            there = (*self.fixed, *(causes if active else ()))
+            parts.append(part.near([c for c in there if part.sees((c.effect, c.element))]))
+        return replace(self, parts=tuple(parts))
+
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return the model's point; its `view` are the points of the parts."""
         points = []

@@ -217,6 +217,11 @@ class Problem(ABC):
         """Return the problem with further fixed causes; a kind may build them into its model."""
         return replace(self, fixed=(*self.fixed, *causes))
 
+    def near(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem with corrections of the model that are computed once computed at these
+        causes; here there are none."""
+        return self
+
     @abstractmethod
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return the model's point."""

@@ -251,6 +251,7 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         state = State(search.problem, before, np.zeros(search.problem.valid.shape, dtype=bool))
     else:
         state = State(**{own.name: getattr(so_far, own.name) for own in fields(State)})
+        search = replace(search, problem=search.problem.near(state.fit.causes))
         first = Scans(so_far.first, so_far.first_kicks, NO_SCAN)
     seen: set[frozenset[object]] = set()
     visited: set[object] = set()
@@ -279,6 +280,9 @@ def _run(search: Search, before: Fit, so_far: Explanation | None = None) -> Expl
         if state.fit.point.lost:  # the model has no solution there
             state = there
             break
+        if best.kind == "named":
+            search = replace(search, problem=search.problem.near(state.fit.causes))
+            state = _without(search, state, state.dropped)
         pending = pending or state.count > 1
         if state.count > 1 and best.kind != "reading":
             state = revised(search, state, quick=True)

@@ -16,6 +16,7 @@ velocity's contribution is added before the cavities and at the end, where it co
 
 import copy
 import functools
+import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -209,14 +210,13 @@ class AtEngine:
         for orbits, changed, frequency in self._groups(settings):
             line = self._set(changed)
             late = -self.ring.length * frequency / (1 + frequency)
-            turn = functools.partial(self.one_pass, line)
-            readings[orbits] = at_orbit.settle(turn, start, solve, late)[1]
+            readings[orbits] = at_orbit.settle(self._again(line), start, solve, late)[1]
         return readings
 
     @functools.cached_property
     def _stored(self) -> tuple[Array, Array]:
         """The unset ring's closed orbit, and its Jacobian, for every setting."""
-        return at_orbit.stored(functools.partial(self.one_pass, self._line))
+        return at_orbit.stored(self._again(self._line))
 
     def stored_line(self, settings: Settings) -> tuple[list[Any], list[Any], float]:
         """Return the line with the settings of one shot, without RF; with the RF that acts on a
@@ -241,9 +241,17 @@ class AtEngine:
             for place in self._cavities:
                 line[place] = self._cavity(line[place], frequency)
 
-    def one_pass(self, line: list[Any], beam: Array) -> Array:
-        """Return readings of the first state of [6, shot]; all are moved to the line's end."""
-        return np.asarray(self.run(line, beam.T, 1, beam)[0, 0])
+    def one_pass(self, line: list[Any], beam: Array, known: bool = False) -> Array:
+        """Return readings of the first state of [6, shot]; all are moved to the line's end.
+
+        `known`: the line is that of AT's latest tracking, which takes most of the time to read it.
+        """
+        return np.asarray(self.run(line, beam.T, 1, beam, known=known)[0, 0])
+
+    def _again(self, line: list[Any]) -> at_orbit.Turn:
+        """Passes through one line, with no other tracking between them."""
+        known = itertools.chain([False], itertools.repeat(True))
+        return lambda beam: self.one_pass(line, beam, next(known))
 
     def centroids(self, line: list[Any], beam: Array, turns: int) -> Iterator[tuple[Array, Array]]:
         """Yield of each turn the mean of the particles, [monitor, 2], and their part that is not
@@ -315,11 +323,12 @@ class AtEngine:
         turns: int,
         beam: Array | None = None,
         first: int = 0,
+        known: bool = False,
     ) -> Array:
         """Return readings of the states [shot, 6], in AT's coordinates, [shot, turn, monitor, 2].
 
         A given `beam`, the states for AT, [6, shot], is moved to the line's end; `first` is the
-        number of the first turn, for the RF.
+        number of the first turn, for the RF; `known`: see `one_pass`.
         """
         beam = np.asfortranarray(state.T) if beam is None else beam
         readings = np.empty((len(state), turns, len(self._monitors), 2))
@@ -332,6 +341,7 @@ class AtEngine:
                 refpts=self._monitors,
                 energy=self._energy,
                 turn=first + turn,
+                keep_lattice=known or turn > 0,
             )
             readings[:, turn : turn + block] = np.moveaxis(seen[[0, 2]], [0, 2, 3], [3, 2, 1])
         # AT sets x alone of a lost particle to NaN; beyond the aperture it is lost later.

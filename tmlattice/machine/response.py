@@ -55,7 +55,7 @@ def simulate_response(
         background: distributed errors: effect -> rms (None: the catalogue's), or "all".
         noise: rms of one orbit change, m, one number or (x, y).
         engine: "at": closed orbits of thick symplectic elements; "ocelot": of the second-order
-            maps. Neither linearises.
+            maps, with sextupole fields as kicks. Neither linearises.
         machine_seed: of the background; else `seed`.
     """
     check_engine(engine)
@@ -173,10 +173,13 @@ def _map_orbits(
     """Orbits from the second-order maps, as `_at_orbits`."""
     wrong = apply(ring, causes)
     model = ResponseModel(wrong, frequency=frequency)
+    names = [name for name, _, _ in steps if name is not None]
+    scale = corrector_scales(ring, causes, names)
+    sides = np.array([own[1:] for own in steps if own[0] is not None]).reshape(-1, 2).T
+    orbits = zip(*(model.closed_orbits(names, scale * side) for side in sides), strict=True)
     for name, low, high in steps:
-        if name is None:
-            down, up = (ResponseModel(wrong, frequency=frequency + f).readings for f in (low, high))
+        if name is not None:
+            yield next(orbits)
         else:
-            (scale,) = corrector_scales(ring, causes, [name])
-            down, up = model.closed_orbits([name, name], [scale * low, scale * high])
-        yield down, up
+            down, up = (ResponseModel(wrong, frequency=frequency + f).readings for f in (low, high))
+            yield down, up

@@ -259,28 +259,33 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
         first, second = _remembered(
             _halved, element, (energy, n), lambda: _halves(element, energy, n)
         )
-        kick = errors.kick_x * _in_the_middle(element)
-        total = composed(
-            [
-                _way(n, errors.ds, energy),
-                _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
-                _shift(n, -errors.dx, -errors.dy),
-                _turn(n, errors.roll),
-                first,
-                _thin(n, kick, errors.kick_y, errors.k1l, errors.k1sl, errors.middle),
-                _loss(n, errors.loss, element),
-                second,
-                _turn(n, -errors.roll),
-                _shift(n, errors.dx, errors.dy),
-                _way(n, -errors.ds, energy),
-            ]
-        )
+        before, middle, behind = parts_of_errors(element, energy, n)
+        total = composed([*before, first, *middle, second, *behind])
     finite = np.isfinite(total.R).all() and np.isfinite(total.B).all()
     if not finite or (total.T is not None and not np.isfinite(total.T).all()):
         raise LatticeError(
             f"OCELOT's map of {element.kind} '{element.name}' is not finite; check its strengths"
         )
     return total
+
+
+def parts_of_errors(
+    element: Element, energy: float, n: int
+) -> tuple[list[Quadratic | None], list[Quadratic | None], list[Quadratic | None]]:
+    """Return the maps of an element's errors before it, in its middle, and behind it; None is the
+    identity."""
+    own = element.errors
+    kick = own.kick_x * _in_the_middle(element)
+    before = [
+        _way(n, own.ds, energy), _thin(n, k1l=own.entrance_k1l, slopes=own.entrance),
+        _shift(n, -own.dx, -own.dy), _turn(n, own.roll),
+    ]  # fmt: skip
+    middle = [
+        _thin(n, kick, own.kick_y, own.k1l, own.k1sl, own.middle),
+        _loss(n, own.loss, element),
+    ]
+    behind = [_turn(n, -own.roll), _shift(n, own.dx, own.dy), _way(n, -own.ds, energy)]
+    return before, middle, behind
 
 
 def _in_the_middle(element: Element) -> float:

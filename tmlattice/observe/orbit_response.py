@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
@@ -262,32 +263,37 @@ class Predicted:
     def slopes(self, pairs: Sequence[Hypothesis]) -> Iterator[Array]:
         """Yield d beam's orbit changes / d amount of effects on the ring, m, [column, monitor,
         2]."""
-        data = self.data
+        data, slopes = self.data, self.response_slopes
         scale = ((1 + self.errors.calibration) * data.kicks)[:, None, None]
-        for change in self.response_slopes.factors(pairs):
-            yield self.response_slopes.whole(change)[:, data.at] * scale
+        some = max(slopes.at_once // len(data.orbits), 1)
+        for start in range(0, len(pairs), some):
+            for whole in slopes.whole(slopes.factors(pairs[start : start + some])):
+                yield whole[:, data.at] * scale
 
     @cached_property
     def response_slopes(self) -> ResponseSlopes:
         """Derivatives of the linear response, at all of the ring's monitors."""
         return ResponseSlopes(self.model, self.data.measured.correctors)
 
-    def slopes_of(self, block: int, pairs: Sequence[Hypothesis]) -> Iterator[Array]:
-        """Yield the same in the plane of a block, m, [column, monitor]; one array, overwritten."""
-        data = self.data
-        scale = ((1 + self.errors.calibration) * data.kicks)[:, None]
-        for slope in self.response_slopes.picked(pairs, data.at, data.plane_of(block)):
-            yield np.multiply(slope, scale, out=slope)
+    def rows(
+        self, pairs: Sequence[Hypothesis], block: int, shares: Array | csr_array | None = None
+    ) -> Array:
+        """Derivatives of a block's readings by effects on the ring, with gains alone, m, [error,
+        column, monitor].
 
-    def rows(self, effect: str, places: Sequence[str], block: int) -> Array:
-        """Derivatives of a block's readings, with gains alone, [error, column, monitor]."""
-        out = np.empty((len(places), *self.data.shape))
-        gain = self.gain(block)
-        for own, slope in zip(
-            out, self.slopes_of(block, [(effect, place) for place in places]), strict=True
-        ):
-            np.multiply(slope, gain, out=own)
-        return out
+        Args:
+            pairs: (effect, place).
+            block: of the readings.
+            shares: amounts of the effects for a unit of each number; then [number, column,
+                monitor]; None: each effect is a number.
+        """
+        data, slopes = self.data, self.response_slopes
+        factors = slopes.factors(pairs)
+        return slopes.picked(
+            factors if shares is None else factors.combined(shares), data.at, data.plane_of(block),
+            (1 + self.errors.calibration) * data.kicks,
+            np.diagonal(self.errors.monitors, axis1=1, axis2=2),
+        )  # fmt: skip
 
     @cached_property
     def jumps(self) -> Array:

@@ -7,7 +7,7 @@ per cent are exact.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from tmlattice.observe.stored import Stored, rf_of, stacked
 class Orbits(Stored):
     """Closed orbits, m, [shot, monitor, 2]."""
 
+    oscillates: ClassVar[bool] = False
+
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the readings; a shot is a state."""
         return stacked(states, "orbit")
@@ -32,6 +34,8 @@ class Orbits(Stored):
 @dataclass(frozen=True, kw_only=True)
 class RfOrbits(Stored):
     """Orbit changes for steps of the RF, m, [step, monitor, 2]."""
+
+    oscillates: ClassVar[bool] = False
 
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the change from half a step below to half a step above."""

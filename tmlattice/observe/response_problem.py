@@ -13,8 +13,9 @@ readings, each with its weight. An error of a monitor affects that monitor's rea
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from tmlattice.arrays import AT_ONCE, Array, Flags, Indices
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
 from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference.problem import Hypothesis, Metric, Point, Products
 from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
@@ -78,6 +80,15 @@ class Response(Steady):
         effect = find(hypothesis[0])
         return effect.responds or not isinstance(effect, LaunchEffect)
 
+    def near(self, causes: Sequence[Cause]) -> Self:
+        """Return the problem with the third order of the steps at these causes, if the ring stores
+        a beam with each step there."""
+        try:
+            bent = self.view((*self.fixed, *causes)).bend().bent
+        except UnstableRingError:
+            return self
+        return replace(self, base=replace(self.base, bent=bent))
+
     def view(self, causes: Sequence[Cause]) -> Predicted:
         """Return the prediction with these causes."""
         return self.base.with_causes(causes)
@@ -131,7 +142,7 @@ class ResponseMetric(SteadyMetric):
         rest = np.setdiff1d(np.arange(len(kinds)), [*on_ring, *of_monitors])
         whole = self.rows([hypotheses[int(i)] for i in rest])
         here = _Here(self.point.view, self.problem.used, self.problem.sigma)
-        some = here.read_all([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
+        some = here.read([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
         places = np.array([self.point.view.monitor(hypotheses[int(i)][1]) for i in of_monitors])
         used, row = self.problem.used, self._numbered()
         measured = np.flatnonzero(used.any(axis=(0, 2)))
@@ -165,10 +176,9 @@ class ResponseMetric(SteadyMetric):
         """Put in products of ring errors, from their factors."""
         here = _Here(self.point.view, self.problem.used, self.problem.sigma)
         sums = here.sums(data)
-        factors = here.slopes.factors([hypotheses[i] for i in which])
-        for start in range(0, len(which), self.chunk):
-            part = which[start : start + self.chunk]
-            some = here.read([next(factors) for _ in part])
+        for start in range(0, len(which), here.slopes.at_once):
+            part = which[start : start + here.slopes.at_once]
+            some = here.read([hypotheses[i] for i in part])
             found.put(part, here.squares(some), 0.0, some.products(sums))
 
     def _of_monitors(
@@ -184,27 +194,6 @@ class ResponseMetric(SteadyMetric):
             rows = (np.stack(slopes) / self.problem.sigma[at])[:, there]
             inner = rows @ data[:, row[:, at][there]].T
             found.put(own, np.einsum("hr,hr->h", rows, rows), 0.0, inner)
-
-
-@dataclass(frozen=True)
-class _Stack:
-    """Stacked factors with `seen` in readings over noise, or sums over data that give products of
-    signatures with the data.
-
-    Attributes:
-        seen, before, behind: see `Factors`, [many, ...].
-    """
-
-    seen: Array
-    before: Array
-    behind: Array
-
-    def products(self, sums: "_Stack") -> Array:
-        """[error, data]."""
-        pairs = (
-            (self.seen, sums.seen), (self.before, sums.before), (self.behind, sums.behind),
-        )  # fmt: skip
-        return np.asarray(sum(a.reshape(len(a), -1) @ b.reshape(len(b), -1).T for a, b in pairs))
 
 
 @dataclass(frozen=True)
@@ -246,26 +235,12 @@ class _Here:
         """Readings over noise by launch, [monitor, 2, n]."""
         return self.seen(self.slopes.readings)
 
-    def read(self, changes: Sequence[Factors]) -> _Stack:
-        """Return the factors as readings of the measured monitors."""
-        seen = self.seen(np.stack([change.seen for change in changes]))
-        before, behind = (
-            np.stack([getattr(change, name) for change in changes]) for name in ("before", "behind")
-        )
-        return _Stack(seen, before, behind)
+    def read(self, hypotheses: Sequence[Hypothesis]) -> Factors:
+        """Return the factors of ring errors as readings over noise of the measured monitors."""
+        change = self.slopes.factors(hypotheses)
+        return change._replace(seen=self.seen(change.seen))
 
-    def read_all(self, hypotheses: Sequence[Hypothesis]) -> _Stack:
-        """Return the factors of ring errors, formed some at a time."""
-        factors = self.slopes.factors(hypotheses)
-        count = max(AT_ONCE // self.used.size, 1)
-        parts = [
-            self.read([next(factors) for _ in hypotheses[start : start + count]])
-            for start in range(0, len(hypotheses), count)
-        ]
-        return _Stack(*(np.concatenate([getattr(part, name) for part in parts])
-                        for name in ("seen", "before", "behind")))  # fmt: skip
-
-    def at(self, monitor: int, some: _Stack) -> Array:
+    def at(self, monitor: int, some: Factors) -> Array:
         """Signatures at one monitor, [error, column, 2]."""
         slopes, late = self.slopes, (monitor >= self.first)[:, None]
         launch = slopes.start + late * slopes.launch_kick
@@ -274,7 +249,7 @@ class _Here:
         moved = np.swapaxes(orbit, 1, 2) + change @ self.readings[monitor].T
         return np.asarray(moved * self.scale[:, None])
 
-    def sums(self, data: Array) -> _Stack:
+    def sums(self, data: Array) -> Factors:
         """Sums of data [data, row]."""
         n, columns = self.readings.shape[2], len(self.scale)
         G = self.readings.reshape(-1, n)
@@ -288,56 +263,72 @@ class _Here:
             late = np.where(behind, D, 0.0)
             seen[d] = D.T @ self.slopes.start + late.T @ self.slopes.launch_kick
             before[d], added[d] = D @ G, late @ G
-        return _Stack(seen, before, added)
+        return Factors(seen, before, added)
 
-    def squares(self, some: _Stack) -> Array:
+    def squares(self, some: Factors) -> Array:
         """Squares of signatures, [error]."""
         slopes, n = self.slopes, self.readings.shape[2]
-        seen = some.seen.reshape(len(some.seen), -1, n)
+        used = self.used.reshape(len(self.scale), -1)
+        columns, read = used.any(axis=1), used.any(axis=0)
         return np.asarray(
             _squares(
-                np.ascontiguousarray(np.moveaxis(seen, 2, 1)),
-                np.ascontiguousarray(self.readings.reshape(-1, n).T),
+                some.seen.reshape(len(some.seen), -1, n) * read[:, None],
+                self.readings.reshape(-1, n) * read[:, None],
                 np.stack([slopes.start, slopes.start + slopes.launch_kick]),
                 np.stack([some.before, some.before + some.behind]),
                 2 * self.first,
-                self.used.reshape(len(self.scale), -1) * self.scale[:, None] ** 2,
+                columns * self.scale**2,
+                np.argwhere(np.outer(columns, read) & ~used),
             )
         )
 
 
 # `reassoc`: the sum may follow the vector unit's order.
 @jit_sums
-def _squares(seen, readings, start, change, first, weight):  # type: ignore[no-untyped-def]
-    """Weighted sum over all readings of (seen . start + readings . change)^2, [error].
+def _squares(seen, readings, start, change, first, weight, missing):  # type: ignore[no-untyped-def]
+    """Weighted sum over all readings but the missing of (seen . start + readings . change)^2,
+    [error], from sums of products up to each reading.
 
     Args:
-        seen: change of the readings of a launch by an error, [error, n, reading]; n is even.
-        readings: readings of a launch, [n, reading].
+        seen: change of the readings of a launch by an error, [error, reading, n].
+        readings: readings of a launch, [reading, n].
         start: launches of the columns, for the readings before and behind each column's kick,
             [2, column, n].
         change: of these by an error, [2, error, column, n].
         first: the first reading behind each column's kick, [column].
-        weight: of each reading, [column, reading].
+        weight: of each column, [column].
+        missing: columns and readings, [missing, 2].
     """
-    errors, n, count = seen.shape
+    errors, count, n = seen.shape
+    squares = np.zeros((3, count + 1, n, n))  # of seen, of both, of readings
+    for r in range(count):
+        for i in range(n):
+            for j in range(n):
+                squares[2, r + 1, i, j] = squares[2, r, i, j] + readings[r, i] * readings[r, j]
     out = np.zeros(errors)
-    left = np.empty(count)
     for h in range(errors):
+        for r in range(count):
+            for i in range(n):
+                for j in range(n):
+                    squares[0, r + 1, i, j] = squares[0, r, i, j] + seen[h, r, i] * seen[h, r, j]
+                    squares[1, r + 1, i, j] = squares[1, r, i, j] + seen[h, r, i] * readings[r, j]
         total = 0.0
         for c in range(len(first)):
+            own = 0.0
             for side in range(2):
                 low, high = (0, first[c]) if side == 0 else (first[c], count)
-                left[low:high] = 0.0
-                for i in range(0, n, 2):
-                    u, v = start[side, c, i], start[side, c, i + 1]
-                    a, b = change[side, h, c, i], change[side, h, c, i + 1]
-                    for r in range(low, high):
-                        left[r] += (
-                            u * seen[h, i, r] + v * seen[h, i + 1, r]
-                            + a * readings[i, r] + b * readings[i + 1, r]
-                        )  # fmt: skip
-            for r in range(count):
-                total += weight[c, r] * left[r] * left[r]
-        out[h] = total
+                for i in range(n):
+                    u, a = start[side, c, i], change[side, h, c, i]
+                    for j in range(n):
+                        v, b = start[side, c, j], change[side, h, c, j]
+                        own += u * v * (squares[0, high, i, j] - squares[0, low, i, j])
+                        own += 2 * u * b * (squares[1, high, i, j] - squares[1, low, i, j])
+                        own += a * b * (squares[2, high, i, j] - squares[2, low, i, j])
+            total += weight[c] * own
+        for c, r in missing:
+            side, left = int(r >= first[c]), 0.0
+            for i in range(n):
+                left += seen[h, r, i] * start[side, c, i] + readings[r, i] * change[side, h, c, i]
+            total -= weight[c] * left * left
+        out[h] = max(total, 0.0)
     return out

@@ -291,9 +291,11 @@ class Stored(Steady):
         read_by: the monitor of each reading, -1 for none, of the kind's shape.
         cache: of models; measurements of the same ring may share one.
         counts: whether readings are turn by turn.
+        oscillates: whether tunes or modes are read.
     """
 
     counts: ClassVar[bool] = False
+    oscillates: ClassVar[bool] = True
 
     ring: Ring = field(repr=False)
     states: tuple[tuple[Settings, float], ...]
@@ -357,7 +359,7 @@ class Stored(Steady):
             known: dict[int, Moved] = {}
             for beam in view.beams:
                 if id(beam) not in known:
-                    known[id(beam)] = seen_by(beam.moved(some), matrix)
+                    known[id(beam)] = seen_by(beam.moved(some, self.oscillates), matrix)
             moved = self.with_turn_offsets(
                 [known[id(beam)] for beam in view.beams], view.monitors.late
             )

@@ -219,8 +219,6 @@ def dispersion_beside(
 
 LEAST_FOCUSING = 0.02
 """Share of the strongest pattern below which one is omitted; quadrupole gradients absorb it."""
-TOGETHER = 32
-"""Number of errors whose derivatives are computed at a time."""
 
 
 class OrbitPatterns(NamedTuple):
@@ -280,12 +278,7 @@ class OrbitFamily(RingFamily):
     def rows(self, at: Predicted, values: Array) -> Array:
         """Derivatives by all errors."""
         causes, amounts, _ = self.patterns(at.data)
-        out = np.zeros((len(values), at.data.orbits[..., 0].size))
-        for start in range(0, len(causes), TOGETHER):
-            some = slice(start, start + TOGETHER)
-            slopes = [slope.ravel().copy() for slope in at.slopes_of(self.block, causes[some])]
-            out += amounts[:, some] @ np.stack(slopes)
-        return np.asarray(out.reshape(-1, *at.data.shape) * at.gain(self.block))
+        return at.rows(causes, self.block, amounts)
 
     def causes_of(
         self, errors: Errors, values: Array, sigma: Array, data: ResponseData

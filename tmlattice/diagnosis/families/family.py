@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array
 from tmlattice.effects import Cause, find
@@ -118,15 +119,13 @@ class RingFamily(Family):
     def rows(self, at: Predicted, values: Array) -> Array:
         """Derivatives of the response, with gains."""
         each = self.moves(at.data)
-        gain = at.gain(self.block)
-        slopes = at.slopes_of(self.block, [cause for moves in each for cause in moves])
-        out = np.empty((len(each), *at.data.shape))
-        for own, moves, unit in zip(out, each, self.units(values), strict=True):
-            first, *others = moves.values()
-            np.multiply(next(slopes), first * unit * gain, out=own)
-            for share in others:
-                np.add(own, next(slopes) * (share * unit * gain), out=own)
-        return out
+        column = {cause: i for i, cause in enumerate(dict.fromkeys(c for own in each for c in own))}
+        counts = [len(own) for own in each]
+        shares = np.array([share for own in each for share in own.values()])
+        shares *= np.repeat(self.units(values), counts)
+        where = [column[cause] for own in each for cause in own]
+        matrix = csr_array((shares, where, np.cumsum([0, *counts])), (len(each), len(column)))
+        return at.rows(list(column), self.block, matrix)
 
     def put(self, errors: Errors, values: Array, data: ResponseData) -> Errors:
         """The errors with these causes in the ring."""

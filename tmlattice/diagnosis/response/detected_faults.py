@@ -124,7 +124,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     few = data.orbits.size <= ANEW
     for start in (allow(design, families), continued) if few else (continued,):
         try:
-            state = settle(jump(bend(start), beyond=1.0), gain=ROUGH)
+            state = settle(jump(start, beyond=1.0), gain=ROUGH)
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # diverged
             continue

@@ -15,7 +15,7 @@ from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.missing_effects import HELPS
-from tmlattice.diagnosis.response.state import begin, bend
+from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.stepwise import StepwiseFit
 from tmlattice.diagnosis.response.undetermined import Blur, SingleChange, Undetermined
 from tmlattice.diagnosis.response.validation import score
@@ -110,7 +110,7 @@ def sparse_fit(
     design = begin(data, split)
     places = {name: sum(h[0] == name for h in hypotheses) for name in {h[0] for h in hypotheses}}
     problem = Response(
-        base=bend(design).at,
+        base=design.at,
         used=_used(data, split),
         places=places,
         rare=rare(data.ring, list(places)),
@@ -135,7 +135,8 @@ def sparse_fit(
         found = _among_open(search, problem, before, found, open_)
     if found is None:
         return None
-    return _result(data, split, problem.base, found, count, most, judgement)
+    base = problem.near(found.fit.causes).base
+    return _result(data, split, base, found, count, most, judgement)
 
 
 def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bool:
@@ -156,6 +157,8 @@ def _explained(search: Search, problem: Response, before: Fit, gap: float) -> Ex
     if _hopeless(problem, search.hypotheses, before, MOST, search.enough):
         return None
     found = explain(search, before)
+    if not found.fit.causes and before.chi2 <= _noise_alone(problem):
+        return found
     if not found.fit.causes or before.chi2 - found.fit.chi2 < gap / (2 * MOST):
         return None  # the strongest cause would explain its share
     if found.fit.chi2 > search.enough:

@@ -142,8 +142,8 @@ class State:
 
 
 def begin(data: ResponseData, split: Split) -> State:
-    """The state of the design."""
-    at = Predicted(data, Errors.none(data))
+    """The state of the design, with the third order of the steps."""
+    at = bent(Predicted(data, Errors.none(data)))
     gap = data.pick(at.left)[~split.held]
     size = float(chi2.typical(gap))
     return State(
@@ -153,11 +153,16 @@ def begin(data: ResponseData, split: Split) -> State:
 
 
 def bend(state: State) -> State:
-    """The state with the third order of the steps, if the ring stores a beam with such a step."""
+    """The state with the third order of the steps."""
+    return replace(state, at=bent(state.at))
+
+
+def bent(at: Predicted) -> Predicted:
+    """The prediction with the third order of the steps, if the ring stores a beam with each."""
     try:
-        return replace(state, at=state.at.bend())
+        return at.bend()
     except UnstableRingError:
-        return state
+        return at
 
 
 def allow(state: State, families: Sequence[Family]) -> State:
