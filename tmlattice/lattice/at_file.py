@@ -181,7 +181,6 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     Warns:
         Of orders above the second, which are left out.
     """
-
     energy_gev = float(lattice.energy) / 1e9 if energy is None else energy
     rest = float(lattice.particle.rest_energy) / 1e9
     light = rest < 2 * ELECTRON_GEV  # an electron, or AT's particle that is as fast as light
@@ -407,6 +406,7 @@ def passes_freely(element: Any) -> bool:
 
 
 _EMPTY = ("Identity", "Aperture", "Moments", "VariableThin")
+"""In the names of pass methods that have neither a field nor a length."""
 
 
 def _is_short(method: str) -> bool:
