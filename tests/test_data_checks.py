@@ -1,7 +1,9 @@
 """The data checks: what is wrong everywhere is named, and healthy data of sick machines are not."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import machine_data
 import numpy as np
 import pytest
 from command import tmlattice
@@ -12,6 +14,7 @@ from tmlattice.diagnosis import diagnose
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.effects import Cause, background_rms
 from tmlattice.errors import MeasurementError, UnknownNameError
+from tmlattice.lattice import load_ring
 from tmlattice.machine import simulate
 from tmlattice.machine.response import simulate_response
 from tmlattice.machine.shots import draw_background
@@ -146,6 +149,21 @@ def test_an_orbit_that_is_millimetres_off_is_no_global_error(small_ring, seed):
     swapped = replace(data, readings=data.readings[..., ::-1])
     (check,) = told(check_data(small_ring, swapped))
     assert check.assume == ("planes-swapped",)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_beam_lost_in_a_ring_far_from_its_design_is_not_in_another_order(seed):
+    """Offsets of three times the usual, a tenth of the BPMs read; in the order of the sorted names
+    they would be all along the ring, each alone, and nothing would contradict that."""
+    ring = load_ring(Path(machine_data.__file__).parent / "hmba.mat")
+    rms = background_rms({"all": None})
+    rms = {name: 3 * size if "offset" in name else size for name, size in rms.items()}
+    data = simulate(ring, background=rms, amplitude=3e-4, seed=seed).measurement()
+    assert np.isfinite(data.readings).mean() < 0.15
+    assert [check.sentence for check in told(check_data(ring, data))] == []
+    order = np.argsort(np.char.lower(data.monitors), kind="stable")
+    (check,) = told(check_data(ring, replace(data, readings=data.readings[:, :, order])))
+    assert check.assume == ("monitors-alphabetical",)
 
 
 @pytest.mark.parametrize("size", [2e-5, 1e-3])

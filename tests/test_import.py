@@ -402,7 +402,7 @@ WRONG = {
         lambda v: {"RINGData_Lattice": element(2, Length=np.ones(3))}, "has the length"),
     "fields of text": (
         lambda v: {"RINGData_Lattice": element(1, PolynomB="much")},
-        "element 2 of the lattice, 'QF'"),
+        "element 2 of the lattice: the element 'QF'"),
 }  # fmt: skip
 
 

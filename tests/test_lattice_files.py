@@ -397,10 +397,35 @@ def test_function_of_matlab_is_one_list_of_elements_or_refused(tmp_path):
     for text in (code, "QF = quadrupole('QF', 0.4, 1.1, 'QuadLinearPass');\nbuildlat([QF]);\n"):
         with pytest.raises(LatticeError, match="MATLAB code and not one list of AT's elements"):
             load_ring(write(tmp_path, "fodo.m", text))
-    with pytest.raises(LatticeError, match="leaves an element out: Line 2: Unknown class"):
-        load_ring(
-            write(tmp_path, "fodo.m", M_FILE.replace("atdrift('D1', 0.5);\na", "atway('D');\na"))
-        )
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("atway('D')", r"AT's reader cannot read atway\('D'\)\)"),
+        ("atsbend('B2', 1.0, pi/8)", r"AT's reader cannot read atsbend\('B2', 1.0, pi/8\)"),
+        ("atsbend('B2', 1.0, pi/8, 'BndMPoleSymplectic4Pass')", "the element 'B2': .*BndMPole"),
+        ("atquadrupole('Q2', 0.4, 1.05^2)", r"may hold: 1.05\^2"),
+        ("atquadrupole('Q2', 0.4, [0 1.1]*2)", r"cannot read atquadrupole\('Q2', 0.4, \[0 1.1\]"),
+    ],
+)
+def test_a_statement_that_at_cannot_read_is_named(tmp_path, statement, message):
+    text = M_FILE.replace("atdrift('D1', 0.5);\na", f"{statement};\na")
+    with pytest.raises(LatticeError, match=message):
+        load_ring(write(tmp_path, "fodo.m", text))
+
+
+def test_element_written_by_its_attributes_alone(tmp_path):
+    """As AT writes elements of no class of its own."""
+    plain = "atbaselem('QF','StrMPoleSymplectic4Pass','Length',0.4,'PolynomB',[0 1.1],"
+    plain += "'PolynomA',[0 0],'MaxOrder',1,'NumIntSteps',40);\n"
+    text = M_FILE[: M_FILE.index("atquadrupole('QF'")] + plain
+    text += "atbaselem('BPM1','IdentityPass','Class','Monitor');\n"
+    text += M_FILE[M_FILE.index("atdrift('D1'") :]
+    ring = load_ring(write(tmp_path, "plain.m", text))
+    known = load_ring(write(tmp_path, "fodo.m", M_FILE))
+    assert ring.counts()["monitor"] == 8
+    np.testing.assert_allclose(ring_matrix(ring), ring_matrix(known), rtol=0, atol=1e-9)
 
 
 def fodo(**changed):
@@ -448,8 +473,87 @@ def test_pass_method_and_not_the_class_says_what_at_tracks(changed):
 
 
 @pytest.mark.parametrize(
+    ("changed", "same"),
+    [
+        ({"m": at.RFCavity("m", 0.2, 1e6, 5e8, 32, 3e9, **QUADRUPOLE)},
+         {"m": at.Multipole("m", 0.2, [0], [0, 0.3])}),
+        ({"m": at.Element("m", Length=0.2, PassMethod="RFCavityPass", Voltage=1e6, Frequency=5e8)},
+         {"m": at.Drift("m", 0.2)}),
+        ({"b": at.Dipole("b", 1.0, np.pi / 8, 0.1, PassMethod="BndOldRadPass")},
+         {"b": at.Dipole("b", 1.0, np.pi / 8, 0.1)}),
+        ({"m": at.Element("m", Length=0.2, PassMethod="StrMPoleSymplectic4RadPass",
+                          **{k: v for k, v in QUADRUPOLE.items() if k != "PassMethod"})},
+         {"m": at.Multipole("m", 0.2, [0], [0, 0.3])}),
+    ],
+)  # fmt: skip
+def test_radiation_and_acceleration_are_left_out_by_the_pass_method(changed, same):
+    mine, other = (ring_matrix(ring_from_at(fodo(**own), "x")) for own in (changed, same))
+    np.testing.assert_allclose(mine, other, rtol=0, atol=1e-12)
+
+
+GIVEN = {
+    "Q": {"Class": "Quadrupole", "Length": 0.4, "PolynomB": [0.0, 1.1], "PolynomA": [0.0, 0.0],
+          "MaxOrder": 1.0, "NumIntSteps": 20.0, "PassMethod": "StrMPoleSymplectic4Pass"},
+    "B": {"Class": "Bend", "Length": 1.0, "BendingAngle": 0.1, "EntranceAngle": 0.0,
+          "ExitAngle": 0.0, "PolynomB": [0.0, 0.0], "PolynomA": [0.0, 0.0], "MaxOrder": 1.0,
+          "NumIntSteps": 20.0, "PassMethod": "BndMPoleSymplectic4Pass"},
+    "D": {"Class": "Drift", "Length": 1.0, "PassMethod": "DriftPass"},
+}  # fmt: skip
+
+
+def written(folder, suffix, **changed):
+    """A file of AT whose elements have other attributes; None: not this one."""
+    elements = [
+        {
+            "FamName": name,
+            **{k: v for k, v in {**own, **changed.get(name, {})}.items() if v is not None},
+        }
+        for name, own in GIVEN.items()
+    ]
+    path = folder / f"ring{suffix}"
+    if suffix == ".json":
+        properties = {"energy": 3e9, "periodicity": 1, "particle": {"name": "relativistic"}}
+        path.write_text(json.dumps({"atjson": 1, "elements": elements, "properties": properties}))
+    else:
+        ring = {"FamName": "R", "Class": "RingParam", "PassMethod": "IdentityPass", "Length": 0.0,
+                "Energy": 3e9, "Periodicity": 1.0}  # fmt: skip
+        cells = np.empty((4, 1), dtype=object)
+        cells[:, 0] = [ring, *elements]
+        savemat(path, {"RING": cells})
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".json"])
+@pytest.mark.parametrize(
     ("changed", "message"),
     [
+        ({"Q": {"Length": None, "K": 0.3}}, "the element 'Q' the Length 0.3, the file 0"),
+        ({"B": {"BendingAngle": None, "K": 0.3}}, "the element 'B' the BendingAngle 0.3, the file"),
+        ({"D": {"Length": None}}, "the element 'D': .*length"),
+        ({"D": {"Class": "Aperture", "PassMethod": "AperturePass"}}, "the element 'D': .*limits"),
+        ({"Q": {"PolynomB": "x"}}, "the element 'Q': .*'x'"),
+    ],
+)
+def test_an_element_that_at_makes_otherwise_is_refused_by_its_name(
+    tmp_path, suffix, changed, message
+):
+    with pytest.raises(LatticeError, match=message):
+        load_ring(written(tmp_path, suffix, **changed))
+
+
+@pytest.mark.filterwarnings("ignore:.*bends")
+@pytest.mark.parametrize("suffix", [".mat", ".json"])
+@pytest.mark.parametrize("own", [{"K": 0.9}, {"Class": "Sextupole", "H": 0.9}])
+def test_a_strength_beside_polynom_b_is_warned_of(tmp_path, suffix, own):
+    with pytest.warns(UserWarning, match=r"K or H of Q \(1\) is not that of PolynomB"):
+        ring = load_ring(written(tmp_path, suffix, Q=own))
+    assert ring["q::0"].k1 == 1.1
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"m": at.Aperture("m", [-1, 1, -1, 1], Length=0.2)}, "AperturePass skips the length"),
         ({"m": at.Monitor("m", Length=0.2)}, r"AT's IdentityPass skips the length.* of m \(1\)$"),
         ({"q": at.Quadrupole("q", 0.4, 1.1, NumIntSteps=1)}, "integration in a few steps"),
         ({"m": at.Quadrupole("m", 0.2, 0.3, PassMethod="IdentityPass")}, "is IdentityPass"),

@@ -38,7 +38,7 @@ def wide(path, data, header, scale=1e3, separator=","):
         writer.writerow(["shot", *(header(m, p) for m in data.monitors for p in "xy")])
         for shot, values in enumerate(data.readings[:, 0]):
             row = ["" if np.isnan(v) else repr(float(scale * v)) for v in values.ravel()]
-            if separator == ";":
+            if separator in ";|":
                 row = [v.replace(".", ",") for v in row]
             writer.writerow([str(shot), *row])
     return path
@@ -114,8 +114,9 @@ def test_a_spreadsheet_is_refused_in_a_sentence(small_ring, tmp_path, name):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_semicolons_and_decimal_commas(small_ring, data, tmp_path):
-    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m}:{p} [mm]", separator=";")
+@pytest.mark.parametrize("separator", [";", "|"])
+def test_separators_and_decimal_commas(small_ring, data, tmp_path, separator):
+    path = wide(tmp_path / "a.csv", data, lambda m, p: f"{m}:{p} [mm]", separator=separator)
     same(bring_in([path], Options(ring=small_ring)), data)
 
 

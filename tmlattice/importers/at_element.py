@@ -60,11 +60,8 @@ def at_element(fields: Mapping[str, Any], place: int, energy: float, messages: C
     _complete(kept, energy)
     try:
         return of_fields(kept, index=place, check=False, quiet=True)
-    except Exception as error:  # AT's constructors fail in their own ways
-        said_so = " ".join(str(error).split()) or type(error).__name__
-        raise LatticeError(
-            f"element {place + 1} of the lattice, '{kept['FamName']}', cannot be made ({said_so})"
-        ) from error
+    except LatticeError as error:
+        raise LatticeError(f"element {place + 1} of the lattice: {error}") from error
 
 
 def _is_data(value: Any) -> bool:

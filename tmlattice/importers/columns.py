@@ -164,7 +164,7 @@ def _csv(path: Path) -> list[Column]:
     last = lines[-1][1]
     commas = [field for field in last.split() if "," in field]
     decimal = len(last.split()) > 1 and all(map(_DECIMAL.match, commas))
-    separator = next((sign for sign in ";\t" if sign in last), " " if decimal else ",")
+    separator = next((sign for sign in ";\t|" if sign in last), " " if decimal else ",")
 
     def cut(line: str, number: int) -> list[str]:
         if separator == " ":

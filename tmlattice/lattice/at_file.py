@@ -30,11 +30,11 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.errors import LatticeError, plain
+from tmlattice.errors import LatticeError, first_of, plain
 from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.at_child import check_methods, map_of
 from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with_coils
-from tmlattice.lattice.expressions import nothing_run
+from tmlattice.lattice.expressions import STALE, nothing_run
 from tmlattice.lattice.madx_language import split
 from tmlattice.lattice.mat_file import lattice_in, read_mat
 from tmlattice.lattice.parts import Report, assembled
@@ -52,9 +52,6 @@ ACTS = frozenset({
 
 COARSE = 1e-3
 """|k1| l^2 / steps^4 of a magnet above which AT's integrator is wrong by 3e-5 of a tune."""
-
-SHORT = ("IdentityPass", "ThinMPolePass")
-"""Pass methods that skip the length of an element."""
 
 FINE = 100
 """Steps in which AT integrates a magnet without an error that counts."""
@@ -96,18 +93,27 @@ def read_at(
             lattice = at.load_lattice(str(source), **options)
             for message in (str(warning.message) for warning in caught):
                 if "skipped" in message or "Unknown class" in message:
-                    raise LatticeError(f"AT's reader leaves an element out: {message}")
+                    place = 2 + int(re.findall(r"\d+", message)[0])
+                    which = source.read_text().splitlines()[place].removesuffix(";...")
+                    raise LatticeError(f"AT's reader cannot read {plain(which, 100)}")
     except Exception as error:  # each of AT's readers fails in its own way
         message = plain(str(error), 300) or type(error).__name__
         if "energy is not defined" in message:
             raise LatticeError(f"'{path}' states no beam energy; give energy= (GeV)") from error
-        advice = "save it with AT's save_lattice, or name its variable with sequence="
+        advice = "correct it, or save the ring with AT's save_lattice"
         if isinstance(error, LatticeError):
             advice = "correct it"
         raise LatticeError(
             f"'{path}' cannot be read as an AT lattice ({message}); {advice}"
         ) from error
-    for message in dict.fromkeys(str(warning.message) for warning in caught):
+    messages = dict.fromkeys(str(warning.message) for warning in caught)
+    if stale := [own.removeprefix(STALE) for own in messages if own.startswith(STALE)]:
+        warnings.warn(
+            f"'{path}': K or H of {first_of(stale, 3)} ({len(stale)}) is not that of PolynomB, "
+            "which is used, as AT does",
+            stacklevel=4,
+        )
+    for message in messages:
         if message.startswith(_ASSUMED):
             warnings.warn(f"'{path}': by AT's reader: {message}", stacklevel=4)
     return ring_from_at(lattice, name, energy)
@@ -139,7 +145,14 @@ def _list_of_m(path: Path) -> str:
             "with AT's atwritem, or save it as .mat"
         )
     rows = [re.sub(r"\[[^\[\]]*\]", lambda m: m[0].replace(",", " "), item) for item in items]
+    rows = [re.sub(r"^atbaselem(?=\()", f"at{_plain_class(row)}", row) for row in rows]
     return "\n".join(["function ring = x()", "ring = {...", *(f"{r};..." for r in rows), "};", ""])
+
+
+def _plain_class(row: str) -> str:
+    """The class of an element that is written by its attributes alone."""
+    own = re.search(r"'Class'\s*,\s*'(Monitor|Marker)'", row)
+    return own[1].lower() if own else "element"
 
 
 @contextmanager
@@ -168,8 +181,6 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     Warns:
         Of orders above the second, which are left out.
     """
-    import at
-
     energy_gev = float(lattice.energy) / 1e9 if energy is None else energy
     rest = float(lattice.particle.rest_energy) / 1e9
     light = rest < 2 * ELECTRON_GEV  # an electron, or AT's particle that is as fast as light
@@ -178,10 +189,9 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
     converted: list[Place] = []
     known: dict[int, list[Place]] = {}
     errors: dict[int, dict[str, float]] = {}
-    with quiet_at():
-        lattice = lattice.disable_6d(at.LongtMotion, copy=True)
-    check_methods(lattice)
-    for element in lattice:
+    still = {id(element): _at_rest(element) for element in lattice}
+    check_methods(still.values())
+    for element in (still[id(element)] for element in lattice):
         if id(element) not in known:
             family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
             entrance, exit_ = _frame(element, family, design.map_energy)
@@ -199,6 +209,27 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         raise LatticeError(f"'{name}' holds no elements; name another variable with sequence=")
     report.warn(name)
     return assembled(design, converted, errors, max(1, int(lattice.periodicity)))
+
+
+def _at_rest(element: Any) -> Any:
+    """The element without radiation and acceleration, whatever its class: by its pass method."""
+    method = str(element.PassMethod)
+    if any(word in method for word in _LONGITUDINAL):
+        own = "DriftPass" if getattr(element, "Length", 0.0) else "IdentityPass"
+    else:
+        own = re.sub(r"(Rad|Quant)Pass$", "Pass", method)
+        own = own.replace("OldPass", "MPoleSymplectic4Pass")
+    if own == method:
+        return element
+    still = element.deepcopy()
+    still.PassMethod = own
+    return still
+
+
+_LONGITUDINAL = (
+    "Cavity", "EnergyLoss", "QuantDiff", "SimpleRadiation", "WakeField", "ImpedanceTable",
+)  # fmt: skip
+"""In the names of pass methods that change energies alone, or act by the charge of the beam."""
 
 
 def _translations(element: Any) -> tuple[Array, Array]:
@@ -255,7 +286,7 @@ def _places(
     if kind == "bend":
         own = with_coils(element, family, source)
     method = element.PassMethod
-    warned = method.startswith("Str") if kind == "bend" else source.l and method in SHORT
+    warned = method.startswith("Str") if kind == "bend" else source.l and _is_short(method)
     if _fields(element) and not passes_freely(element) and not warned:
         return _as_tracked(element, family, own, energy, left_out)
     return own
@@ -300,13 +331,13 @@ def _convert(
     length = float(getattr(element, "Length", 0.0))
     R1, R2 = _rotations(element)
     roll = math.atan2(R1[0, 2], R1[0, 0])
-    if isinstance(element, at.RFCavity):
+    if isinstance(element, at.RFCavity) and passes_freely(element):
         voltage, frequency = (float(getattr(element, k, 0.0)) for k in ("Voltage", "Frequency"))
         return "cavity", ocelot.Cavity(l=length, v=1e-9 * voltage, freq=frequency, eid=family)
     if mad == "INSTRUMENT" and isinstance(element, at.Monitor):  # AT's MAD-X reader has it so
         return "marker", ocelot.Marker(eid=family)
     acts, method = _acts(element), element.PassMethod
-    if length and method in SHORT:
+    if length and _is_short(method):
         left_out(f"that AT's {method} skips the length of an element")
     steps = float(np.ravel(getattr(element, "NumIntSteps", 10.0))[0])
     gradient = abs(strengths_of(element)[1]) if acts else 0.0
@@ -369,10 +400,18 @@ def _acts(element: Any) -> bool:
 
 def passes_freely(element: Any) -> bool:
     """Whether AT passes an element as if nothing were there, whatever its class and its fields: by
-    a drift, an aperture, a monitor of the beam's moments, noise of the radiation, or fields that
-    change from turn to turn."""
-    free = ("Drift", "Identity", "QuantDiff", "Aperture", "Moments", "VariableThin")
-    return any(word in element.PassMethod for word in free)
+    a drift, an aperture, a monitor of the beam's moments, or fields that change from turn to
+    turn."""
+    return any(word in element.PassMethod for word in ("Drift", *_EMPTY))
+
+
+_EMPTY = ("Identity", "Aperture", "Moments", "VariableThin")
+"""In the names of pass methods that have neither a field nor a length."""
+
+
+def _is_short(method: str) -> bool:
+    """Whether a pass method skips the length of an element."""
+    return any(word in method for word in ("ThinMPole", *_EMPTY))
 
 
 def _correctors(element: Any, family: str, mad: str) -> list[Place]:

@@ -8,8 +8,9 @@ powers, and calls of the functions that it is given; there is nothing else.
 import ast
 import math
 import operator
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from threading import Lock
 from typing import Any
 
@@ -183,17 +184,54 @@ def _checked(make: Callable[..., Any]) -> Callable[..., Any]:
     return made
 
 
+STALE = "K or H is not that of PolynomB, which is used, at "
+"""What a warning of `of_fields` begins with; the element's name follows."""
+
+
 def of_fields(fields: dict[str, Any], **options: Any) -> Any:
     """AT's element of a structure of MATLAB. Its class is that of its fields: of a family's name,
-    which AT looks at before its pass method, only `BPM` and `Monitor` are one."""
+    which AT looks at before its pass method, only `BPM` and `Monitor` are one.
+
+    Raises:
+        LatticeError: AT cannot make it, or makes another of it.
+
+    Warns:
+        Of a `K` or `H` that is not the strength in `PolynomB`, which AT tracks.
+    """
     from at.load.utils import element_from_dict
 
     name = fields.get("FamName")
-    if not isinstance(name, str) or name.casefold() in ("bpm", "monitor"):
-        return element_from_dict(fields, **options)
-    element = element_from_dict({**fields, "FamName": "_"}, **options)
-    element.FamName = name
+    known = not isinstance(name, str) or name.casefold() in ("bpm", "monitor")
+    given = {key: _as_array(value) for key, value in fields.items()}
+    try:
+        element = element_from_dict(given | ({} if known else {"FamName": "_"}), **options)
+    except Exception as error:  # AT's constructors fail in their own ways
+        raise LatticeError(
+            f"the element '{plain(str(name), 40)}': {plain(str(error), 200)}"
+        ) from error
+    if not known:
+        element.FamName = name
+    for key in ("Length", "BendingAngle"):  # AT counts arguments, also where one is not there
+        own, value = getattr(element, key, 0.0), np.squeeze(given.get(key, 0.0))
+        if not np.array_equal(own, value, equal_nan=True):
+            raise LatticeError(
+                f"AT's reader gives the element '{plain(str(name), 40)}' the {key} {own!s:.20}, "
+                f"the file {value!s:.20}; give the element all that its class needs"
+            )
+    strengths = given.keys() & {"K", "H"}
+    if any(np.any(getattr(element, k, given[k]) != np.squeeze(given[k])) for k in strengths):
+        warnings.warn(f"{STALE}{plain(str(name), 40)}", stacklevel=2)
     return element
+
+
+def _as_array(value: Any) -> Any:
+    """Numbers that JSON has in a list."""
+    if not isinstance(value, list):
+        return value
+    with suppress(ValueError):  # rows of different lengths
+        array = np.asarray(value)
+        return array if array.dtype.kind in "fiub" else value
+    return value
 
 
 @contextmanager
@@ -217,13 +255,13 @@ def nothing_run() -> Iterator[None]:
     def value(text: str, *_: Any) -> Any:
         try:
             return arithmetic.value(text, names)
-        except ValueError as error:  # AT would leave the line out
-            raise LatticeError(str(error)) from error
+        except (ValueError, SyntaxError) as error:  # AT would leave the line out
+            raise LatticeError(f"{error}: {plain(text, 60)}") from error
 
     with _ONE_AT_A_TIME:
         for module in (matfile, reprfile):
             module.eval = value
-        json.element_from_dict, matfile.element_from_dict = _checked(make), _checked(of_fields)
+        json.element_from_dict = matfile.element_from_dict = _checked(of_fields)
         try:
             yield
         finally:

@@ -12,6 +12,7 @@ in common counts once, and is compared with the orbit of a ring with distributed
 whose orbit is millimetres off is no global error.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -293,6 +294,14 @@ def _parts(passes: Passes, found: SectionFits) -> tuple[Split, list[Split], list
     return sections, joints, [spread for _, spread, _ in pairs]
 
 
+def _scattered(readings: Array) -> float:
+    """Negative log likelihood of where there are readings, by the number of places along the ring
+    where they begin or end: one, where the beam is lost; many, if BPMs have others' names."""
+    read = np.isfinite(readings).any(axis=(0, 2))
+    ends = int(np.count_nonzero(np.diff(read)))
+    return math.lgamma(len(read) + 1) - math.lgamma(ends + 1) - math.lgamma(len(read) - ends + 1)
+
+
 def _worse(launch: Array) -> float:
     """The usual mean square [shot, plane] of the worse plane."""
     return float(np.median(launch, axis=0).max()) if len(launch) else float("nan")
@@ -395,7 +404,7 @@ class OfTurns(Search):
         sections, joints, spreads = _parts(passes, found)
         launch, each, blur = self._launch(data, passes, found, square, "beam-backwards" in names)
         times = _size(data) / self.scale
-        blur += sum(log_uncertainty(own / times**2) for own in spreads)
+        blur += sum(log_uncertainty(own / times**2) / len(own) for own in spreads)
         ratio = 1.0
         if data.noise is not None:
             ratio = float(np.nanmedian(passes.sigma) / np.nanmedian(data.noise))
@@ -410,7 +419,7 @@ class OfTurns(Search):
         best = costs[costs.sum(axis=1).argmin()]
         unit = 1 / square if data.noise is None else ratio**2
         return Terms(
-            np.concatenate([best, [noise**2 / 2, orbit**2 / 2]]),
+            np.concatenate([best, [noise**2 / 2, orbit**2 / 2, _scattered(passes.readings)]]),
             blur,
             unit * np.array([found.level, sections.level()]),
             np.full(2, np.nan) if launch is None else np.array([_worse(each), launch.level(True)]),

@@ -476,8 +476,7 @@ def _prior_precision(passes: Passes, slopes: Array, members: Flags, count: Indic
     square = np.where(members[..., None, None], own**2, 0.0).sum(axis=2)
     square = square / members.sum(axis=1)[:, None, None]
     precision = square / np.maximum(size, TINY) ** 2
-    unread = (count < TWO) & (count.max(axis=2, keepdims=True) >= TWO)
-    return np.where(unread[..., None], precision, 0.0).reshape(*count.shape[:2], 4)
+    return np.where((count < TWO)[..., None], precision, 0.0).reshape(*count.shape[:2], 4)
 
 
 def _inverse(curvature: Array) -> Array:
