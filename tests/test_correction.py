@@ -10,6 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.optimize import lsq_linear
 from test_cli import schema
 
 from tmlattice import correct, diagnose, simulate, write_measurement
@@ -20,6 +21,7 @@ from tmlattice.correction.estimate import Estimate, read_estimate
 from tmlattice.correction.first_turn import estimate_of_turns
 from tmlattice.correction.knobs import read_settings, write_knobs
 from tmlattice.correction.result import read_correction
+from tmlattice.correction.solve import bounded, normal
 from tmlattice.correction.targets import Targets, rms_of
 from tmlattice.diagnosis.twin import known_document
 from tmlattice.effects import Cause, apply, find
@@ -142,6 +144,42 @@ def test_a_target_that_rises_is_named(small_ring, quadrupoles):
         assert words in found.words.split("It raises ")[1]
         assert words in " ".join(found.report().split())
     assert "It raises" not in correct(machine, goal=small_ring).words
+
+
+def test_a_target_out_of_reach_outweighs_no_other(small_ring, wrong):
+    """A dispersion of 37 tolerances that no quadrupole makes: two of them are no reason to raise
+    the beta beating."""
+    machine = apply(small_ring, [replace(cause, amount=cause.amount / 2) for cause in wrong])
+    names = ["beta_beating", "dispersion"]
+    size = 40 * Targets(small_ring, names).tolerance["dispersion"]
+    rng, count = np.random.default_rng(1), len(small_ring.monitors)
+    beyond = size * rng.standard_normal((count, 1)) * [1, 0]
+    found = correct(Estimate(machine, small_ring, dispersion=beyond), knobs=["quadrupoles"],
+                    targets=names)  # fmt: skip
+    before, after = beating(machine, small_ring), beating(set_to(machine, found), small_ring)
+    assert (after < before).all()
+    assert after[0] < 0.4 * before[0]
+    assert found.after["dispersion"][0][0] < found.before["dispersion"][0][0]
+
+
+def test_the_minimum_within_limits():
+    """As by scipy's least squares within bounds: many knobs are at a limit, and alike."""
+    rng = np.random.default_rng(0)
+    for count in (2, 6, 20, 60):
+        for _ in range(10):
+            slopes = rng.standard_normal((count + 5, count)) * np.exp(rng.normal(0, 1.5, count))
+            slopes[:, : count // 2] += 5 * slopes[:, :1]
+            slopes /= np.linalg.norm(slopes, axis=0)
+            rows = 3 * rng.standard_normal(count + 5)
+            low, high = -rng.uniform(0.1, 2, count), rng.uniform(0.1, 2, count)
+            sigma = np.full(count, 1e-2)
+            matrix, right = normal(-rows, slopes, sigma)
+            found, rooted = bounded(matrix, right, low, high), np.linalg.cholesky(matrix)
+            best = lsq_linear(rooted.T, np.linalg.solve(rooted, right), (low, high), "bvls").x
+            values = [x @ matrix @ x / 2 - right @ x for x in (found, best)]
+            assert values[0] == pytest.approx(values[1], rel=1e-6)
+            assert (low <= found).all()
+            assert (found <= high).all()
 
 
 def test_limits_steps_and_excitation_curves(small_ring, wrong):
