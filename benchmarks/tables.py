@@ -63,10 +63,10 @@ def code(machines):
 
 
 def against(machines, other):
-    """How many corrections leave a smaller square than another method's, an equal one and a larger
+    """How many corrections leave a smaller cost than another method's, an equal one and a larger
     one: equal within what 1 % errors of the changes add to the oracle's (0 where not measured)."""
     own, its, exact, made = (
-        np.array([(one.get(m) or one["oracle"])["square"] for one in machines])
+        np.array([(one.get(m) or one["oracle"])["cost"] for one in machines])
         for m in ("tmlattice", other, "oracle", "oracle_made")
     )
     ties = np.abs(own - its) <= np.abs(made - exact)
@@ -74,15 +74,17 @@ def against(machines, other):
 
 
 def of_corrections(machines):
-    """Each study of `correct.py`: sums of squares in tolerances, medians over its machines."""
+    """Each study of `correct.py`: errors in tolerances, medians over its machines."""
     yield ["study", "code", "machines", "nothing set", "before", "after", "oracle", "SVD", "LOCO",
-           "rms over the oracle's, median (worst)", "not worse than before",
+           "beta beating over the oracle's, median (worst)", "not worse than before",
            "LOCO: better, equal, worse", "68 % intervals: now", "expected"]  # fmt: skip
     for study in sorted({tuple(one["study"]) for one in machines}):
         own = [one for one in machines if tuple(one["study"]) == study]
-        square = {m: np.array([one[m]["square"] for one in own if m in one])
-                  for m in ("before", "tmlattice", "oracle", "svd", "loco")}  # fmt: skip
-        ratio = np.sqrt(square["tmlattice"] / square["oracle"])
+        cost = {m: np.array([one[m]["cost"] for one in own if m in one])
+                for m in ("before", "tmlattice", "oracle", "svd", "loco")}  # fmt: skip
+        own_beta, its = (np.array([np.linalg.norm(one[m]["beta_beating"]) for one in own])
+                         for m in ("tmlattice", "oracle"))  # fmt: skip
+        ratio = own_beta / its
         hold = [
             np.mean([
                 low <= value <= high
@@ -94,10 +96,10 @@ def of_corrections(machines):
         yield [
             ", ".join(study).replace("_", " "), code(own), str(len(own)),
             str(sum(bool(one["refused"]) for one in own)),
-            *(f"{np.median(v):.3g}" if len(v) == len(own) else "" for v in square.values()),
+            *(f"{np.median(v):.3g}" if len(v) == len(own) else "" for v in cost.values()),
             f"{np.median(ratio):.3f} ({ratio.max():.3f})",
-            str(np.sum(square["tmlattice"] <= square["before"])),
-            ", ".join(map(str, against(own, "loco"))) if len(square["loco"]) else "",
+            str(np.sum(cost["tmlattice"] <= cost["before"])),
+            ", ".join(map(str, against(own, "loco"))) if len(cost["loco"]) else "",
             *(f"{100 * share:.0f} %" for share in hold),
         ]  # fmt: skip
 

@@ -51,6 +51,13 @@ def same(one, other, tolerance):
     assert np.abs(off).max() < tolerance
 
 
+def chi2_of(turns, found):
+    """Of the model with the most probable errors, the launches fitted."""
+    pairs = zip(found.before.hypotheses, found.amounts.tolist(), strict=True)
+    fixed = turns.with_fixed([Cause(*h, a) for h, a in pairs])
+    return fit_nuisances(fixed, (), turns.first).chi2
+
+
 def test_pieces_are_the_signatures(response, everywhere, monkeypatch):
     monkeypatch.setattr(response_problem, "AT_ONCE", PIECE)
     point = response.at((Cause("monitor_roll", "end_1", 0.02),), response.first)
@@ -107,6 +114,19 @@ def test_first_turns_far_from_the_design_are_followed_along_the_way(small_ring):
     turns = prepare(strong, measured, None, False, None, DEFAULT).problem
     seen = [(n, p) for n in USUAL for p in find(n).places(strong) if turns.sees((n, p))]
     found = posterior(turns, DistributedErrors.usual(seen, twice), learn=False)
-    pairs = zip(seen, found.amounts.tolist(), strict=True)
-    at = fit_nuisances(turns.with_fixed([Cause(*h, a) for h, a in pairs]), (), turns.first)
-    assert at.chi2 < turns.valid.sum()
+    assert chi2_of(turns, found) < turns.valid.sum()
+
+
+def test_amounts_follow_the_estimated_scales(small_ring):
+    """Quadrupoles displaced by thirty times the usual, with the usual ones as prior: one step to
+    the estimated scales, from amounts of the usual ones, explains the readings half."""
+    usual = {f"quadrupole_offset_{plane}": USUAL[f"quadrupole_offset_{plane}"] for plane in "xy"}
+    machine = {name: 30 * rms for name, rms in usual.items()}
+    measured = simulate(
+        small_ring, background=machine, machine_seed=2, shots=3, turns=2, seed=3
+    ).measurement()
+    turns = prepare(small_ring, measured, None, False, None, DEFAULT).problem
+    seen = [(n, p) for n in usual for p in find(n).places(small_ring) if turns.sees((n, p))]
+    found = posterior(turns, DistributedErrors.usual(seen, usual))
+    assert all(10 < rms / usual[name] < 90 for name, rms in found.sizes.items())
+    assert chi2_of(turns, found) < turns.valid.sum()

@@ -111,8 +111,9 @@ def _fields(
 ) -> dict[str, Any]:
     """Fields of the result: the whole correction, and the safe one where all ends."""
     problem, targets = end.problem, end.problem.targets
-    gain = begin.squares - (whole if end is begin else end).squares
-    gain /= max(float(begin.squares.mean()), 1e-30)
+    now = begin.squares(whole.weights)
+    gain = now - (whole if end is begin else end).squares(whole.weights)
+    gain /= max(float(now.mean()), 1e-30)
     refused = _refusal(float(gain.mean()), float(gain.std())) if end is begin else ""
     order = order[:0] if refused else order
     gains = end.gains(order, aversion)
@@ -158,7 +159,7 @@ def _fields(
         "profile": profile,
         "s": tuple(targets.s.tolist()),
         "targets": targets.tolerance,
-        "iterations": 2 if aversion or _dominated(end) else 1,
+        "iterations": 2 if aversion or end.dominated else 1,
         "warnings": tuple(_warnings(begin, whole, end, aversion, settings)),
     }  # fmt: skip
 
@@ -194,21 +195,16 @@ def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _dominated(end: Point) -> bool:
-    """Whether most of what stays is errors of the changes, which a second measurement shows."""
-    return float(end.unsure @ end.unsure) > float(end.rows @ end.rows)
-
-
 def _warnings(
     begin: Point, whole: Point, end: Point, aversion: float, settings: Sequence[Setting]
 ) -> Iterable[str]:
     if 0 < aversion < np.inf:
-        share = (begin.square - end.square) / (begin.square - whole.square)
+        share = (begin.cost - end.cost) / (begin.cost - whole.cost)
         yield (
             f"the settings have {100 * share:.0f} % of the gain of the most probable correction, "
             "since larger ones may make the ring worse; measure again, and correct the rest"
         )
-    elif _dominated(end):
+    elif end.dominated:
         yield "most of what stays are errors of the changes; measure again, and correct them"
     held = [setting.knob.name for setting in settings if setting.at_limit]
     if held:

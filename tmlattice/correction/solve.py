@@ -1,19 +1,26 @@
-"""Settings of the smallest expected square of the target errors.
+"""Settings of the smallest expected errors of the targets in units of their tolerances.
 
-With the errors e of the estimated ring in units of their tolerances, J their derivatives by the
-knobs and G those by its uncertain errors, the expected square after a change x is, to first order,
+With the errors e of a target (in one plane) in units of its tolerance, J their derivatives by the
+knobs and G those by the uncertain errors of the ring, its expected square after a change x is, to
+first order,
 
-    |e + J x|^2 + sum_k (sigma_k |J_k| x_k)^2 + E |G delta|^2.
+    s = |e + J x|^2 + sum_k (sigma_k |J_k| x_k)^2 + E |G delta|^2.
 
 The first term can be reduced by the knobs. The second is a ridge without a free parameter: a knob's
 change has a relative error sigma_k, so that large changes which cancel one another cost more than
 they gain. The third is what the data do not determine: no knob lowers it.
 
-The change with the smallest expected square may still make one machine of the posterior worse: its
-gain -2 (e + G delta) J x - |J x|^2 has the variance 4 x D x, D = J^T G E[delta delta^T] G^T J. Of
-all changes that make the ring worse with one probability, the one of the largest expected gain
-minimises the expected square plus a multiple (the risk aversion) of x D x: directions whose slope
-is uncertain are shortened, the others are not.
+The cost is the sum of sqrt(1 + s) - 1 over the targets: squares within the tolerances and the rms
+beyond, the slowest growth that a cost with a single minimum can have. A sum of squares would be
+that of the target which is furthest out of reach alone. At every point the roots have the slopes of
+squares with the weights (1 + s)^(-1/2), and are below them everywhere else: what lowers these
+squares lowers the cost.
+
+The change with the smallest cost may still make one machine of the posterior worse: the gain of
+its weighted squares, -2 (e + G delta) J x - |J x|^2, has the variance 4 x D x,
+D = J^T G E[delta delta^T] G^T J. Of all changes that make the ring worse with one probability, the
+one of the largest expected gain minimises the expected square plus a multiple (the risk aversion)
+of x D x: directions whose slope is uncertain are shortened, the others are not.
 """
 
 import logging
@@ -41,12 +48,11 @@ log = logging.getLogger(__name__)
 MAX_ROUNDS = 30
 """Linearisations at most: a threaded beam gets further with each of them."""
 MIN_FALL = 1e-3
-"""Fall of the expected square, relative and in squares of the tolerances, that ends the search."""
+"""Fall of the cost, relative and in tolerances, that ends the search."""
 MAX_HALVINGS = 6
-"""Halvings, at most, of a step that does not lower the expected square."""
+"""Halvings, at most, of a step that does not lower the cost."""
 MAX_EXCESS = 5e-4, 2e-3
-"""Excess over the smallest expected square that is allowed for fewer knobs: relative (0.025 % in
-rms), and in squares of the tolerances."""
+"""Excess over the smallest cost that is allowed for fewer knobs: relative, and in tolerances."""
 SIGMAS = 3.0
 """Standard deviations by which a correction is expected to make the ring better: of a thousand such
 corrections one makes it worse."""
@@ -61,8 +67,10 @@ COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Numbers of knobs that are tried, and whose gain is stated."""
 ROUNDING = 1e-10
 """Of the squares of slopes, relative to a knob's size: a ridge for knobs without errors."""
-MAX_PIVOTS = 50
+MAX_PIVOTS = 1000
 """Of the search for the knobs at their limits: systems solved."""
+PLANES = 2
+"""Of each target: a target counts as much as the mean of its planes."""
 AT_ONCE = 500
 """Uncertain errors whose derivatives are in memory."""
 
@@ -103,11 +111,27 @@ class Problem:
         return np.array([knob.error for knob in self.knobs])
 
     @cached_property
-    def sizes(self) -> Array:
-        """Norm of the rows' derivatives by each knob in the estimated ring, [knob]; 1 if it has no
-        effect."""
-        size = np.linalg.norm(self.begin.slopes, axis=0)
-        return np.asarray(np.where(size > 0, size, 1.0))
+    def groups(self) -> Indices:
+        """Target and plane of each row, [row]."""
+        return self.targets.groups(self.begin.errors)
+
+    @cached_property
+    def undetermined(self) -> Array:
+        """Mean square of each row over the posterior in the estimated ring, [row]."""
+        return np.asarray(np.mean(self.targets.rows(self.begin.open) ** 2, axis=0))
+
+    def cost(self, squares: Array) -> Array:
+        """Return the sum of sqrt(1 + s) - 1 over the targets, with their mean squares s, [...].
+
+        Args:
+            squares: of the rows, [..., row].
+        """
+        return np.asarray((np.sqrt(1 + self.sums(squares)) - 1).sum(axis=-1) / PLANES)
+
+    def sums(self, squares: Array) -> Array:
+        """Return mean squares of targets and planes from squares of the rows, [..., group]."""
+        count = self.groups.max() + 1
+        return np.asarray(PLANES * squares @ (self.groups[:, None] == np.arange(count)))
 
     @cached_property
     def bounds(self) -> Array:
@@ -128,12 +152,12 @@ class Problem:
         return Point(self, amounts, shown)
 
     def better(self, amounts: Array, least: float) -> "Point | None":
-        """Return the point, if it stores a beam and its expected square is below `least`."""
+        """Return the point, if it stores a beam and its cost is below `least`."""
         try:
             point = self.at(amounts)
         except UnstableRingError:
             return None
-        return point if point.square < least else None
+        return point if point.cost < least else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,88 +228,111 @@ class Point:
             shift = problem.energies * self.shown.per_energy
             for name, part in self.by_frequency.items():
                 total[name] += shift[:, None, None] * part
-        for some, changes in self._by_errors():
+        for some, changes in self.by_errors():
             for name, part in changes.items():
                 total[name] += np.tensordot(problem.draws[:, some], part, 1)
         return total
 
-    def _by_errors(self) -> Iterator[tuple[slice, dict[str, Array]]]:
+    def by_errors(self) -> Iterator[tuple[slice, dict[str, Array]]]:
         """Yield d errors / d amount of the uncertain errors, some at a time."""
         hypotheses = self.problem.estimate.hypotheses
         for first in range(0, len(hypotheses), AT_ONCE):
             some = slice(first, first + AT_ONCE)
             yield some, self.problem.targets.changes(self.shown.derivatives(hypotheses[some]))
 
+    def squares(self, weights: Array) -> Array:
+        """Weighted squares of the rows over the draws, [draw].
+
+        Args:
+            weights: [row].
+        """
+        rows = self.rows + self.problem.targets.rows(self.open)
+        return np.asarray(rows**2 @ weights**2)
+
     @cached_property
-    def squares(self) -> Array:
-        """Squares of the rows over the draws, [draw]."""
-        return np.asarray(np.sum((self.rows + self.problem.targets.rows(self.open)) ** 2, axis=-1))
+    def _expected(self) -> Array:
+        """Expected square of each row, [row]."""
+        moved = (self.problem.sigma * self.amounts) ** 2
+        unsure = self.slopes**2 @ moved if moved.any() else 0.0
+        return np.asarray(self.rows**2 + unsure + self.problem.undetermined)
+
+    @cached_property
+    def cost(self) -> float:
+        """Of the expected squares."""
+        return float(self.problem.cost(self._expected))
+
+    @cached_property
+    def weights(self) -> Array:
+        """Factors of the rows with which the sum of squares has the slopes of the cost, [row]."""
+        sums = self.problem.sums(self._expected)
+        return np.asarray((1 + sums[self.problem.groups]) ** -0.25)
+
+    @cached_property
+    def sizes(self) -> Array:
+        """Norm of the weighted rows' derivatives by each knob, [knob]; 1 if it has no effect."""
+        return sizes_of(self.weights[:, None] * self.slopes)
 
     @cached_property
     def doubt(self) -> Array:
-        """Covariance of half the slopes of the square by the knobs, in units of their sizes, over
-        the posterior, [knob, knob]."""
-        problem, estimate = self.problem, self.problem.estimate
-        slopes = self.slopes / problem.sizes
-        parts = [problem.targets.rows(own) @ slopes for _, own in self._by_errors()]
+        """Covariance of half the slopes of the weighted square in the estimated ring by the knobs,
+        in units of their sizes, over the posterior, [knob, knob]."""
+        problem, estimate, begin = self.problem, self.problem.estimate, self.problem.begin
+        slopes = self.weights[:, None] ** 2 * begin.slopes / self.sizes
+        parts = [problem.targets.rows(own) @ slopes for _, own in begin.by_errors()]
         whole = estimate.independent(np.concatenate(parts)) if parts else 0.0 * slopes
         if estimate.energy_error:
-            shift = estimate.energy_error * self.shown.per_energy
-            energy = shift * problem.targets.rows(self.by_frequency) @ slopes
+            shift = estimate.energy_error * begin.shown.per_energy
+            energy = shift * problem.targets.rows(begin.by_frequency) @ slopes
             whole = np.concatenate([whole, energy])
         return np.asarray(whole.T @ whole)
 
     @property
-    def unsure(self) -> Array:
-        """rms contribution of each knob's error to the rows, [knob]."""
-        return self.problem.sigma * self.problem.sizes * self.amounts
-
-    @property
-    def square(self) -> float:
-        """Expected square of the rows, without the undetermined part."""
-        return float(self.rows @ self.rows + self.unsure @ self.unsure)
+    def dominated(self) -> bool:
+        """Whether most of the weighted square is errors of the changes."""
+        unsure, rows = self.problem.sigma * self.sizes * self.amounts, self.weights * self.rows
+        return float(unsure @ unsure) > float(rows @ rows)
 
     @cached_property
     def _normal(self) -> tuple[Array, Array, float]:
         """Normal equations in units of the knobs' sizes: matrix with the ridge, [knob, knob], right
-        side, [knob], and the square without any change."""
-        slopes = self.slopes / self.problem.sizes
-        start = self.rows - self.slopes @ self.amounts
-        matrix = slopes.T @ slopes
-        matrix.flat[:: len(matrix) + 1] += self.problem.sigma**2 + ROUNDING
-        return matrix, -slopes.T @ start, float(start @ start)
+        side, [knob], and the weighted square without any change."""
+        slopes = self.weights[:, None] * self.slopes / self.sizes
+        start = self.weights * (self.rows - self.slopes @ self.amounts)
+        return *normal(start, slopes, self.problem.sigma), float(start @ start)
 
     def step(self, knobs: Indices, aversion: float = 0.0) -> tuple[Array, float]:
         """Return the amounts of some knobs, the others at zero, of the smallest linearised expected
-        square within the limits, with a risk aversion; and that square."""
+        square within the limits, with a risk aversion; and that square, weighted."""
         matrix, right, square = self._normal
-        bounds = self.problem.bounds[:, knobs] * self.problem.sizes[knobs]
+        bounds = self.problem.bounds[:, knobs] * self.sizes[knobs]
         matrix, right = matrix[np.ix_(knobs, knobs)], right[knobs]
         found = bounded(matrix + self._ridge(knobs, aversion), right, *bounds)
         amounts = np.zeros(len(self.amounts))
-        amounts[knobs] = found / self.problem.sizes[knobs]
+        amounts[knobs] = found / self.sizes[knobs]
         return amounts, square + float(found @ (matrix @ found - 2 * right))
 
     def _ridge(self, knobs: Indices, aversion: float) -> Array | float:
-        return aversion * self.problem.begin.doubt[np.ix_(knobs, knobs)] if aversion else 0.0
+        return aversion * self.doubt[np.ix_(knobs, knobs)] if aversion else 0.0
+
+    def sigmas(self, knobs: Indices, aversion: float) -> float:
+        """Return the standard deviations of the gain by which a step with a risk aversion is
+        expected to gain, to first order."""
+        amounts, then = self.step(knobs, aversion)
+        own = (amounts * self.sizes)[knobs]
+        deviation = 2 * float(np.sqrt(own @ self.doubt[np.ix_(knobs, knobs)] @ own))
+        return (self._normal[2] - then) / max(deviation, 1e-300)
 
     def aversion(self, knobs: Indices, sigmas: float) -> float:
         """Return the smallest risk aversion whose step gains these standard deviations, to first
         order; infinite where none does."""
-        doubt = self.problem.begin.doubt[np.ix_(knobs, knobs)]
-        ends = np.log(AVERSIONS) + np.log(len(knobs) / max(float(np.trace(doubt)), 1e-300))
-
-        def safe(log: float) -> bool:
-            amounts, then = self.step(knobs, float(np.exp(log)))
-            own = (amounts * self.problem.sizes)[knobs]
-            return self._normal[2] - then >= 2 * sigmas * float(np.sqrt(own @ doubt @ own))
-
-        low, high = ends
-        if not safe(high):
+        size = float(np.trace(self.doubt[np.ix_(knobs, knobs)]))
+        low, high = np.log(AVERSIONS) + np.log(len(knobs) / max(size, 1e-300))
+        if self.sigmas(knobs, float(np.exp(high))) < sigmas:
             return np.inf
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
-            low, high = (low, middle) if safe(middle) else (middle, high)
+            safe = self.sigmas(knobs, float(np.exp(middle))) >= sigmas
+            low, high = (low, middle) if safe else (middle, high)
         return float(np.exp(high))
 
     def gains(self, knobs: Indices, aversion: float) -> Array:
@@ -316,33 +363,63 @@ class Point:
             yield k
 
 
+def sizes_of(slopes: Array) -> Array:
+    """Return the norm of the rows' derivatives by each knob, [knob]; 1 if it has no effect."""
+    size = np.linalg.norm(slopes, axis=0)
+    return np.asarray(np.where(size > 0, size, 1.0))
+
+
+def normal(rows: Array, slopes: Array, sigma: Array) -> tuple[Array, Array]:
+    """Return the normal equations with the ridge: matrix, [knob, knob], and right side, [knob].
+
+    Args:
+        rows: [row].
+        slopes: in units of the knobs' sizes, [row, knob].
+        sigma: relative error of each knob's change, [knob].
+    """
+    matrix = slopes.T @ slopes
+    matrix.flat[:: len(matrix) + 1] += sigma**2 + ROUNDING
+    return matrix, -slopes.T @ rows
+
+
 def bounded(matrix: Array, right: Array, low: Array, high: Array) -> Array:
     """Return the minimum of x matrix x / 2 - right x with low <= x <= high.
 
-    Knobs beyond a limit are held there, and released where the slope leads back inside, all at once
-    (block principal pivoting: Judice & Pires, Computers & Operations Research 21 (1994) 587).
+    An active set: knobs that reach a limit are held there, and released where the slope leads back
+    inside (Nocedal & Wright, Numerical Optimization, 16.5). A step holds all knobs that it takes
+    beyond a limit if it lowers the value nevertheless, else it ends at the first limit: the value
+    never rises.
 
     Args:
         matrix: positive definite, [knob, knob].
         right, low, high: [knob].
     """
-    held = np.zeros(len(right), dtype=int)  # -1 at the low limit, 1 at the high one
-    x = np.zeros(len(right))
+    x = np.clip(np.zeros(len(right)), low, high)
+    free = np.ones(len(right), dtype=bool)
+    slope = right - matrix @ x
     for _ in range(MAX_PIVOTS):
-        free = held == 0
-        x = np.where(held > 0, high, np.where(held < 0, low, 0.0))
-        rest = right - matrix[:, ~free] @ x[~free]
-        x[free] = solve(matrix[np.ix_(free, free)], rest[free], assume_a="pos")
-        outward = held * (rest - matrix[:, free] @ x[free])
-        wrong = (x < low) | (x > high) | (outward < 0)
-        if not wrong.any():
-            break
-        held[wrong] = np.where(held, 0, np.where(x > high, 1, -1))[wrong]
-    return np.asarray(np.clip(x, low, high))
+        step = np.zeros(len(right))
+        step[free] = solve(matrix[np.ix_(free, free)], slope[free], assume_a="pos")
+        new = np.clip(x + step, low, high)
+        beyond = new != x + step
+        moved = new - x
+        if beyond.any() and moved @ (matrix @ moved - 2 * slope) >= 0:
+            share = np.divide(moved, step, out=np.ones(len(right)), where=beyond)
+            beyond = share == share.min()
+            new = np.where(beyond, new, x + share.min() * step)
+        free &= ~beyond
+        x = new
+        slope = right - matrix @ x
+        if not beyond.any():
+            inward = ~free & np.where(slope > 0, x < high, x > low) & (np.abs(slope) > ROUNDING)
+            if not inward.any():
+                break
+            free |= inward
+    return np.asarray(x)
 
 
 def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
-    """Return the point of the smallest expected square with some knobs, by repeated linearisation.
+    """Return the point of the smallest cost with some knobs, by repeated linearisation.
 
     Args:
         problem: errors, knobs and targets.
@@ -354,24 +431,42 @@ def optimised(problem: Problem, begin: Point, knobs: Indices) -> Point:
         goal, _ = now.step(knobs)
         found = None
         for half in range(MAX_HALVINGS):
-            found = problem.better(now.amounts + (goal - now.amounts) / 2**half, now.square)
+            found = problem.better(now.amounts + (goal - now.amounts) / 2**half, now.cost)
             if found is not None:
                 break
         if found is None:
             return now
-        log.info("expected square %.4g -> %.4g", now.square, found.square)
-        done = now.square - found.square < MIN_FALL * (1 + found.square)
+        log.info("cost %.4g -> %.4g", now.cost, found.cost)
+        done = now.cost - found.cost < MIN_FALL * (1 + found.cost)
         now = found
         if done:
             break
     return now
 
 
+def tuned(problem: Problem) -> Point:
+    """Return the point where a search begins: the tunes are nearer to the goal's by one step.
+
+    A resonance between the tunes and the goal's is a barrier, since beta or coupling diverge on it.
+    A step for the tunes alone crosses it.
+    """
+    begin = problem.begin
+    own = problem.groups // PLANES == [*problem.targets.names, "tunes"].index("tunes")
+    slopes, rows = begin.slopes[own], begin.rows[own]
+    sizes = sizes_of(slopes)
+    step = bounded(*normal(rows, slopes / sizes, problem.sigma), *(problem.bounds * sizes)) / sizes
+    for half in range(MAX_HALVINGS):
+        point = problem.better(step / 2**half, np.inf)
+        if point is not None and np.linalg.norm(point.rows[own]) < np.linalg.norm(rows):
+            return point
+    return begin
+
+
 def fewest(problem: Problem) -> tuple[Point, Indices]:
     """Return the end of a correction, and its knobs by falling gain: the fewest of `COUNTS` whose
-    expected square is nearly that of all."""
+    cost is nearly that of all."""
     every = np.arange(len(problem.knobs))
-    whole = optimised(problem, problem.begin, every)
+    whole = optimised(problem, tuned(problem), every)
     order = np.array([*whole.by_gain()], dtype=np.int64)
     least = whole.step(every)[1]
     for count in COUNTS:
@@ -381,15 +476,15 @@ def fewest(problem: Problem) -> tuple[Point, Indices]:
         goal, square = whole.step(chosen)
         if nearly(square, least):
             break
-    end = optimised(problem, problem.better(goal, problem.begin.square) or problem.begin, chosen)
+    end = optimised(problem, problem.better(goal, problem.begin.cost) or problem.begin, chosen)
     # or it is not as linear as that
-    return (end, chosen) if nearly(end.square, whole.square) else (whole, order)
+    return (end, chosen) if nearly(end.cost, whole.cost) else (whole, order)
 
 
-def nearly(square: float, least: float) -> bool:
-    """Return whether an expected square is as good as the smallest one."""
+def nearly(value: float, least: float) -> bool:
+    """Return whether a cost, or a weighted square, is as good as the smallest one."""
     relative, beyond = MAX_EXCESS
-    return square <= (1 + relative) * least + beyond
+    return value <= (1 + relative) * least + beyond
 
 
 def safest(begin: Point, end: Point, knobs: Indices) -> tuple[Point, float]:
@@ -401,22 +496,21 @@ def safest(begin: Point, end: Point, knobs: Indices) -> tuple[Point, float]:
         begin, end: before and after the whole correction.
         knobs: indices of free knobs; the others are at zero.
     """
-    problem, now, found = end.problem, begin.squares, (begin, np.inf)
-    amounts, aversion, sigmas = end.amounts, 0.0, SIGMAS
+    problem, now, found = end.problem, begin.squares(end.weights), (begin, np.inf)
+    amounts, aversion = end.amounts, 0.0
     for _ in range(MAX_HALVINGS):
         pairs = zip(problem.knobs, amounts.tolist(), strict=True)
         new = np.array([knob.rounded(amount) if amount else 0.0 for knob, amount in pairs])
         point = end if np.array_equal(new, end.amounts) else problem.better(new, np.inf)
-        gain = now - (now if point is None else point.squares)
+        gain = now - (now if point is None else point.squares(end.weights))
         mean, deviation = float(gain.mean()), float(gain.std())
         safe = mean >= SIGMAS * deviation
         if point is not None and safe and mean >= MIN_GAIN * now.mean():
             found = point, aversion
         if safe and (not aversion or mean <= NEAR * SIGMAS * deviation):
             break
-        if aversion:  # beyond first order
-            sigmas *= float(np.clip(1.01 * SIGMAS * deviation / max(mean, 1e-30), 0.5, 2.0))
-        aversion = end.aversion(knobs, sigmas)
+        beyond = end.sigmas(knobs, aversion) * deviation / max(mean, 1e-30)  # first order
+        aversion = end.aversion(knobs, 1.01 * SIGMAS * float(np.clip(beyond, 0.5, 10.0)))
         if np.isinf(aversion):
             break
         amounts, _ = end.step(knobs, aversion)

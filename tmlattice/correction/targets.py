@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.errors import TmlatticeError, unknown_choice
@@ -185,6 +185,12 @@ class Weighted:
             part = part.reshape(*part.shape[:-2], -1)
             own.append(part / np.sqrt(part.shape[-1]))
         return np.concatenate(own, axis=-1)
+
+    def groups(self, parts: Mapping[str, Array]) -> Indices:
+        """Return the index of the target and plane of each of `rows`, [row]."""
+        return np.concatenate([
+            2 * k + np.arange(parts[name].size) % 2 for k, name in enumerate(self.names)
+        ])  # fmt: skip
 
 
 class Targets(Weighted):

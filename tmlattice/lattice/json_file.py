@@ -6,7 +6,7 @@ reading, as everywhere. A matrix is stored by its nonzero entries (`"12"` is row
 """
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -194,7 +194,7 @@ def described(element: Element) -> dict[str, Any]:
                 f"'{element.name}' has a {key} that is no number; a lattice file holds numbers"
             )
     described: dict[str, Any] = {"kind": element.kind, "class": cls, "parameters": parameters}
-    nonzero = {k: v for k, v in asdict(element.errors).items() if v != getattr(NO_ERRORS, k)}
+    nonzero = {k: v for k, v in vars(element.errors).items() if v != getattr(NO_ERRORS, k)}
     if nonzero:
         described["errors"] = nonzero
     return described
