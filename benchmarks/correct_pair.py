@@ -67,8 +67,8 @@ def main() -> None:
         rows.append((back, setting.amount, pull))
     record, asked, pull = np.array(rows).T
     known = {knob.name for knob in knobs}
-    statistic = [f.amount / f.amount_sigma for f in diagnosis.findings if f.element in known]
-    statistic = np.abs(statistic)
+    found = [f for f in diagnosis.findings if f.element in known]
+    statistic = np.abs([f.amount / f.amount_sigma for f in found])
     print("| quantity | result |\n|---|---|")
     print(f"| changed supplies that are found | {len(statistic)} of {len(knobs)}, at "
           f"{statistic.min():.1f} to {statistic.max():.1f} standard errors |")  # fmt: skip

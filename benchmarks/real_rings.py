@@ -136,7 +136,7 @@ def ring(name, files, data, place, options):
             try:
                 source = source or imported(name, files, data, place, options.iteration)
                 picture_of = None if seed > options.seed else options.pictures
-                one |= _diagnosed(*source, seed, options.missing, picture_of, name)
+                one |= _diagnosed(source, seed, options.missing, picture_of, name)
             except (TmlatticeError, np.linalg.LinAlgError) as error:
                 one |= {"error": str(error), "seconds": 0.0}
             if files and files[0].name.endswith(".loco.mat"):
@@ -174,7 +174,8 @@ def _figures(step):
     return f"{step['in_plane']:.2f}{jump} / {step['coupling']:.2f}{roll} / {rf}"
 
 
-def _diagnosed(lattice, folder, told, seed, missing, pictures, name):
+def _diagnosed(source, seed, missing, pictures, name):
+    lattice, folder, told = source
     begun = time.process_time()
     ring, measurement = tmlattice.load_ring(lattice), read_measurement(folder)
     found = tmlattice.diagnose(ring, measurement, seed=seed, missing=missing)

@@ -511,6 +511,14 @@ RESPONSES = (
     usual("monitor_swap", "end_6", 1.0),
     usual("family_gradient", "QD", -0.0235),
     usual("sextupole_offset_y", "sf::2", -3e-3),
+    *(  # a member of a family, one with the scatter of its usual errors, one beside the orbit
+        usual(*fault, seed=1, made={"machine_seed": 5})
+        for fault in (
+            ("quadrupole_gradient", "QD::1", 0.02),
+            ("sextupole_offset_y", "sd::2", 2.5e-3),
+            ("gradient_absolute", "sf::2", 0.02),
+        )
+    ),
     row(
         "response: edges of all bends",
         *tuple(Cause("vertical_focusing", name, 2e-3) for name in BENDS),
@@ -555,6 +563,7 @@ RESPONSES = (
         found=(),
         verdicts=MANY,
         lasts=True,
+        fewer=None,  # as quick in tests/test_response_forms.py
     ),
 )
 

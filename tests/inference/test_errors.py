@@ -1,5 +1,7 @@
 """Stated errors: unknown prior scales, and readings that share model discrepancy."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -31,10 +33,10 @@ def problem(monkeypatch):
 
 
 def one_by_one(J, left, sizes, chances):
-    """Mean and variance of each number, every size weighed with its evidence, densely."""
+    """Mean and variance of each number, all sizes of the last ones weighed with their evidence."""
     logs, means, variances = [], [], []
     for size, chance in zip(sizes, chances, strict=True):
-        prior = np.append(np.full(10, 0.25), size**2)
+        prior = np.append(np.full(10, 0.25), np.square(size))
         V = np.eye(len(left)) + (J * prior) @ J.T
         gain = (prior[:, None] * J.T) @ np.linalg.inv(V)
         logs.append(np.log(chance) - 0.5 * left @ np.linalg.solve(V, left)
@@ -93,20 +95,9 @@ def test_rejected_families_are_exchangeable(problem, monkeypatch):
     ]
     sizes = 0.02 * np.exp(FACTORS)
     chances = np.append(1.0, hyperprior(sizes, groups[1]))
-    every = np.append(0.0, sizes)
-    logs, means, variances = [], [], []
-    for a, first in zip(every, chances, strict=True):
-        for b, second in zip(every, chances, strict=True):
-            prior = np.concatenate([np.full(10, 0.25), [a**2, b**2]])
-            V = np.eye(len(left)) + (J * prior) @ J.T
-            gain = (prior[:, None] * J.T) @ np.linalg.inv(V)
-            evidence = -0.5 * left @ np.linalg.solve(V, left) - 0.5 * np.linalg.slogdet(V)[1]
-            logs.append(np.log(first * second) + evidence)
-            means.append(gain @ left)
-            variances.append(prior - np.sum(gain * (J * prior).T, axis=1))
-    share = np.exp(np.array(logs) - max(logs))
-    share /= share.sum()
-    expected = share @ (np.array(variances) + (np.array(means) - means[0]) ** 2) - variances[0]
+    both = product(np.append(0.0, sizes), repeat=2)
+    share, means, variances = one_by_one(J, left, both, np.outer(chances, chances).ravel())
+    expected = share @ (variances + (means - means[0]) ** 2) - variances[0]
     assert (expected[10:] > 0.05).all()  # either may be there
     normal = Normal(J.T @ J, J.T @ left)
     more = variance(scale_covariance(normal, groups, np.zeros(12), ["one 10", "one 11"]))

@@ -102,24 +102,6 @@ def test_a_closed_orbit_far_off_in_sextupoles_is_no_kick():
     assert (found.verdict, found.findings) == ("distributed", ())
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        Cause("quadrupole_gradient", "QD::1", 0.02),
-        Cause("sextupole_offset_y", "sd::2", 2.5e-3),
-        Cause("gradient_absolute", "sf::2", 0.02),
-    ],
-)
-def test_a_fault_of_a_response_is_named_among_usual_errors(small_ring, fault):
-    """A member of a family; one with the scatter of its usual errors; one beside the orbit's."""
-    data = simulate_response(
-        small_ring, [fault], background=ALL, seed=1, machine_seed=5, progress=False
-    ).measured
-    (finding,) = diagnose(small_ring, data).findings
-    assert (finding.effect, finding.element) == (fault.effect, fault.element)
-    assert abs(finding.amount - fault.amount) <= 4 * finding.amount_sigma
-
-
 @pytest.mark.filterwarnings("ignore:.*have no value")
 def test_a_usual_error_of_an_effect_without_a_family_is_no_fault():
     """Six bends of 60 degrees focus by their fields' errors: 1.3 of the scatter was named."""
