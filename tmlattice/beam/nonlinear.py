@@ -67,9 +67,9 @@ def nonlinear_turn(layers: LayerMaps) -> NonlinearTurn:
             key = layers.physics(magnet)
             if key not in known:
                 entry, one, other, exit_ = halves_without_sextupole(magnet, ring.map_energy, n)
-                before, middle, behind = parts_of_errors(magnet, ring.map_energy, n)
+                before, inside, behind = parts_of_errors(magnet, ring.map_energy, n)
                 known[key] = [
-                    composed([*before, entry]), one, composed([*middle, other]),
+                    composed([*before, entry]), one, composed([*inside, other]),
                     composed([exit_, *behind]),
                 ]  # fmt: skip
             first, *rest = known[key]

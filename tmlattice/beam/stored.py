@@ -21,6 +21,7 @@ the RF's phase and is not affected.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -125,7 +126,7 @@ class StoredBeam:
         d = directions_nearby(model.layers, hypotheses)
         if len(d.owner):
             orbit, w, z = self._kicks(d)
-            found = [(moved.orbit, orbit)]
+            found: list[tuple[Any, Any]] = [(moved.orbit, orbit)]
             if oscillates:
                 total, seen = self._sources(d, w, z)
                 tunes, mixed = self._perturbed(total)

@@ -297,7 +297,7 @@ def _parts(passes: Passes, found: SectionFits) -> tuple[Split, list[Split], list
 def _scattered(readings: Array) -> float:
     """Negative log likelihood of where there are readings, by the number of places along the ring
     where they begin or end: one, where the beam is lost; many, if BPMs have others' names."""
-    read = np.isfinite(readings).any(axis=(0, 2))
+    read = np.asarray(np.isfinite(readings).any(axis=(0, 2)))
     ends = int(np.count_nonzero(np.diff(read)))
     return math.lgamma(len(read) + 1) - math.lgamma(ends + 1) - math.lgamma(len(read) - ends + 1)
 

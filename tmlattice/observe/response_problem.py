@@ -269,7 +269,7 @@ class _Here:
         """Squares of signatures, [error]."""
         slopes, n = self.slopes, self.readings.shape[2]
         used = self.used.reshape(len(self.scale), -1)
-        columns, read = used.any(axis=1), used.any(axis=0)
+        columns, read = (np.asarray(used.any(axis=axis)) for axis in (1, 0))
         return np.asarray(
             _squares(
                 some.seen.reshape(len(some.seen), -1, n) * read[:, None],
