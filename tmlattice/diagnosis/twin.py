@@ -34,7 +34,7 @@ PRODUCTS = 2e12
 """Readings times errors squared up to which the covariance of all distributed errors of a response
 is computed: some six minutes of processor (`docs/together.md`)."""
 
-ROUNDED, PROBES = 1e-4, 4
+ROUNDED = 1e-4
 """Of the products of directions: single precision rounds them by 1e-6."""
 
 FORMAT = "tmlattice-known"
@@ -218,7 +218,7 @@ def read_known(path: Path, ring: Ring) -> DistributedErrors:
 
 
 def _directions(path: Path, seen: Mapping[str, Any], errors: int) -> Array:
-    """Orthonormal to the rounding, which is tested by their products with a few random vectors."""
+    """Orthonormal again after the rounding."""
     count = int(seen["directions"])
     try:
         raw = base64.b64decode(seen["float32"], validate=True)
@@ -227,7 +227,9 @@ def _directions(path: Path, seen: Mapping[str, Any], errors: int) -> Array:
         raise MeasurementError(f"{path}: its directions are damaged; write it anew") from None
     if len(seen["share"]) != count or not np.isfinite(rows).all() or count > errors:
         raise MeasurementError(f"{path}: its directions are damaged; write it anew")
-    probes = np.random.default_rng(0).standard_normal((count, PROBES))
-    if np.abs(rows @ (rows.T @ probes) - probes).max(initial=0.0) > ROUNDED:
+    gram = rows @ rows.T
+    if np.abs(gram - np.eye(count)).max(initial=0.0) > ROUNDED:
         raise MeasurementError(f"{path}: its directions are damaged; write it anew")
-    return np.asarray(rows)
+    return np.asarray(
+        1.5 * rows - 0.5 * gram @ rows
+    )  # Newton's step: the remaining error is its square
