@@ -65,9 +65,13 @@ class Response(Steady):
         base: prediction with the known errors, see `Predicted`.
         used: fitted readings, [column, monitor, 2].
         values, sigma: orbit changes, m, [column, monitor, 2], and noise, m, [monitor, 2].
+        bends: the latest third order of the steps, by its causes, see `near`.
     """
 
     base: Predicted = field(repr=False)
+    bends: dict[tuple[Cause, ...], Array | float] = field(
+        default_factory=dict, repr=False, compare=False
+    )
     values: Array = field(init=False, repr=False)
     sigma: Array = field(init=False, repr=False)
 
@@ -83,10 +87,14 @@ class Response(Steady):
     def near(self, causes: Sequence[Cause]) -> Self:
         """Return the problem with the third order of the steps at these causes, if the ring stores
         a beam with each step there."""
-        try:
-            bent = self.view((*self.fixed, *causes)).bend().bent
-        except UnstableRingError:
-            return self
+        there = (*self.fixed, *causes)
+        if there not in self.bends:
+            self.bends.clear()
+            try:
+                self.bends[there] = self.view(there).bend().bent
+            except UnstableRingError:
+                return self
+        bent = self.bends[there]
         return replace(self, base=replace(self.base, bent=bent))
 
     def view(self, causes: Sequence[Cause]) -> Predicted:

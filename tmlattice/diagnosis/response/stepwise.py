@@ -335,7 +335,6 @@ def one_by_one(
         if not any(family.count(state.data) for family in trial):
             continue
         progress(_title(trial))
-        state = bend(state) if 0 in _blocks(trial) else state
         state = settle(jump(allow(state, trial)), _blocks(trial), FIRST, ROUGH)
         yield trial, state
 
