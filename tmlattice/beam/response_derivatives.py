@@ -54,6 +54,15 @@ def derivatives(
     return (slopes.whole(slopes.factors([hypothesis]))[0] for hypothesis in hypotheses)
 
 
+def kicks_on_orbit(model: ResponseModel, d: Directions) -> tuple[Array, Array]:
+    """Return the kick of each row of directions on the closed orbit as a change of the launch,
+    [row, n], and its slope by the state at the layer's entrance, [row, n, n]."""
+    x = model.path[d.layer][:, :, None]
+    bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
+    kick = d.D0[..., None] + (d.D1 + bent / 2) @ x
+    return (model.inverse[d.layer + 1] @ kick)[..., 0], d.D1 + bent
+
+
 def _check(hypotheses: Sequence[Hypothesis]) -> None:
     for name, _ in hypotheses:
         if not isinstance(find(name), RingEffect):
@@ -175,7 +184,8 @@ class ResponseSlopes:
 
     def _factors(self, hypotheses: Sequence[Hypothesis]) -> Factors:
         model, d, n = self.model, directions(self.model.layers, hypotheses), self.model.dimension
-        kicks, sources = self._own(d)
+        kicks, slopes = kicks_on_orbit(model, d)
+        sources = model.inverse[d.layer + 1] @ slopes @ model.tangents[d.layer]
         G, p, errors = self.readings.reshape(-1, n), self.launch_kick, len(hypotheses)
         behind = np.stack([self._mixed(hypothesis) for hypothesis in hypotheses])
         later = (model.maps.at > d.layer[:, None])[:, :, None, None]  # monitors
@@ -206,16 +216,6 @@ class ResponseSlopes:
             seen[owner, m] += (d.E1[r] + bent) @ model.tangents[model.maps.at[m]]
         before = (self.start + p) @ end.transpose(0, 2, 1) + behind
         return Factors(seen, before @ model.closing.T, behind)
-
-    def _own(self, d: Directions) -> tuple[Array, Array]:
-        """Kick of each row of directions on the closed orbit, [row, n], and its slope by the
-        launch, [row, n, n]; both as changes of the launch."""
-        model = self.model
-        x, back = model.path[d.layer], model.inverse[d.layer + 1]
-        bent = (second_derivatives(d.D2) @ x[:, None, :, None])[..., 0]
-        kick = d.D0 + ((d.D1 + bent / 2) @ x[:, :, None])[..., 0]
-        kicks = (back @ kick[:, :, None])[..., 0]
-        return kicks, back @ (d.D1 + bent) @ model.tangents[d.layer]
 
     @cached_property
     def _fed(self) -> tuple[Array, Array, Array, Array]:

@@ -25,10 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array, ComplexArray
+from tmlattice.arrays import Array, ComplexArray, Indices
 from tmlattice.beam.closed_orbit import ResponseModel, feed_down
+from tmlattice.beam.response_derivatives import STILL, kicks_on_orbit
 from tmlattice.beam.rf import NO_RF, Cavities
-from tmlattice.effects.directions import Directions, directions_nearby
+from tmlattice.effects.directions import directions_nearby
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import second_derivatives
 
@@ -43,10 +44,6 @@ NEAR = 1e-9
 GROWTH = 1e-2
 """Distance of an eigenvalue from the unit circle at which the motion counts as unstable: off the
 axis second-order maps are symplectic to their own order only (1e-5 for an orbit of 6 mm)."""
-
-
-STILL = 1e-12
-"""m and rad per unit: smaller kicks are taken as no change of the closed orbit."""
 
 
 @dataclass(frozen=True)
@@ -125,10 +122,10 @@ class StoredBeam:
         )  # fmt: skip
         d = directions_nearby(model.layers, hypotheses)
         if len(d.owner):
-            orbit, w, z = self._kicks(d)
-            found: list[tuple[Any, Any]] = [(moved.orbit, orbit)]
+            w, slopes = kicks_on_orbit(model, d)
+            found: list[tuple[Any, Any]] = [(moved.orbit, self._orbit(d.layer, w))]
             if oscillates:
-                total, seen = self._sources(d, w, z)
+                total, seen = self._sources(d.layer, w, slopes)
                 tunes, mixed = self._perturbed(total)
                 G = self._G.reshape(-1, model.dimension)
                 there = (G @ mixed.transpose(1, 2, 0).reshape(model.dimension, -1)).T
@@ -147,28 +144,21 @@ class StoredBeam:
             moved.modes[owner, m] += (d.E1[row] + bent) @ self._C[at] @ self._U
         return moved
 
-    def _kicks(self, d: Directions) -> tuple[Array, Array, Array]:
-        """For each row of the directions: the closed orbit's change at the monitors, and its kick
-        as a change of the launch, alone and closed, [row, n]."""
-        model, at, n = self.model, self.model.maps.at, self.model.dimension
-        x = model.path[d.layer][..., None]
-        bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
-        kick = d.D0[..., None] + (d.D1 + bent / 2) @ x
-        w = (model.inverse[d.layer + 1] @ kick)[..., 0]
-        z = w @ model.closing.T
-        behind = at[None] > d.layer[:, None]  # the monitor reads behind the layer
-        G = model.reading_slopes.reshape(-1, n)
-        shape = (len(d.layer), len(at), 2)
-        orbit = (z @ G.T).reshape(shape) + behind[..., None] * (w @ G.T).reshape(shape)
-        return orbit, w, z
+    def _orbit(self, k: Indices, w: Array) -> Array:
+        """The closed orbit's change at the monitors, [row, monitor, 2], by kicks w in layers k, as
+        changes of the launch, [row, n]."""
+        model, at = self.model, self.model.maps.at
+        G = model.reading_slopes.reshape(-1, model.dimension).T
+        z, shape = w @ model.closing.T, (len(k), len(at), 2)
+        behind = at[None] > k[:, None]  # the monitor reads behind the layer
+        return np.asarray((z @ G).reshape(shape) + behind[..., None] * (w @ G).reshape(shape))
 
-    def _sources(self, d: Directions, w: Array, z: Array) -> tuple[Array, ComplexArray]:
+    def _sources(self, k: Indices, w: Array, slopes: Array) -> tuple[Array, ComplexArray]:
         """The sources of the whole turn, [row, n, n], and G T U at the monitors, [row, monitor, 2,
-        mode], of the directions and their `_kicks`."""
+        mode], of kicks as in `_orbit` and their slopes by the state before the layer."""
         model, at, U, n = self.model, self.model.maps.at, self._U, self.model.dimension
-        k, rows = d.layer, len(d.layer)
-        bent = (second_derivatives(d.D2) @ model.path[k][:, None, :, None])[..., 0]
-        S = self._back[k + 1] @ (d.D1 + bent) @ self._into[k]
+        rows, z = len(k), w @ model.closing.T
+        S = self._back[k + 1] @ slopes @ self._into[k]
         behind = at[None] > k[:, None]
         shape = (rows, len(at), 2)
         G, bends = self._G.reshape(-1, n), self._bends

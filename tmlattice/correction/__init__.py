@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.arrays import TINY
 from tmlattice.correction.estimate import Estimate, estimate_of
 from tmlattice.correction.first_turn import Threading, estimate_of_turns
 from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_knobs
@@ -113,11 +114,11 @@ def _fields(
     problem, targets = end.problem, end.problem.targets
     now = begin.squares(whole.weights)
     gain = now - (whole if end is begin else end).squares(whole.weights)
-    gain /= max(float(now.mean()), 1e-30)
+    gain /= max(float(now.mean()), TINY)
     refused = _refusal(float(gain.mean()), float(gain.std())) if end is begin else ""
     order = order[:0] if refused else order
     gains = end.gains(order, aversion)
-    gains /= max(float(gains.sum()), 1e-30)
+    gains /= max(float(gains.sum()), TINY)
     settings = [
         Setting(knob, amount, knob.setting(amount), own)
         for knob, amount, own in zip(

@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import erfcx
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import TINY, Array
 from tmlattice.beam.model import Model
 from tmlattice.beam.readouts import APERTURE
 from tmlattice.correction.estimate import Estimate
@@ -202,7 +202,7 @@ def given_losses(ring: Ring, known: DistributedErrors, data: Data) -> Distribute
         for at, own in losses:
             inside = (np.abs(at) < APERTURE).all()  # false for a beam that overflows
             sigma = np.linalg.norm(own, axis=0)
-            distance = (APERTURE - np.abs(at)) / np.maximum(sigma, 1e-30)
+            distance = (APERTURE - np.abs(at)) / np.maximum(sigma, TINY)
             k = int(np.argmin(distance))
             if inside and sigma[k]:
                 nearest.append((float(distance[k]), np.sign(at[k]) or 1.0, own[:, k] / sigma[k]))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from tmlattice.arrays import TINY
 from tmlattice.correction.knobs import Knob
 from tmlattice.correction.snippets import snippet
 from tmlattice.correction.targets import TARGETS
@@ -128,7 +129,7 @@ class Correction(Speaks):
             plane = max((0, 1), key=lambda p: self.before[name][p][0])
             now, then = self.before[name][plane][0], self.after[name][plane][0]
             if then < now:
-                falls.append((now / max(then, 1e-30), self._change(name, plane)))
+                falls.append((now / max(then, TINY), self._change(name, plane)))
         most = sorted(falls, key=lambda fall: -fall[0])[:3]
         devices = f"The device {names} takes" if count == 1 else f"The {count} devices {names} take"
         worse = self.worse

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve, solve_triangular
 
-from tmlattice.arrays import Array, Indices
+from tmlattice.arrays import TINY, Array, Indices
 from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.first_turn import Threading
 from tmlattice.correction.knobs import KINDS, Knob
@@ -320,13 +320,13 @@ class Point:
         amounts, then = self.step(knobs, aversion)
         own = (amounts * self.sizes)[knobs]
         deviation = 2 * float(np.sqrt(own @ self.doubt[np.ix_(knobs, knobs)] @ own))
-        return (self._normal[2] - then) / max(deviation, 1e-300)
+        return (self._normal[2] - then) / max(deviation, TINY)
 
     def aversion(self, knobs: Indices, sigmas: float) -> float:
         """Return the smallest risk aversion whose step gains these standard deviations, to first
         order; infinite where none does."""
         size = float(np.trace(self.doubt[np.ix_(knobs, knobs)]))
-        low, high = np.log(AVERSIONS) + np.log(len(knobs) / max(size, 1e-300))
+        low, high = np.log(AVERSIONS) + np.log(len(knobs) / max(size, TINY))
         if self.sigmas(knobs, float(np.exp(high))) < sigmas:
             return np.inf
         for _ in range(BISECTIONS):
@@ -509,7 +509,7 @@ def safest(begin: Point, end: Point, knobs: Indices) -> tuple[Point, float]:
             found = point, aversion
         if safe and (not aversion or mean <= NEAR * SIGMAS * deviation):
             break
-        beyond = end.sigmas(knobs, aversion) * deviation / max(mean, 1e-30)  # first order
+        beyond = end.sigmas(knobs, aversion) * deviation / max(mean, TINY)  # first order
         aversion = end.aversion(knobs, 1.01 * SIGMAS * float(np.clip(beyond, 0.5, 10.0)))
         if np.isinf(aversion):
             break
