@@ -1,11 +1,14 @@
 """The two engines against each other, and rings whose own elements have errors."""
 
+from pathlib import Path
+
+import machine_data
 import numpy as np
 import pytest
 from places import PLACES
 
 from tests.scenarios import ring_of
-from tmlattice import load_ring
+from tmlattice import TaylorNetwork, load_ring
 from tmlattice.effects import CATALOGUE, Cause, ReadingEffect, apply
 from tmlattice.effects.effect import RingEffect
 from tmlattice.errors import LatticeError
@@ -131,3 +134,30 @@ def test_errors_add_to_causes_and_what_cannot_be_built_is_told(small_ring):
     rolled = small_ring.with_elements({place: small_ring["bend::0"].with_errors(roll=1e-3)})
     with pytest.raises(LatticeError, match="'bend::0' with a roll of its own"):
         AtEngine(rolled)
+
+
+def test_a_first_turn_of_millimetres_follows_at_through_strong_sextupoles():
+    """Second-order maps lack a sextupole's field on its own kick, and octupoles: 0.1 mm here."""
+    with pytest.warns(UserWarning, match="octupoles"):
+        ring = load_ring(Path(machine_data.__file__).parent / "hmba.mat")
+    launches = np.zeros((2, 6))
+    launches[:, :4] = [(1.5e-3, 0, 1e-3, 0), (-1e-3, 1e-4, 5e-4, 2e-4)]
+    causes = [Cause("sextupole_offset_x", e.name, 5e-4) for e in ring.magnets
+              if e.kind == "sextupole"][:9]  # fmt: skip
+    at, ocelot = (Machine(ring, causes, engine=e).beam(launches)[:, 0] for e in ("at", "ocelot"))
+    second = TaylorNetwork.from_ring(apply(ring, causes), 6).readings(launches)
+    lacks = np.sqrt(((at - second) ** 2).mean())
+    assert lacks > 2e-5
+    assert np.sqrt(((at - ocelot) ** 2).mean()) < 0.05 * lacks
+
+
+def test_a_rolled_bend_with_a_gradient_kicks_alike_in_both_engines(small_ring):
+    """The kick is spread over the body, which focuses it: by 3 % here."""
+    bend = small_ring["bend::3"]
+    ring = small_ring.with_changed("bend::3", k1=-0.7 / bend.length**2)
+    causes, launches = [Cause("dipole_roll", "bend::3", 1e-3)], np.zeros((1, 6))
+    at, ocelot = (
+        Machine(ring, causes, engine=e).beam(launches)[0, 0, :, 1] for e in ("at", "ocelot")
+    )
+    assert np.abs(at).max() > 1e-4
+    np.testing.assert_allclose(ocelot, at, atol=2e-3 * np.abs(at).max())

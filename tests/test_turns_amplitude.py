@@ -11,7 +11,9 @@ from numpy.testing import assert_allclose
 from tests.scenarios import ring_of
 from tmlattice import Cause, diagnose, load_ring
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.nonlinear import nonlinear_turn, track
+from tmlattice.beam.layers import Layers
+from tmlattice.beam.nonlinear import third_orders
+from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.newton import fit
@@ -44,8 +46,8 @@ def tracked(ring, launch, turns):
     model = ResponseModel(ring)
     state = model.state.copy()
     state[:4] += launch
-    way = nonlinear_turn(model.layers)
-    return track(state[None], turns, way, model.maps, cavities_of(ring, model))[0]
+    layers = Layers.of(model.maps, third_orders(model.layers))
+    return positions(state[None], turns, layers, cavities_of(ring, model))[0]
 
 
 @pytest.mark.parametrize("launch", [(2e-3, 0, 1e-3, 0), (-1e-3, 1e-4, 2e-3, -1e-4)])

@@ -11,7 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tmlattice.arrays import ComplexArray
 from tmlattice.beam.layers import LayerParts, Layers
+from tmlattice.beam.nonlinear import third_order, third_orders
 from tmlattice.beam.rf import Cavities, Rf, cavities, frequency_of, rf_of
 from tmlattice.effects import (
     Cause,
@@ -99,7 +101,18 @@ class Assembly:
     def layers_with(self, replaced: Mapping[int, Element]) -> dict[int, LayerParts]:
         """Return the layers of these elements."""
         touched = {int(self.layers.layer_of[place]) for place in replaced}
-        return {k: self.layers.layer(k, replaced) for k in sorted(touched)}
+        return {k: self.part(k, replaced) for k in sorted(touched)}
+
+    def part(self, k: int, replaced: Mapping[int, Element]) -> LayerParts:
+        """Return layer k with other elements by index in the ring."""
+        magnet = self.layers.first_element(k + 1) - 1
+        third = third_order(replaced[magnet]) if magnet in replaced else self.third[k]
+        return (*self.layers.layer(k, replaced), third)
+
+    @property
+    def third(self) -> ComplexArray:
+        """The third order of the layers, [step, 4]."""
+        return third_orders(self.layers)
 
     def layers_of(self, cause: Cause) -> tuple[int, ...]:
         """Layers that a cause changes."""
@@ -176,7 +189,7 @@ class Group:
         self.settings = settings
         self.active = active
         self.there = there
-        self.layers = Layers.of(there.maps)
+        self.layers = Layers.of(there.maps, there.third)
         self.replaced = there.set(settings)
         own = there.layers_with(self.replaced)
         self.touched = frozenset(own)
@@ -203,7 +216,7 @@ class Group:
             if part is None:
                 if replaced is None:
                     replaced = self.there.changed(self.settings, causes)
-                part = made[key] = self.there.layers.layer(layer, replaced)
+                part = made[key] = self.there.part(layer, replaced)
             found[layer] = part
         return found
 

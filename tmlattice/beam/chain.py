@@ -269,7 +269,7 @@ class Chain(LayerChain):
 
     def turn(self) -> Layers:
         """A copy of the layers of one turn, with the drift to the ring's end."""
-        return Layers.of(self.maps, self.weights())
+        return Layers.of(self.maps, weights=self.weights())
 
     def _forward(self, size: sweeps.Size, states: Array) -> None:
         W0, W1, W2 = self.weights()
@@ -287,5 +287,5 @@ class Chain(LayerChain):
         tangents = np.empty((*states.shape, n))
         states[0, 0], tangents[0, 0] = x, np.eye(n)
         rf = NO_RF.exits, NO_RF.values
-        kernels.trajectories(0, 1, *turn.W, turn.curved, *rf, states, tangents)
+        kernels.trajectories(0, 1, *turn.W, turn.curved, turn.third, *rf, states, tangents)
         return states[0], tangents[0]

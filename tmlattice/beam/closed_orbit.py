@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.chain import NO_ORBIT, Chain, closing
-from tmlattice.beam.nonlinear import nonlinear_turn
+from tmlattice.beam.layers import Layers
+from tmlattice.beam.nonlinear import third_orders
 from tmlattice.beam.settle import settle
-from tmlattice.beam.sweeps import curved
 from tmlattice.beam.threads import share
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.lattice import Element, Ring
@@ -285,8 +285,7 @@ class ResponseModel:
     def closed_orbits(self, correctors: Sequence[str], kicks: Sequence[float] | Array) -> Array:
         """The closed orbit with one corrector stepped, not linearised, m, [orbit, monitor, 2].
 
-        Sextupole fields are kicks, see `beam.nonlinear`: the third order of a step, which second-
-        order maps have to a few per cent. `response` is the derivative.
+        With the third order of sextupoles, see `beam.nonlinear`. `response` is the derivative.
 
         Args:
             correctors: one for each orbit, also repeatedly.
@@ -297,14 +296,10 @@ class ResponseModel:
             UnstableRingError: no closed orbit is found.
         """
         n, ring = self.dimension, self.ring
-        way = nonlinear_turn(self.layers)
-        magnets = np.arange(len(ring.magnets))
-        last = way.exits[magnets + 1] - 1  # step of each magnet
-        for weights in way.W:
-            weights[last] = self._with_orbit_kicks(magnets, weights[last])
+        turn = Layers.of(self.maps, third_orders(self.layers))
         layer = np.empty(len(correctors), dtype=np.int64)
         replaced = []
-        paths = np.empty((len(correctors), len(way.second) + 1, n))
+        paths = np.empty((len(correctors), turn.steps + 1, n))
         paths[:, 0] = self.state
         for row, (name, kick) in enumerate(zip(correctors, kicks, strict=True)):
             i = ring.index(name)
@@ -317,12 +312,12 @@ class ResponseModel:
         )
         good = np.zeros(len(paths), dtype=bool)
         share(
-            settle, len(paths), *way.W, curved(way.W[2]), way.fields, way.second, last[layer], V0,
-            V1, V2, self._solve, self._turn, 1e-14, paths, good,
+            settle, len(paths), *turn.W, turn.curved, turn.third, layer, V0, V1, V2, self._solve,
+            self._turn, 1e-14, paths, good,
         )  # fmt: skip
         if not good.all():
             raise UnstableRingError(NO_ORBIT)
-        return self._read(paths[:, way.exits[self.maps.at]])
+        return self._read(paths[:, self.maps.at])
 
     def _read(self, here: Array) -> Array:
         """Readings [..., monitor, 2] of the states at the monitors' exits."""

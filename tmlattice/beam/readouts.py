@@ -63,11 +63,10 @@ def positions(launches: Array, turns: int, layers: Layers, cavities: Cavities = 
     bends, bent = layers.curved, curved(layers.R[2])
     alive = np.ones(len(launches), dtype=bool)
     for turn in range(turns):
-        way = len(states), size, *layers.W, bends
-        if len(cavities.exits):
-            sweeps.run(sweeps.accelerate, *way, cavities.exits, cavities.values, states)
-        else:
-            sweeps.run(sweeps.forward, *way, states)
+        sweeps.run(
+            sweeps.turn, len(states), size, *layers.W, bends, layers.third, cavities.exits,
+            cavities.values, states,
+        )  # fmt: skip
         sweeps.run(sweeps.read, len(states), size, *layers.R, bent, at, states, readings)
         beam[:, turn] = sweeps.unpack(readings, len(launches))
         inside = np.abs(states[:, :, 0:3:2]).max(axis=2) < APERTURE  # [block, exit, lane]

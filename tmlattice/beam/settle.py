@@ -2,20 +2,18 @@
 
 import numpy as np
 
-from tmlattice.beam.nonlinear import kick
+from tmlattice.beam.nonlinear import bend_state
 from tmlattice.compiled import jit
 
 
 @jit
 def settle(  # type: ignore[no-untyped-def]
-    first, last, W0, W1, W2, curved, fields, second, layer, V0, V1, V2, solve, turn, tolerance,
-    paths, good,
+    first, last, W0, W1, W2, curved, third, layer, V0, V1, V2, solve, turn, tolerance, paths, good,
 ):  # fmt: skip
     """Find closed orbits by Broyden's method from a given Jacobian.
 
     Args:
-        W0, W1, W2, curved: the ring's maps, the closing drift last, [map, ...].
-        fields, second: kicks behind these, see `NonlinearTurn`, [map, ...].
+        W0, W1, W2, curved, third: see `Layers`.
         layer: the map that is replaced, [orbit].
         V0, V1, V2: its replacement, [orbit, ...].
         solve: the start's change for a mismatch of the turn in the first coordinates, [n, free].
@@ -45,7 +43,7 @@ def settle(  # type: ignore[no-untyped-def]
                                 m += 1
                         total += value * x[i]
                     y[a] = total
-                kick(y, fields[k], second[k])
+                bend_state(third[k], y)
             for i in range(free):
                 miss[i] = paths[orbit, -1, i] - paths[orbit, 0, i] - turn[i]
             if step > 0:  # Broyden's update of the inverse Jacobian

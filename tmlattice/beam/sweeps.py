@@ -19,6 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
+from tmlattice.beam.nonlinear import bend
 from tmlattice.beam.threads import share
 from tmlattice.compiled import jit, jit_sums
 
@@ -104,21 +105,31 @@ def forward(first, last, size, W0, W1, W2, curved, states):  # type: ignore[no-u
 
 
 @jit
-def accelerate(first, last, size, W0, W1, W2, curved, exits, rf, states):  # type: ignore[no-untyped-def]
-    """`forward` with the cavities of `Cavities`, and the slip of the turn at its end."""
+def turn(first, last, size, W0, W1, W2, curved, third, exits, rf, states):  # type: ignore[no-untyped-def]
+    """`forward` with the third order of `Layers`, with the cavities of `Cavities`, and the slip of
+    the turn at its end."""
     lanes = len(size[1])
     for block in range(first, last):
         for k in range(W0.shape[0] + 1):
             if k > 0:
                 x, y = states[block, k - 1], states[block, k]
                 _polynomial(size, k - 1, W0, W1, W2, curved, x, y)
+                high = third[k - 1]
+                if high[0] != 0 or high[2] != 0:
+                    for v in range(lanes):
+                        place, slope = bend(high, y[0, v], y[1, v], y[2, v], y[3, v])
+                        y[0, v] += place.real
+                        y[1, v] += slope.real
+                        y[2, v] += place.imag
+                        y[3, v] += slope.imag
             for c in range(len(exits)):
                 if exits[c] == k:
                     for v in range(lanes):
                         angle = rf[1] - rf[2] * states[block, k, 4, v]
                         states[block, k, 5, v] += rf[0] * math.sin(angle)
-        for v in range(lanes):
-            states[block, -1, 4, v] += rf[3]
+        if len(exits):
+            for v in range(lanes):
+                states[block, -1, 4, v] += rf[3]
 
 
 @jit

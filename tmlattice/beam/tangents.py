@@ -8,14 +8,17 @@ import math
 
 import numpy as np
 
+from tmlattice.beam.nonlinear import bend_tangent
 from tmlattice.compiled import jit
 
 
 @jit
-def trajectories(first, last, W0, W1, W2, curved, exits, rf, states, tangents):  # type: ignore[no-untyped-def]
+def trajectories(  # type: ignore[no-untyped-def]
+    first, last, W0, W1, W2, curved, third, exits, rf, states, tangents
+):
     """Fill states [shot, 1:] and tangents [shot, 1:] from states[:, 0] and tangents[:, 0].
 
-    Step k of a turn applies W0[k], W1[k], W2[k]; `exits` and `rf` are those of `Cavities`.
+    Step k of a turn is that of `Layers`; `exits` and `rf` are those of `Cavities`.
     """
     n, steps = states.shape[2], W0.shape[0]
     for shot in range(first, last):
@@ -48,6 +51,7 @@ def trajectories(first, last, W0, W1, W2, curved, exits, rf, states, tangents): 
                         for j in range(n):
                             after[a, j] += slope * before[i, j]
                 y[a] = total
+            bend_tangent(third[w], y, after)
             if len(exits):
                 _cavities(w + 1, exits, rf, y, after)
                 if w + 1 == steps:

@@ -238,8 +238,8 @@ class TrackedShots:
         for group, shots, rf in self._runs(causes, kicks):
             part, layers = (states[shots], tangents[shots]), group.layers
             share(
-                kernels.trajectories, len(shots), *layers.W, layers.curved, rf.exits, rf.values,
-                *part,
+                kernels.trajectories, len(shots), *layers.W, layers.curved, layers.third, rf.exits,
+                rf.values, *part,
             )  # fmt: skip
             states[shots], tangents[shots] = part = _held(*part)
             R1, R2 = (np.tile(r, (self.turns, *(1,) * (r.ndim - 1))) for r in layers.R[1:])

@@ -161,7 +161,7 @@ def _warn_of_octupoles(sources: Sequence[Any]) -> None:
     if names:
         kinds = list(dict.fromkeys(names))
         warnings.warn(
-            "octupoles are drifts in second-order maps, their fields are not modelled: "
+            "octupoles are drifts in the network and in optics; trajectories have them: "
             f"{first_of(kinds, NAMED)} ({len(names)})",
             stacklevel=4,
         )

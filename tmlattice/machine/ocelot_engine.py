@@ -1,4 +1,4 @@
-"""The machine as the chain of OCELOT's second-order maps, in six coordinates."""
+"""The machine as the chain of OCELOT's maps with the third order of sextupoles, in six coordinates."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from tmlattice.lattice import Ring
 
 
 class OcelotEngine:
-    """A ring with causes, tracked through second-order maps.
+    """A ring with causes, tracked through the maps of the diagnosis.
 
     Over many turns the RF replaces the design orbit's loss: see `beam.rf`."""
 

@@ -259,8 +259,16 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
         first, second = _remembered(
             _halved, element, (energy, n), lambda: _halves(element, energy, n)
         )
-        before, middle, behind = parts_of_errors(element, energy, n)
-        total = composed([*before, first, *middle, second, *behind])
+        ratio_x, ratio_y = _in_the_middle(element)
+        kicks = errors.kick_x * ratio_x, errors.kick_y * ratio_y
+        total = composed([
+            _way(n, errors.ds, energy),
+            _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
+            _shift(n, -errors.dx, -errors.dy), _turn(n, errors.roll), first,
+            _thin(n, *kicks, errors.k1l, errors.k1sl, errors.middle),
+            _loss(n, errors.loss, element), second, _turn(n, -errors.roll),
+            _shift(n, errors.dx, errors.dy), _way(n, -errors.ds, energy),
+        ])  # fmt: skip
     finite = np.isfinite(total.R).all() and np.isfinite(total.B).all()
     if not finite or (total.T is not None and not np.isfinite(total.T).all()):
         raise LatticeError(
@@ -269,33 +277,16 @@ def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
     return total
 
 
-def parts_of_errors(
-    element: Element, energy: float, n: int
-) -> tuple[list[Quadratic | None], list[Quadratic | None], list[Quadratic | None]]:
-    """Return the maps of an element's errors before it, in its middle, and behind it; None is the
-    identity."""
-    own = element.errors
-    kick = own.kick_x * _in_the_middle(element)
-    before = [
-        _way(n, own.ds, energy), _thin(n, k1l=own.entrance_k1l, slopes=own.entrance),
-        _shift(n, -own.dx, -own.dy), _turn(n, own.roll),
-    ]  # fmt: skip
-    middle = [
-        _thin(n, kick, own.kick_y, own.k1l, own.k1sl, own.middle),
-        _loss(n, own.loss, element),
-    ]
-    behind = [_turn(n, -own.roll), _shift(n, own.dx, own.dy), _way(n, -own.ds, energy)]
-    return before, middle, behind
-
-
-def _in_the_middle(element: Element) -> float:
-    """Ratio of one kick in the middle to the equivalent kick in the bend's plane that is spread
-    over the body: rho a (1 - cos angle) and a sin angle are those of 2 a sin(angle / 2), and a
-    gradient k1 in the body focuses like angle^2 / length^2."""
+def _in_the_middle(element: Element) -> tuple[float, float]:
+    """Ratios of a kick in the middle, in and across the bend's plane, to the equivalent one that is
+    spread over the body: rho a (1 - cos angle) and a sin angle are those of 2 a sin(angle / 2), and
+    a gradient k1 in the body focuses like angle^2 / length^2, and across the other way."""
     if element.kind != "bend":
-        return 1.0
-    half = cmath.sqrt(element.angle**2 + element.k1 * element.length**2) / 2
-    return (cmath.sin(half) / half).real if half else 1.0
+        return 1.0, 1.0
+    gradient = element.k1 * element.length**2
+    halves = cmath.sqrt(element.angle**2 + gradient) / 2, cmath.sqrt(-gradient) / 2
+    x, y = ((cmath.sin(half) / half).real if half else 1.0 for half in halves)
+    return x, y
 
 
 def _empty(element: Element) -> Element:
@@ -331,33 +322,6 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
     first = Quadratic(np.zeros(n), root, None)
     second = body.after(Quadratic(np.zeros(n), back, None))
     return composed([*parts[:middle], first]), composed([second, *parts[middle + 1 :]])
-
-
-def halves_without_sextupole(element: Element, energy: float, n: int) -> list[Quadratic]:
-    """Return maps of a magnet without its sextupole field: entrance edge, both halves of the body,
-    exit edge.
-
-    Args:
-        element: with a length; its `errors` are ignored.
-        n: coordinates, 4 or 6.
-    """
-    from tmlattice.lattice.ocelot import SecondTM, TMTypes
-
-    if element.kind == "octupole":
-        atom = _empty(element).source.element
-    else:
-        fields = [name for name in ("k2", "k2s") if hasattr(element.source, name)]
-        atom = element.changed(**dict.fromkeys(fields, 0.0)).source.element
-
-    def edge(where: Any) -> Quadratic:
-        if not atom.has_edge:
-            return identity(n)
-        own = SecondTM.from_element(atom, where, None).get_params(energy)
-        return of_ocelot((own.B.ravel(), *_tilted(own.R, own.T, own.tilt)), n)
-
-    B, R, T, tilt = _body(atom, energy, TMTypes.MAIN, atom.l / 2)
-    half = of_ocelot((B, *_tilted(R, T, tilt)), n)
-    return [edge(TMTypes.ENTRANCE), half, half, edge(TMTypes.EXIT)]
 
 
 def _thin(

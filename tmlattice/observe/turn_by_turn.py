@@ -32,7 +32,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
-from tmlattice.beam.nonlinear import nonlinear_turn, track
+from tmlattice.beam.layers import Layers
+from tmlattice.beam.nonlinear import third_orders
+from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
 from tmlattice.errors import MeasurementError, first_of
@@ -169,11 +171,11 @@ def _tracked(
     """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes and actions [shot,
     mode], and whether the beam survived [shot], for about these amplitudes [shot, mode], of which
     the last is small."""
-    way, maps = nonlinear_turn(beam.model.layers), beam.model.maps
+    layers = Layers.of(beam.model.maps, third_orders(beam.model.layers))
     names = tuple(monitor.name for monitor in ring.monitors)
 
     def seen(launched: ComplexArray, turns: int) -> tuple[ComplexArray, Lines, Flags]:
-        readings = track(beam.launched(launched), turns, way, maps, beam.rf)
+        readings = positions(beam.launched(launched), turns, layers, beam.rf)
         kept: Flags = np.asarray(np.isfinite(readings).reshape(len(readings), -1).all(axis=1))
         readings[~kept] = readings[-1]
         found = lines(TurnByTurn(readings=readings, monitors=names), beam.tunes, at)

@@ -374,7 +374,8 @@ def _suspicion(one: Suspect) -> str:
     what = "no effect of the catalogue" if one.effect is None else words(one.effect)
     if one.measure == "scatter" and one.effect is not None and one.amount is not None:
         amount = amount_text(one.effect, one.amount, one.amount_sigma)
-        return f"{what} {amount}, {one.statistic:.0f} times the scatter of its family"
+        far = f"{one.statistic:.0f} times the scatter of its family from the median"
+        return f"{what} {amount}, {far}"
     if one.kind == "section" and one.effect is not None:
         what += f", {one.element}"
     return f"{what} (statistic {one.statistic:.4g}, threshold {one.threshold:.3g})"
