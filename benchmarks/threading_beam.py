@@ -32,6 +32,8 @@ from tmlattice.machine.simulate import simulate
 
 TURNS, SHOTS = 20, 6
 TARGET = ["first_turn"]
+TRIED = 20
+"""Seeds for each machine that is asked for: where no beam is lost the study ends."""
 
 
 def turns(ring, causes, kicks):
@@ -110,7 +112,8 @@ def main() -> None:
         rows = [json.loads(line) for line in options.out.read_text().splitlines()]
         rows = [row for row in rows if study.items() <= row.items()]
     seed = max((row["seed"] for row in rows), default=options.first_seed - 1)
-    while len(rows) < options.machines:
+    last = options.first_seed + TRIED * options.machines
+    while len(rows) < options.machines and seed < last:
         seed += 1
         begun = time.process_time()
         row = case(ring, seed, options)

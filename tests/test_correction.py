@@ -109,6 +109,18 @@ def test_supplies_gain_as_in_at(small_ring, wrong, quadrupoles):
     np.testing.assert_allclose(reached, after, rtol=0.02)
 
 
+def test_a_resonance_between_the_tunes_is_crossed(small_ring, quadrupoles):
+    """Two supplies hold the tunes below an integer, which is above it in the design."""
+    supplies = [Cause("family_gradient", "QF", -0.05), Cause("family_gradient", "QD", 0.05)]
+    skew = [Cause("skew_gradient", q, 2e-3 * (-1) ** i) for i, q in enumerate(quadrupoles[::5])]
+    machine, design = apply(small_ring, [*skew, *supplies]), optics(small_ring)[2]
+    assert optics(machine)[2][0] - design[0] > 0.5  # of fractions: 0.82 for 1.13
+    found = correct(machine, goal=small_ring, targets=NO_ORBIT)
+    after = set_to(machine, found)
+    np.testing.assert_allclose(optics(after)[2], design, atol=5e-4)
+    assert (beating(after, small_ring) < 2e-3).all()
+
+
 def test_orbit_and_coupling_in_their_units_and_signs(small_ring, quadrupoles):
     """Kicks by displaced magnets, and a skew field: by correctors and a skew quadrupole."""
     causes = [Cause("quadrupole_offset_y", quadrupoles[5], 4e-4),
