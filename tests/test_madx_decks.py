@@ -183,7 +183,7 @@ def test_what_is_passed_over_is_named_in_a_warning(tmp_path, what):
 
 
 @pytest.mark.parametrize(
-    "name", ["plain", "rbend", "sbend poles", "thin bends", "beam beta", "arrow"]
+    "name", ["plain", "rbend", "sbend poles", "sbend k1 k2", "thin bends", "beam beta", "arrow"]
 )
 def test_chromaticity_is_that_of_madx(tmp_path, name):
     """Per energy, as MAD-X has it; both from maps of second order."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
-from tmlattice.lattice.source import copied
 
 TUNES, TUNES_WITH_RF = 1e-4, 1e-3
 """Both codes multiply the same linear maps: from five digits a tune agrees to 1e-5. A magnet that
@@ -223,14 +222,11 @@ def _maps_of_elements(ring: Ring) -> list[list[tuple[Array, Array, Array]]]:
 
 def _parts(element: Element, energy: float) -> list[tuple[Array, Array, Array]]:
     """Of one element; a cavity is a drift in the static optics."""
-    from tmlattice.lattice.ocelot import SecondTM, elements
+    from tmlattice.lattice.ocelot import elements, parts_of_ocelot
 
-    cavity = element.kind == "cavity"
-    own = elements.Drift(l=element.length) if cavity else copied(element.source)
-    if own.supported_tms is None or SecondTM in own.supported_tms:
-        own.set_tm(SecondTM)
-    maps = zip(own.B(energy), own.R(energy), own.T(energy), strict=True)
-    return [(np.ravel(b), np.asarray(r, dtype=float), np.asarray(t)) for b, r, t in maps]
+    source = elements.Drift(l=element.length) if element.kind == "cavity" else element.source
+    maps = parts_of_ocelot(source, energy, False)
+    return [(b, r, 0.5 * (t + t.swapaxes(1, 2))) for b, r, t in maps]
 
 
 def _turn(chain: list[tuple[Array, Array, Array]], launch: Array) -> Array:
