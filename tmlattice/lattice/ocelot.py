@@ -204,9 +204,9 @@ def body_of(
 def second_order(length: float, h: float, k1: float, k2: float, energy: float) -> Array:
     """Return T of a magnet's body, [6, 6, 6]: OCELOT's `t_nnn`, with two integrals as in MAD-X.
 
-    OCELOT takes four times the second integral of sin^2(ky s) / ky^2 / 2, a factor of h k1 k2 in the
-    vertical chromaticity, and too little of sx^3 in the integral of the cubed dispersion, a factor
-    of k2 + 2 h k1 in the second order of the momentum compaction.
+    OCELOT takes four times the second integral of sin^2(ky s) / ky^2 / 2, a factor of h k1 k2 in
+    the vertical chromaticity, and too little of sx^3 in the integral of the cubed dispersion, a
+    factor of k2 + 2 h k1 in the second order of the momentum compaction.
 
     Args:
         length: m.
