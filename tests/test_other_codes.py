@@ -226,6 +226,17 @@ def test_fields_that_a_table_lacks_are_named(madx, tmp_path, old, new, drop, mes
         load_ring(path)
 
 
+def test_header_states_the_particle_by_its_name_and_the_energy_by_its_momentum(madx, tmp_path):
+    momentum = float(np.sqrt(madx.energy**2 - madx.mass**2))
+    path = table(madx, tmp_path, ENERGY=None, MASS=None, PARTICLE="PROTON", PC=momentum)
+    path.write_text(path.read_text().replace("PARTICLE %le 'PROTON'", 'PARTICLE %06s "PROTON"'))
+    ring = load_ring(path)
+    assert (ring.mass, ring.energy) == pytest.approx((madx.mass, madx.energy))
+    path.write_text(path.read_text().replace("PROTON", "PB54"))
+    with pytest.raises(LatticeError, match="particle 'pb54' without a MASS"):
+        load_ring(path)
+
+
 def test_tables_that_say_too_little(madx, tmp_path):
     with pytest.raises(LatticeError, match=r"no column L; write the table with .*k1l"):
         load_ring(table(madx, tmp_path, drop=("L",)))

@@ -16,8 +16,9 @@ from typing import Any
 
 from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.lines import with_gaps
+from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.parts import MODELLED, Part, Report, ring_of_parts
-from tmlattice.lattice.ring import ELECTRON_GEV, Ring
+from tmlattice.lattice.ring import Ring
 from tmlattice.lattice.stated import Stated, contradiction, curvatures
 
 NEEDED = ("NAME", "KEYWORD", "S", "L")
@@ -43,7 +44,7 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     Args:
         path: of the file.
         name: of the ring.
-        energy: GeV; else the header's ENERGY, of its particle of rest energy MASS.
+        energy: GeV; else that of the header, by its ENERGY, PC or GAMMA.
 
     Raises:
         LatticeError: a column is missing, elements overlap, an element that a table does not
@@ -71,12 +72,16 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
             "flag=twiss, column=name,keyword,s,l,angle,k0l,k1l,k2l,k0sl,k1sl,tilt,e1,e2,lrad"
         )
     header = {str(k).upper(): v for k, v in table.headers.items()}
-    if energy is None:
-        energy = _number(header, "ENERGY")
-    if energy is None:
+    numbers = {k: _number(header, k.upper()) for k in ("mass", "charge", "energy", "pc", "gamma")}
+    beam = Beam({k: v for k, v in numbers.items() if v})
+    if "PARTICLE" in header and "mass" not in beam.given:
+        beam.given["particle"] = str(header["PARTICLE"]).strip()
+    if energy is None and not beam.has_energy:
         raise LatticeError(f"'{path}' states no ENERGY; give energy= (GeV)")
-    mass = _number(header, "MASS") or ELECTRON_GEV
-    charge = _number(header, "CHARGE") or 1.0
+    try:
+        mass, charge, energy = beam.mass, beam.charge, beam.energy if energy is None else energy
+    except LatticeError as error:
+        raise LatticeError(f"'{path}': {error}") from error
     rows: list[Row] = table.to_dict("records")
     if _number(header, "BV_FLAG") == -1:  # all but faces and rotations are of the reversed fields
         rows = [
