@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tfs
 from ocelot.cpbd.elements import Solenoid
 
 from tmlattice import load_ring
@@ -14,7 +15,8 @@ from tmlattice.errors import LatticeError
 from tmlattice.maps import ring_matrix
 from tmlattice.optics import closed_orbit, off_momentum, twiss
 
-DECKS = json.loads((Path(__file__).parent / "lattices" / "madx_decks.json").read_text())["decks"]
+FIELD = json.loads((Path(__file__).parent / "lattices" / "madx_decks.json").read_text())
+DECKS = FIELD["decks"]
 
 
 def read(folder, text, **options):
@@ -45,6 +47,33 @@ def test_deck_is_the_ring_that_madx_tracks(tmp_path, name):
 
 
 PLAIN = DECKS["plain"]["text"]
+
+
+REFUSED_TABLES = {
+    "kick next to hkick": "its closed orbit is .* mm at most, the table has .* mm",
+    "thin solenoid": "has the SOLENOID 'xx', whose numbers a table does not hold",
+}
+
+
+@pytest.mark.parametrize("name", FIELD["tables"])
+def test_table_is_the_ring_that_madx_has_written(tmp_path, name):
+    path = tmp_path / "twiss.tfs"
+    path.write_text(FIELD["tables"][name]["table"])
+    if name in REFUSED_TABLES:
+        with pytest.raises(LatticeError, match=REFUSED_TABLES[name]):
+            load_ring(path)
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ring = load_ring(path)
+    table = tfs.read(str(path))
+    start, header = table.iloc[0], table.headers
+    tunes = twiss(Chain.from_ring(ring)).total_tunes
+    orbit = max(header["XCOMAX"], header["YCOMAX"])
+    np.testing.assert_allclose(tunes, [header["Q1"], header["Q2"]], rtol=0, atol=2e-6 + 0.1 * orbit)
+    found = off_momentum(Chain.from_ring(ring, 6), ring.length).dispersion[0]
+    stated = [start.get(column, 0.0) for column in ("DX", "DY")]
+    np.testing.assert_allclose(found, stated, rtol=0, atol=1e-5 + 10 * orbit)
 
 
 def with_element(element):
@@ -183,7 +212,7 @@ def test_what_is_passed_over_is_named_in_a_warning(tmp_path, what):
 
 
 @pytest.mark.parametrize(
-    "name", ["plain", "rbend", "sbend poles", "thin bends", "beam beta", "arrow"]
+    "name", ["plain", "rbend", "sbend poles", "sbend k1 k2", "thin bends", "beam beta", "arrow"]
 )
 def test_chromaticity_is_that_of_madx(tmp_path, name):
     """Per energy, as MAD-X has it; both from maps of second order."""

@@ -216,13 +216,24 @@ def test_table_off_momentum_is_of_the_same_ring(madx, tmp_path):
     [
         ('"QUADRUPOLE"', '"SOLENOID"', (), "SOLENOID 'QF' and no column KS or KSI"),
         ('"QF"', '"QF"', ("K1L",), "QUADRUPOLE 'QF' and no column K1L"),
-        ('"MONITOR"', '"DIPEDGE"', (), "DIPEDGE 'm1', whose numbers a table does not hold"),
+        ('"MONITOR"', '"DIPEDGE"', (), "DIPEDGE 'M1' and no column H1"),
     ],
 )
 def test_fields_that_a_table_lacks_are_named(madx, tmp_path, old, new, drop, message):
     path = table(madx, tmp_path, drop=drop)
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(LatticeError, match=message):
+        load_ring(path)
+
+
+def test_header_states_the_particle_by_its_name_and_the_energy_by_its_momentum(madx, tmp_path):
+    momentum = float(np.sqrt(madx.energy**2 - madx.mass**2))
+    path = table(madx, tmp_path, ENERGY=None, MASS=None, PARTICLE="PROTON", PC=momentum)
+    path.write_text(path.read_text().replace("PARTICLE %le 'PROTON'", 'PARTICLE %06s "PROTON"'))
+    ring = load_ring(path)
+    assert (ring.mass, ring.energy) == pytest.approx((madx.mass, madx.energy))
+    path.write_text(path.read_text().replace("PROTON", "PB54"))
+    with pytest.raises(LatticeError, match="particle 'pb54' without a MASS"):
         load_ring(path)
 
 
@@ -333,8 +344,11 @@ def test_line_of_elegant(tmp_path):
 def test_orbit_that_nothing_in_a_table_makes_is_a_contradiction(madx, tmp_path):
     """Misaligned magnets bend the orbit, and no column of a table has them."""
     straight = load_ring(table(madx, tmp_path))
+    path = table(madx, tmp_path, XCOMAX=6e-5)
+    assert load_ring(path).elements == straight.elements  # its correctors make this orbit
     path = table(madx, tmp_path, XCOMAX=1e-3)
-    assert load_ring(path).elements == straight.elements  # its correctors may make the orbit
+    with pytest.raises(LatticeError, match=r"orbit is 0.0612 mm at most, the table has 1 mm"):
+        load_ring(path)
     path.write_text(path.read_text().replace("1e-05", "0.0"))
     with pytest.raises(
         LatticeError, match="nothing in it bends the orbit, the table has one of 1 mm"

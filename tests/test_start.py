@@ -336,12 +336,11 @@ def test_an_entry_of_another_content_is_made_anew(kept):
     [
         lambda e, t: e.Quadrupole(l=0.4, k1=0.9, tilt=t),
         lambda e, t: e.Sextupole(l=0.2, k2=12.0, tilt=t),
-        lambda e, t: e.SBend(l=1.2, angle=0.2, e1=0.1, e2=0.1, k1=0.1, tilt=t),
+        lambda e, t: e.SBend(l=1.2, angle=0.2, e1=0.1, e2=0.1, tilt=t),
     ],
 )
 def test_tilted_maps_vs_ocelots_own_rotation(make, tilt):
-    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
-    from tmlattice.maps.quadratic import parts_of_ocelot
+    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements, parts_of_ocelot
 
     source = make(elements, tilt)
     ours = parts_of_ocelot(source, 3.0, split=False)

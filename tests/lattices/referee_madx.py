@@ -1,11 +1,13 @@
-"""MAD-X's own figures of small decks, one statement or attribute each, for test_madx_decks.py.
+"""MAD-X's own figures and tables of small decks, one statement or attribute each.
 
     pip install cpymad
     python tests/lattices/referee_madx.py        # writes the figures into madx_decks.json
 
 The file beside this one holds each deck's text, MAD-X's tunes, chromaticities, length, momentum
 compaction, orbit at the start, and the beam, and the version of MAD-X. A new deck is a name with a
-`text`, most often that of "plain" with one thing changed: the script adds the figures.
+`text`, most often that of "plain" with one thing changed: the script adds the figures. Under
+`tables` stand decks of which the script adds a TWISS table, without blanks and columns of zeros.
+test_madx_decks.py reads both.
 """
 
 import json
@@ -34,6 +36,32 @@ def figures(text):
     return own, version
 
 
+COLUMNS = ("name,keyword,s,l,angle,k0l,k0sl,k1l,k1sl,k2l,k2sl,e1,e2,h1,h2,hgap,fint,fintx,tilt,"
+           "hkick,vkick,lrad,ks,ksi,x,y,dx,dy")  # fmt: skip
+HEADER = ("MASS", "CHARGE", "ENERGY", "BV_FLAG", "LENGTH", "ALFA", "XCOMAX", "YCOMAX", "Q1", "Q2")
+
+
+def table(text):
+    from cpymad.madx import Madx
+
+    with tempfile.TemporaryDirectory() as folder:
+        mad = Madx(stdout=False, cwd=folder)
+        mad.input(text)
+        if "use," not in text:
+            mad.input("use, sequence=ring;")
+        mad.input(f"select, flag=twiss, column={COLUMNS}; twiss, file=twiss.tfs;")
+        lines = [line.split() for line in Path(folder, "twiss.tfs").read_text().splitlines()]
+        mad.exit()
+    header = [line for line in lines if line[0] == "@" and line[1] in HEADER]
+    names, types, *rows = [line for line in lines if line[0] != "@"]
+    needed = ("NAME", "KEYWORD", "S", "L", "ANGLE", "K1L", "K2L")
+    rows = [["", *row] for row in rows]
+    kept = [0] + [k for k, name in enumerate(names)
+                  if name in needed or (k and any(float(row[k]) for row in rows))]  # fmt: skip
+    lines = [*header, *([line[k] for k in kept] for line in (names, types, *rows))]
+    return "\n".join(" ".join(line) for line in lines) + "\n"
+
+
 def main():
     content = json.loads(FILE.read_text())
     for name, deck in content["decks"].items():
@@ -43,6 +71,8 @@ def main():
             print(f"{name}: {type(error).__name__} {error}")
             continue
         content["decks"][name] = {"text": deck["text"], **own}
+    for deck in content["tables"].values():
+        deck["table"] = table(deck["text"])
     FILE.write_text(json.dumps(content, indent=1) + "\n")
     print(f"{len(content['decks'])} decks, {content['version']}")
 

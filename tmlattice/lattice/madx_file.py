@@ -334,6 +334,7 @@ class _Reader:
         self.sequences: dict[str, _Sequence] = {}
         self.lines: dict[str, Items] = {}
         self.macros: dict[str, tuple[list[str], str]] = {}
+        self._with_arguments: dict[str, tuple[list[str], str]] = {}
         self.beams: dict[str, Beam] = {"": Beam({} if energy is None else {"energy": energy})}
         self.order: list[str] = []
         self.used = ""
@@ -466,9 +467,17 @@ class _Reader:
         match = re.fullmatch(r"([\w.$%]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?\s*:\s*([^=].*)", text,
                              re.DOTALL)  # fmt: skip
         if match:
-            if match[2]:
-                raise LatticeError("lines and elements with arguments are not read; write them out")
-            return self._define(unquoted(match[1]).lower(), match[3], statement)
+            name, rest = unquoted(match[1]).lower(), match[3]
+            line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
+            if match[2] and not line:
+                raise LatticeError("an element with arguments is not read; write it out")
+            if line and match[2]:
+                self._with_arguments[name] = (split(match[2][1:-1].lower()), line[1])
+                return None
+            if line:
+                self.lines[name] = items_of(self._written_out(line[1]), _line_parts, _bare)
+                return self._known_as(name)
+            return self._define(name, rest, statement)
         return self._command(text)
 
     def _assign(self, name: str, given: Given, whole: bool) -> None:
@@ -505,11 +514,6 @@ class _Reader:
     _branched = _in_line = False
 
     def _define(self, name: str, rest: str, statement: Statement) -> None:
-        line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
-        if line:
-            self.lines[name] = items_of(line[1], _line_parts, _bare)
-            self._known_as(name)
-            return
         head, *items = split(rest)
         if " " in head:
             head, first = head.split(" ", 1)
@@ -538,6 +542,24 @@ class _Reader:
         definition.length = self._element_length(definition)
         self._place(name, given)
         return None
+
+    def _written_out(self, text: str) -> str:
+        """The text of a line, with the items of lines with arguments in place of their names."""
+
+        def items(match: re.Match[str]) -> str:
+            names, body = self._with_arguments[match[1].lower()]
+            given = split(match[2])
+            if len(given) != len(names):
+                raise LatticeError(f"the line '{plain(match[1], 60)}' has {len(names)} arguments")
+            values = dict(zip(names, given, strict=True))
+            return re.sub(r"[\w.$%]+", lambda m: values.get(m[0].lower(), m[0]), body)
+
+        known = "|".join(map(re.escape, self._with_arguments))
+        call = re.compile(rf"(?<![\w.$%])({known})\s*\(([^()]*)\)", re.IGNORECASE)
+        while known and call.search(text):
+            self.work(len(text))
+            text = call.sub(items, text)
+        return text
 
     def _known_as(self, name: str) -> None:
         if name in self.order:

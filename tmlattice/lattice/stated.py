@@ -12,7 +12,6 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.lattice.ring import NO_ERRORS, Element, Ring
-from tmlattice.lattice.source import copied
 
 TUNES, TUNES_WITH_RF = 1e-4, 1e-3
 """Both codes multiply the same linear maps: from five digits a tune agrees to 1e-5. A magnet that
@@ -25,6 +24,8 @@ LENGTH = 1e-6
 """Relative to the ring's length, in addition to 1 mm."""
 STRAIGHT = 1e-6
 """m; an orbit below it is none."""
+ORBIT = 0.1
+"""Of the largest orbit: positions between elements have another, and so has the third order."""
 STEP = 1e-6
 """Of the relative energy, for a difference: a tune near an integer must not cross it."""
 
@@ -94,10 +95,17 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
             f"nothing in it bends the orbit, the table has one of {1e3 * stated.orbit:.3g} mm: "
             "errors of elements are not in a table"
         )
+    chain = _maps(ring)
+    if stated.orbit > STRAIGHT and all(e.errors == NO_ERRORS for e in ring.elements):
+        largest = _largest_orbit(chain)
+        if abs(largest - stated.orbit) > ORBIT * stated.orbit + STRAIGHT:
+            return (
+                f"its closed orbit is {1e3 * largest:.3g} mm at most, the table has "
+                f"{1e3 * stated.orbit:.3g} mm: errors of elements are not in a table"
+            )
     if stated.tunes is None:
         return None
-    chain = _maps(ring)
-    matrix = _turn(chain, np.zeros(6))
+    matrix, _ = _turn(chain, np.zeros(6))
     tunes = _tunes(matrix[:4, :4])
     if tunes is None:
         return f"its motion is unstable, the header states tunes of {_two(stated.tunes)}"
@@ -125,7 +133,7 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
     shifted = []
     for delta in (STEP, -STEP):
         launch = np.concatenate([dispersion, [0.0, 1.0]]) * delta
-        off = _tunes(_turn(chain, launch)[:4, :4])
+        off = _tunes(_turn(chain, launch)[0][:4, :4])
         if off is None:
             return None
         shifted.append(off)
@@ -144,7 +152,7 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
 def slip(ring: Ring) -> float:
     """How much later a particle of more energy comes round, per turn's length: above transition it
     is positive."""
-    return _off_energy(_turn(_maps(ring), np.zeros(6)), ring.length)[1]
+    return _off_energy(_turn(_maps(ring), np.zeros(6))[0], ring.length)[1]
 
 
 def _off_energy(matrix: Array, length: float) -> tuple[Array, float]:
@@ -223,28 +231,31 @@ def _maps_of_elements(ring: Ring) -> list[list[tuple[Array, Array, Array]]]:
 
 def _parts(element: Element, energy: float) -> list[tuple[Array, Array, Array]]:
     """Of one element; a cavity is a drift in the static optics."""
-    from tmlattice.lattice.ocelot import SecondTM, elements
+    from tmlattice.lattice.ocelot import elements, parts_of_ocelot
 
-    cavity = element.kind == "cavity"
-    own = elements.Drift(l=element.length) if cavity else copied(element.source)
-    if own.supported_tms is None or SecondTM in own.supported_tms:
-        own.set_tm(SecondTM)
-    maps = zip(own.B(energy), own.R(energy), own.T(energy), strict=True)
-    return [(np.ravel(b), np.asarray(r, dtype=float), np.asarray(t)) for b, r, t in maps]
+    source = elements.Drift(l=element.length) if element.kind == "cavity" else element.source
+    maps = parts_of_ocelot(source, energy, False)
+    return [(b, r, 0.5 * (t + t.swapaxes(1, 2))) for b, r, t in maps]
 
 
-def _turn(chain: list[tuple[Array, Array, Array]], launch: Array) -> Array:
-    """The matrix of a turn about the orbit from a launch, [6, 6]."""
-    matrix, state = np.eye(6), launch
-    bent = bool(np.any(launch))
+def _turn(chain: list[tuple[Array, Array, Array]], launch: Array) -> tuple[Array, Array]:
+    """The matrix of a turn about the orbit from a launch, [6, 6], and that orbit, [part + 1, 6]."""
+    matrix, path = np.eye(6), [launch]
     for b, r, t in chain:
-        if not bent:
-            matrix = r @ matrix
-            continue
-        slope = t @ state
+        slope = t @ path[-1]
         matrix = (r + 2 * slope) @ matrix
-        state = b + r @ state + slope @ state
-    return matrix
+        path.append(b + r @ path[-1] + slope @ path[-1])
+    return matrix, np.array(path)
+
+
+def _largest_orbit(chain: list[tuple[Array, Array, Array]]) -> float:
+    """Largest |x| or |y| of the closed orbit at the ends of the parts, m."""
+    launch = path = np.zeros(6)
+    for _ in range(4):  # Newton's steps
+        matrix, path = _turn(chain, launch)
+        missing = (path[-1] - launch)[:4]
+        launch = launch + np.append(np.linalg.solve(np.eye(4) - matrix[:4, :4], missing), [0, 0])
+    return float(np.abs(path[:, [0, 2]]).max())
 
 
 def _tunes(matrix: Array) -> Array | None:

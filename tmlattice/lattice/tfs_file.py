@@ -3,9 +3,10 @@
 Columns that are needed: NAME, KEYWORD, S (at each element's exit, or in its middle), L. Those that
 hold fields are read where they are there: ANGLE, E1, E2, H1, H2, HGAP, FINT, FINTX, TILT; the
 integrated strengths K0L to K3L and K0SL to K3SL; LRAD; KS, KSI; HKICK, VKICK; VOLT (MV), FREQ
-(MHz). What lies between two elements is a drift. Recent versions of MAD-X write an RBEND's E1 and
-E2 with the half angle, earlier ones without: the header's tunes decide. Without the column LRAD
-thin bends have none, as in MAD-X, or the one bending radius that gives the header's tunes.
+(MHz); of a DIPEDGE, H1 is its H. What lies between two elements is a drift. Recent versions of
+MAD-X write an RBEND's E1 and E2 with the half angle, earlier ones without: the header's tunes
+decide. Without the column LRAD thin bends have none, as in MAD-X, or the one bending radius that
+gives the header's tunes.
 """
 
 import math
@@ -15,8 +16,9 @@ from typing import Any
 
 from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.lines import with_gaps
+from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.parts import MODELLED, Part, Report, ring_of_parts
-from tmlattice.lattice.ring import ELECTRON_GEV, Ring
+from tmlattice.lattice.ring import Ring
 from tmlattice.lattice.stated import Stated, contradiction, curvatures
 
 NEEDED = ("NAME", "KEYWORD", "S", "L")
@@ -42,7 +44,7 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
     Args:
         path: of the file.
         name: of the ring.
-        energy: GeV; else the header's ENERGY, of its particle of rest energy MASS.
+        energy: GeV; else that of the header, by its ENERGY, PC or GAMMA.
 
     Raises:
         LatticeError: a column is missing, elements overlap, an element that a table does not
@@ -70,15 +72,22 @@ def read_tfs(path: Path, name: str, energy: float | None = None) -> Ring:
             "flag=twiss, column=name,keyword,s,l,angle,k0l,k1l,k2l,k0sl,k1sl,tilt,e1,e2,lrad"
         )
     header = {str(k).upper(): v for k, v in table.headers.items()}
-    if energy is None:
-        energy = _number(header, "ENERGY")
-    if energy is None:
+    numbers = {k: _number(header, k.upper()) for k in ("mass", "charge", "energy", "pc", "gamma")}
+    beam = Beam({k: v for k, v in numbers.items() if v})
+    if "PARTICLE" in header and "mass" not in beam.given:
+        beam.given["particle"] = str(header["PARTICLE"]).strip()
+    if energy is None and not beam.has_energy:
         raise LatticeError(f"'{path}' states no ENERGY; give energy= (GeV)")
-    mass = _number(header, "MASS") or ELECTRON_GEV
-    charge = _number(header, "CHARGE") or 1.0
+    try:
+        mass, charge, energy = beam.mass, beam.charge, beam.energy if energy is None else energy
+    except LatticeError as error:
+        raise LatticeError(f"'{path}': {error}") from error
     rows: list[Row] = table.to_dict("records")
-    if _number(header, "BV_FLAG") == -1:  # all but the faces are of the reversed fields
-        rows = [row | {e: -row[e] for e in ("E1", "E2") if row.get(e)} for row in rows]
+    if _number(header, "BV_FLAG") == -1:  # all but faces and rotations are of the reversed fields
+        rows = [
+            row | {e: -row[e] for e in _FACES.get(str(row["KEYWORD"]).upper(), ()) if row.get(e)}
+            for row in rows
+        ]
     stated = Stated.of_header(header, rows)
     columns = frozenset(table.columns)
     _check_columns(path, rows, columns)
@@ -135,9 +144,13 @@ def _bends_thinly(row: Row) -> bool:
     return str(row["KEYWORD"]).upper() == "MULTIPOLE" and _first_strength(row) != 0
 
 
+_FACES = {"SBEND": ("E1", "E2"), "RBEND": ("E1", "E2"), "SROTATION": ("ANGLE",)}
+OWN_ORDER = {"quadrupole": 1, "sextupole": 2, "octupole": 3}
+"""The one order of which MAD-X's TWISS takes account in these, if they have a length."""
 NEEDED_BY = {
     "QUADRUPOLE": ("K1L",), "SEXTUPOLE": ("K2L",), "SBEND": ("ANGLE", "K0L"),
     "RBEND": ("ANGLE", "K0L"), "SOLENOID": ("KS", "KSI"), "MULTIPOLE": ("K1L", "K2L"),
+    "DIPEDGE": ("H1",),
 }  # fmt: skip
 """Without any of these columns the elements of a class would be read as drifts."""
 
@@ -163,7 +176,8 @@ def _check_columns(path: Path, rows: list[Row], columns: frozenset[str]) -> None
 def _advice(columns: Any, rows: list[Row]) -> str:
     if any(map(_bends_thinly, rows)) and "LRAD" not in columns:
         return "its thin bends focus by their length, which it does not state: add the column LRAD"
-    known = ("ANGLE", "K0L", "K1L", "K2L", "K0SL", "K1SL", "TILT", "E1", "E2", "FINT", "HGAP")
+    known = ("ANGLE", "K0L", "K1L", "K2L", "K0SL", "K1SL", "K2SL", "TILT", "E1", "E2", "H1", "H2",
+             "FINT", "HGAP", "HKICK", "VKICK")  # fmt: skip
     lacks = [column for column in known if column not in columns]
     rest = f" and the columns {', '.join(lacks)}" if lacks else ""
     return f"write it of the whole ring, with all elements{rest}"
@@ -215,11 +229,15 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
         value = row.get(attribute.upper())
         if value is not None:
             own[attribute] = float(value)
-    if keyword in ("matrix", "dipedge"):
+    thin_solenoid = keyword == "solenoid" and own.get("ksi") and not (length or own.get("ks"))
+    edge = keyword == "dipedge" and any(own.get(k) for k in ("e1", "fint")) and not own.get("h1")
+    if keyword == "matrix" or thin_solenoid or edge:
         raise LatticeError(
             f"'{path}' has the {keyword.upper()} '{plain(name, 60)}', whose numbers a table does "
             "not hold; give the sequence instead"
         )
+    if keyword == "dipedge":  # its H stands in the column H1
+        own["h"] = own["h1"]
     if keyword == "beambeam":  # no column has its charge; the header's tunes have what it does
         own["charge"] = 0.0
         report.left_out("what the BEAMBEAM does", name)
@@ -235,6 +253,13 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
         own["ks"] = own.get("ksi", 0.0) / length
     for attribute, column in STRENGTHS.items():
         values = [float(row.get(column.format(n)) or 0.0) for n in ORDERS]
+        if keyword in OWN_ORDER:
+            acting = [v if n == OWN_ORDER[keyword] and length else 0.0
+                      for n, v in enumerate(values)]  # fmt: skip
+            if acting != values:
+                what = f"fields of the {keyword.upper()} beyond its own (as in MAD-X's TWISS)"
+                report.left_out(what, name)
+            values = acting
         if keyword == "sbend" and attribute == "knl":
             field, values[0] = values[0], 0.0
             if field and "ANGLE" in row:  # the whole field, where it is not that of the angle

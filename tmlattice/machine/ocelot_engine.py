@@ -1,4 +1,4 @@
-"""The machine as the chain of OCELOT's maps with the third order of sextupoles, in six coordinates."""
+"""The machine as the chain of OCELOT's maps, with the third order of sextupoles."""
 
 from collections.abc import Sequence
 from dataclasses import replace

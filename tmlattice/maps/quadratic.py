@@ -5,11 +5,10 @@ each x -> B + R x + x^T T x. The parts are composed to second order.
 """
 
 import cmath
-import copy
 import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,12 +91,6 @@ def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
     return Quadratic(B, R, total(m.T for m in maps))
 
 
-FAINT = 3e-4
-"""rad; below, OCELOT's map of a bend with k2 loses a hundredth of its second order to rounding
-(k2 terms are differences over powers of the curvature; at 1e-5 they are 1000 times too large).
-The sextupole's part is then that of a straight magnet, wrong by the bend's angle at most."""
-
-
 def _on_rows(matrix: Array, T: Array) -> Array:
     """`np.tensordot(matrix, T, 1)` without its checks, which cost more than the product."""
     rows, n = len(T), T.shape[-1]
@@ -109,20 +102,20 @@ def identity(n: int) -> Quadratic:
     return Quadratic(np.zeros(n), np.eye(n), None)
 
 
-Part = tuple[Array, Array, Array]
-
 ASKED = 5_000
 """Elements' parts, and halves, in memory, some 20 MB: a scan needs each in many hypotheses."""
 
-_asked: dict[Hashable, list[Part]] = {}
+_asked: dict[Hashable, list[Weights]] = {}
 _halved: dict[Hashable, tuple["Quadratic", "Quadratic"]] = {}
 
 
-def parts_of(element: Element, energy: float, split: bool) -> list[Part]:
+def parts_of(element: Element, energy: float, split: bool) -> list[Weights]:
     """Return OCELOT's (B [6], R [6, 6], T [6, 6, 6]) for each part of an element; read-only.
 
     With `split` the body is two halves, in the middle of the list.
     """
+    from tmlattice.lattice.ocelot import parts_of_ocelot
+
     return _remembered(
         _asked, element, (energy, split), lambda: parts_of_ocelot(element.source, energy, split)
     )
@@ -141,82 +134,6 @@ def _remembered(
             memory.clear()
         known = memory[physics, how] = made()
     return known
-
-
-def parts_of_ocelot(source: Any, energy: float, split: bool) -> list[Part]:
-    """Return `parts_of` an OCELOT element, not cached."""
-    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
-
-    atom = source.element
-    supported = source.supported_tms  # None: the family declares nothing, and takes any
-    bare = isinstance(source, elements.Matrix)  # of unknown interior
-    body = [(TMTypes.MAIN, atom.l / 2)] * 2 if split and not bare else [(TMTypes.MAIN, None)]
-    edges = [(TMTypes.ENTRANCE, None)], [(TMTypes.EXIT, None)]
-    parts = [*edges[0], *body, *edges[1]] if atom.has_edge else body
-    bends = (elements.Bend, elements.SBend, elements.RBend)
-    faint = isinstance(source, bends) and atom.k2 and abs(atom.angle) < FAINT
-    if faint:
-        atom = copy.copy(atom)
-        atom.k2 = 0.0
-    if supported is None or SecondTM in supported:
-        try:
-            made = {part: _body(atom, energy, *part) for part in parts}  # two halves are equal
-            second = [made[part] for part in parts]
-            if faint:
-                for i, (where, length) in enumerate(parts):
-                    if where is TMTypes.MAIN:
-                        B, R, T, tilt = second[i]
-                        second[i] = B, R, T + _sextupole(source, length, energy), tilt
-            return [(B, *_tilted(R, T, tilt)) for B, R, T, tilt in second]
-        except (AttributeError, NotImplementedError):
-            pass  # a linear element
-    zero = np.zeros((6, 6, 6))
-    linear = zip(source.B(energy), source.R(energy), strict=True)
-    return [(B.ravel(), R, zero) for B, R in linear]
-
-
-def _body(
-    atom: Any, energy: float, where: Any, length: float | None
-) -> tuple[Array, Array, Array, float]:
-    """B, R, T and tilt of one part; for a magnet's body as from OCELOT's own call, without its
-    Python loop over the feed-down of zero offsets."""
-    from tmlattice.lattice.ocelot import Magnet, SecondTM, TMTypes, t_nnn
-
-    usual = getattr(type(atom), "create_second_order_main_params", None)
-    whole = Magnet.create_second_order_main_params
-    if where is not TMTypes.MAIN or usual is not whole or atom.dx or atom.dy:
-        own = SecondTM.from_element(atom, where, length).get_params(energy)
-        return own.B.ravel(), own.R, own.T, own.tilt
-    bent = 0.0 if atom.l == 0 else atom.angle / atom.l
-    T = t_nnn(atom.l if length is None else length, bent, atom.k1, atom.k2, energy)
-    return np.zeros(6), atom.create_first_order_main_params(energy, length).R, T, atom.tilt
-
-
-def _sextupole(bend: Any, length: float | None, energy: float) -> Array:
-    """Contribution of k2 to T of a bend's body if it were straight, [6, 6, 6]."""
-    from tmlattice.lattice.ocelot import SecondTM, TMTypes, elements
-
-    with_k2, without = (
-        elements.Quadrupole(l=bend.l, k1=bend.k1, k2=k2).element for k2 in (bend.k2, 0.0)
-    )
-    first, second = (
-        SecondTM.from_element(atom, TMTypes.MAIN, length).get_params(energy).T
-        for atom in (with_k2, without)
-    )
-    return np.asarray(first - second)
-
-
-def _tilted(R: Array, T: Array, tilt: float) -> tuple[Array, Array]:
-    """R and T in axes rotated by the tilt, as OCELOT's `get_rotated_R` and `_T`.
-
-    The latter is compiled at its first call, which takes longer than all maps of a ring.
-    """
-    if tilt == 0:
-        return R, T
-    from tmlattice.lattice.ocelot import rot_mtx
-
-    there, back = rot_mtx(tilt), rot_mtx(-tilt)
-    return back @ R @ there, np.tensordot(back, there.T @ T @ there, 1)
 
 
 def physics_of(element: Element) -> Hashable:
@@ -238,7 +155,7 @@ _PLAIN = frozenset((*_NUMBERS, bool))
 _FOR_PEOPLE = frozenset(("id", "color", "params"))
 
 
-def of_ocelot(part: Part, n: int) -> Quadratic:
+def of_ocelot(part: Weights, n: int) -> Quadratic:
     """Return OCELOT's part in the first n coordinates, its T made symmetric."""
     B, R, T = part
     bent = T[:n, :n, :n]
@@ -366,7 +283,7 @@ def _way(n: int, length: float, energy: float) -> Quadratic | None:
 @functools.cache
 def _metre(n: int, energy: float) -> Quadratic:
     """A drift of 1 m less the identity, which is proportional to the length."""
-    from tmlattice.lattice.ocelot import elements
+    from tmlattice.lattice.ocelot import elements, parts_of_ocelot
 
     parts = parts_of_ocelot(elements.Drift(l=1.0), energy, False)
     return composed(of_ocelot(part, n) for part in parts)
