@@ -16,6 +16,7 @@ from tmlattice.beam.chain import Chain
 from tmlattice.errors import LatticeError
 from tmlattice.lattice import save_ring
 from tmlattice.lattice.at_file import ring_from_at
+from tmlattice.lattice.load import contents
 from tmlattice.maps import ring_matrix
 from tmlattice.maps.magnets import way_map
 from tmlattice.optics import ring_tunes
@@ -163,6 +164,13 @@ ELEMENTS = {
         fringeIntP0=np.array([0.0, 2e-3, 2e-4, 0, 0]),
     ),
     "rolled corrector": at.Corrector("h", 0.0, [2e-4, 0.0]),
+    "corrector whose field is scaled": at.Corrector("h", 0.2, [2e-4, -1e-4], FieldScaling=0.5),
+    "corrector whose pass method is of a solenoid": at.Corrector(
+        "h", 0.5, [2e-4, 0.0], K=0.2, PassMethod="SolenoidLinearPass",
+    ),
+    "element that is a matrix by its pass method": at.Element(
+        "e", PassMethod="Matrix66Pass", M66=at.find_elem_m66(at.Dipole("b", 1.0, 0.3, 0.2)),
+    ),
 }  # fmt: skip
 offset = np.array([2e-4, 0, -3e-4, 0, 0, 0])
 for shifted in ("shifted quadrupole", "shifted sextupole"):
@@ -196,6 +204,61 @@ def test_element_moves_a_particle_as_in_at(what):
     np.testing.assert_allclose(mapped, tracked, rtol=0, atol=tolerance)
     kick = np.abs(tracked - starts).max()
     assert kick > big / 100  # it does something
+
+
+COLUMN = np.array([[1.0], [1.0], [0.0], [1.0], [1.0], [0.0]])
+KICKS = [np.outer(np.linspace(-1, 1, 5), np.linspace(-1, 1, 7)) for _ in range(4)]
+SAVED = [
+    *ELEMENTS.values(),
+    *map(at.Marker, ("it's", "a;b", "a%b", "[q]", "x{1}", "a...b", "é", "", "x\\y", "'\"")),
+    at.Marker("others", Tags=["a", "b"], Own={"a": 1.0}, On=True, Off=False, E=[],
+              Flags=np.array([True, False]), Gain=np.float64(1.5), N=3, Nan=np.nan, Inf=np.inf),
+    at.Octupole("o", 0.2, [0, 0, 0, 0], [0, 0.1, 0, 30.0]),
+    at.Multipole("m", 0.2, [0, 0.02, 0.3], [0, 0.2, 3.0], MaxOrder=1),
+    at.Drift("d", -0.2, RApertures=np.array([-0.1, 0.1, -0.1, 0.1])),
+    at.Collimator("c", 0.2, [-0.1, 0.1, -0.1, 0.1]),
+    at.Aperture("a", [-0.1, 0.1, -0.1, 0.1]),
+    at.Monitor("bpm_1", Offset=[1e-4, 0.0]),
+    at.Wiggler("w", 0.6, 0.1, 1.0),
+    at.Wiggler("w", 0.6, 0.1, 1.0, By=COLUMN.ravel(), Bx=[1, 0.5, 1, 0, 1, 0], Nstep=8),
+    at.Element("w", Length=0.6, PassMethod="GWigSymplecticPass", Lw=0.1, Bmax=1.0, Nstep=10,
+               Nmeth=4, NHharm=1, NVharm=0, By=COLUMN, Bx=np.zeros((6, 0)), Energy=ENERGY * 1e9),
+    at.InsertionDeviceKickMap("id", "IdTablePass", "x.txt", 3.0, 5, 1.0, *KICKS,
+                              np.linspace(-1e-2, 1e-2, 7), np.linspace(-1e-2, 1e-2, 5)),
+    at.Multipole("e", 0.3, [0, 0], [0, 0.3], PassMethod="ExactHamiltonianPass", Type=2,
+                 MultipoleFringe=0),
+    at.Element("t", PassMethod="MatrixTijkPass", M66=np.eye(6), Tijk=np.zeros((6, 6, 6)))
+]  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("suffix", [".mat", ".json", ".m", ".repr"])
+@pytest.mark.parametrize(
+    "properties",
+    [
+        {},
+        {"energy": 1.5e9, "particle": "electron", "name": "a 'b' [c] %"},
+        {"energy": 7e12, "particle": at.Particle("proton"), "harmonic_number": 7, "own": [1, 2]},
+        {"energy": 4e13, "particle": at.Particle("lead", rest_energy=193.7e9, charge=82)},
+    ],
+    ids=["relativistic", "electron", "proton", "ion"],
+)
+def test_a_saved_ring_is_the_ring(tmp_path, suffix, properties):
+    rows = SAVED if suffix not in (".m", ".mat") else SAVED[:-1]  # MATLAB has two axes
+    rows = SAVED[::9] if properties else rows
+    given = {"energy": ENERGY * 1e9, "periodicity": 2, "name": "r", **properties}
+    lattice = at.Lattice([e.deepcopy() for e in rows], **given)
+    path = tmp_path / f"{'ring' if properties else '2024-ring (1)'}{suffix}"
+    at.save_lattice(lattice, path)
+    known, ring = ring_from_at(lattice, "r"), load_ring(path)
+    assert contents(ring)[:2] == contents(known)[:2]
+    for a, b in zip(contents(ring)[2], contents(known)[2], strict=True):
+        assert a[:2] == b[:2]
+        np.testing.assert_allclose(a[2:7], b[2:7], rtol=1e-12, atol=1e-15)
+        assert a[7] == b[7]
+    for a, b in zip(ring.elements, known.elements, strict=True):
+        for one, other in zip(a.source.R(ENERGY), b.source.R(ENERGY), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_matrix_element_keeps_dispersion_in_ocelots_coordinates():
@@ -371,63 +434,6 @@ def test_formats_that_are_not_read_are_named(tmp_path, what, suffix):
         load_ring(write(tmp_path, f"ring{suffix}", FOREIGN[what]), energy=3.0)
 
 
-M_FILE = """function ring = fodo()
-%FODO  as atwritem writes it (2003)
-ring = {...
-atringparam('fodo', 3e9, 8);...
-atquadrupole('QF', 0.4, 1.1, 'StrMPoleSymplectic4Pass', ...
-   'PolynomB', [0, 1.1, 0], 'MaxOrder', 2);... % strong (1.1)
-atdrift('D1', 0.5);
-atsbend('BB', 1.0, pi/8, 0.0, 'BndMPoleSymplectic4Pass');...
-%atdrift('D1', 0.5);...
-atdrift('D1', 0.5);...
-atquadrupole('QD', 0.4, -1.15, 'StrMPoleSymplectic4Pass');...
-atdrift('D1', 0.5);...
-};
-end
-"""
-
-
-def test_function_of_matlab_is_one_list_of_elements_or_refused(tmp_path):
-    ring = load_ring(write(tmp_path, "fodo.m", M_FILE))
-    assert ring.length == pytest.approx(8 * 3.3)
-    assert ring.counts()["quadrupole"] == 16
-    assert (ring["qf::0"].k1, ring["bb::0"].angle) == (1.1, np.pi / 8)
-    code = M_FILE.replace("};\n", "};\nring{2}.Length = 0.5;\n")
-    for text in (code, "QF = quadrupole('QF', 0.4, 1.1, 'QuadLinearPass');\nbuildlat([QF]);\n"):
-        with pytest.raises(LatticeError, match="MATLAB code and not one list of AT's elements"):
-            load_ring(write(tmp_path, "fodo.m", text))
-
-
-@pytest.mark.parametrize(
-    ("statement", "message"),
-    [
-        ("atway('D')", r"AT's reader cannot read atway\('D'\)\)"),
-        ("atsbend('B2', 1.0, pi/8)", r"AT's reader cannot read atsbend\('B2', 1.0, pi/8\)"),
-        ("atsbend('B2', 1.0, pi/8, 'BndMPoleSymplectic4Pass')", "the element 'B2': .*BndMPole"),
-        ("atquadrupole('Q2', 0.4, 1.05^2)", r"may hold: 1.05\^2"),
-        ("atquadrupole('Q2', 0.4, [0 1.1]*2)", r"cannot read atquadrupole\('Q2', 0.4, \[0 1.1\]"),
-    ],
-)
-def test_a_statement_that_at_cannot_read_is_named(tmp_path, statement, message):
-    text = M_FILE.replace("atdrift('D1', 0.5);\na", f"{statement};\na")
-    with pytest.raises(LatticeError, match=message):
-        load_ring(write(tmp_path, "fodo.m", text))
-
-
-def test_element_written_by_its_attributes_alone(tmp_path):
-    """As AT writes elements of no class of its own."""
-    plain = "atbaselem('QF','StrMPoleSymplectic4Pass','Length',0.4,'PolynomB',[0 1.1],"
-    plain += "'PolynomA',[0 0],'MaxOrder',1,'NumIntSteps',40);\n"
-    text = M_FILE[: M_FILE.index("atquadrupole('QF'")] + plain
-    text += "atbaselem('BPM1','IdentityPass','Class','Monitor');\n"
-    text += M_FILE[M_FILE.index("atdrift('D1'") :]
-    ring = load_ring(write(tmp_path, "plain.m", text))
-    known = load_ring(write(tmp_path, "fodo.m", M_FILE))
-    assert ring.counts()["monitor"] == 8
-    np.testing.assert_allclose(ring_matrix(ring), ring_matrix(known), rtol=0, atol=1e-9)
-
-
 def fodo(**changed):
     """A ring of AT with other elements."""
     own = {
@@ -565,6 +571,7 @@ def test_a_strength_beside_polynom_b_is_warned_of(tmp_path, suffix, own):
          "what ExactSectorBendPass has beyond the model"),
         ({"b": at.Dipole("b", 1.0, np.pi / 8, 0.0, PassMethod="StrMPoleSymplectic4Pass")},
          "tracks bends straight ahead"),
+        ({"m": at.EnergyLoss("m", 1e5, Length=0.2)}, "AT's IdentityPass skips the length"),
     ],
 )  # fmt: skip
 def test_what_at_tracks_otherwise_is_warned_of(changed, message):

@@ -125,6 +125,9 @@ while len(head := source.read(8)) == 8:
     try:
         import at, numpy as np
         element, energy = pickle.loads(source.read(struct.unpack("<q", head)[0]))
+        for name, value in vars(element).items():
+            if isinstance(value, np.ndarray):  # compiled pass methods have columns first
+                vars(element)[name] = np.asfortranarray(value)
         beam = {"energy": energy, "particle": at.Particle("relativistic")}
         kick = element.track(np.zeros(6), **beam).reshape(1, 6)
         matrix = at.find_elem_m66(element, XYStep=1e-6, **beam)

@@ -24,7 +24,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,9 +32,9 @@ from tmlattice.arrays import Array
 from tmlattice.errors import LatticeError, first_of, plain
 from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.at_child import check_methods, map_of
+from tmlattice.lattice.at_code import elements_of
 from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with_coils
 from tmlattice.lattice.expressions import STALE, nothing_run
-from tmlattice.lattice.madx_language import split
 from tmlattice.lattice.mat_file import lattice_in, read_mat
 from tmlattice.lattice.parts import Report, assembled
 from tmlattice.lattice.places import Place, corrector, corrector_pair, rotation
@@ -78,6 +77,7 @@ def read_at(
             that AT does not ship.
     """
     import at
+    from at.load.matfile import load_var
 
     options: dict[str, Any] = {}
     if energy is not None:
@@ -85,17 +85,12 @@ def read_at(
     if path.suffix.lower() == ".mat":
         options["use"] = lattice_in(read_mat(path), path, sequence)
     try:
-        with quiet_at() as caught, nothing_run(), TemporaryDirectory() as folder:
-            source = path
+        with quiet_at() as caught, nothing_run():
             if path.suffix.lower() == ".m":
-                source = Path(folder) / path.name
-                source.write_text(_list_of_m(path))
-            lattice = at.load_lattice(str(source), **options)
-            for message in (str(warning.message) for warning in caught):
-                if "skipped" in message or "Unknown class" in message:
-                    place = 2 + int(re.findall(r"\d+", message)[0])
-                    which = source.read_text().splitlines()[place].removesuffix(";...")
-                    raise LatticeError(f"AT's reader cannot read {plain(which, 100)}")
+                elements = elements_of(decoded(content_of(path, LatticeError)), sequence)
+                lattice = load_var(elements, **options)
+            else:
+                lattice = at.load_lattice(str(path), **options)
     except Exception as error:  # each of AT's readers fails in its own way
         message = plain(str(error), 300) or type(error).__name__
         if "energy is not defined" in message:
@@ -121,38 +116,6 @@ def read_at(
 
 _ASSUMED = ("More than 1 RingParam", "Inconsistent energy", "Non-integer number of cells")
 """What warnings of AT's reader begin with that are of the ring."""
-
-
-def _list_of_m(path: Path) -> str:
-    """The list of elements of a MATLAB function, one a line, as AT's reader needs it.
-
-    Raises:
-        LatticeError: the function does anything else, which would have to be run.
-    """
-    lines = decoded(content_of(path, LatticeError)).splitlines()
-    bare = "\n".join(re.sub(r"^((?:[^'%]|'[^']*')*)%.*", r"\1", line) for line in lines)
-    bare = re.sub(r"\.\.\.[^\n]*\n", " ", f"{bare}\n")
-    match = re.fullmatch(
-        r"\s*function\s+\w+\s*=\s*\w+\s*(?:\(\s*\))?\s*\w+\s*=\s*\{(.*?)[\n;]\s*\}\s*;?(.*)",
-        bare, re.DOTALL,
-    )  # fmt: skip
-    items = [] if match is None else [i for i in split(match[1].replace("\n", ";"), ";") if i]
-    end = r"function v=(False|True)\(\)|v=(false|true);|\bend\b|\breturn\b;?"
-    code = match is None or re.sub(end, "", match[2]).strip()
-    if code or not all(re.fullmatch(r"at\w+\(.*\)", item) for item in items):
-        raise LatticeError(
-            "it is MATLAB code and not one list of AT's elements, and is not run; write the ring "
-            "with AT's atwritem, or save it as .mat"
-        )
-    rows = [re.sub(r"\[[^\[\]]*\]", lambda m: m[0].replace(",", " "), item) for item in items]
-    rows = [re.sub(r"^atbaselem(?=\()", f"at{_plain_class(row)}", row) for row in rows]
-    return "\n".join(["function ring = x()", "ring = {...", *(f"{r};..." for r in rows), "};", ""])
-
-
-def _plain_class(row: str) -> str:
-    """The class of an element that is written by its attributes alone."""
-    own = re.search(r"'Class'\s*,\s*'(Monitor|Marker)'", row)
-    return own[1].lower() if own else "element"
 
 
 @contextmanager
@@ -215,7 +178,8 @@ def _at_rest(element: Any) -> Any:
     """The element without radiation and acceleration, whatever its class: by its pass method."""
     method = str(element.PassMethod)
     if any(word in method for word in _LONGITUDINAL):
-        own = "DriftPass" if getattr(element, "Length", 0.0) else "IdentityPass"
+        long = float(getattr(element, "Length", 0.0)) != 0.0
+        own = "DriftPass" if long and "Cavity" in method else "IdentityPass"
     else:
         own = re.sub(r"(Rad|Quant)Pass$", "Pass", method)
         own = own.replace("OldPass", "MPoleSymplectic4Pass")
@@ -279,7 +243,8 @@ def _places(
 
     mad = str(getattr(element, "MADType", "")).upper()
     mad = mad or str(getattr(element, "origin", "")).upper()
-    if isinstance(element, at.Corrector) and not _acts(element):
+    kicks = element.PassMethod.startswith(("Corrector", *_FIELDS)) or passes_freely(element)
+    if isinstance(element, at.Corrector) and kicks and not _acts(element):
         return _correctors(element, family, mad)
     kind, source = _convert(element, family, mad, energy, left_out)
     own: list[Place] = [(family, kind, source)]
@@ -419,7 +384,7 @@ def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     kicks = np.zeros(2)
     given = np.asarray(element.KickAngle, dtype=float).ravel()[:2]
     if element.PassMethod.startswith(("Corrector", *_FIELDS)):  # else it is switched off
-        kicks[: len(given)] = given
+        kicks[: len(given)] = given * float(getattr(element, "FieldScaling", 1.0))
     R1, _ = _rotations(element)
     turned = complex(*kicks) * cmath.exp(1j * math.atan2(R1[0, 2], R1[0, 0]))
     x, y = turned.real, turned.imag

@@ -203,6 +203,9 @@ def of_fields(fields: dict[str, Any], **options: Any) -> Any:
     name = fields.get("FamName")
     known = not isinstance(name, str) or name.casefold() in ("bpm", "monitor")
     given = {key: _as_array(value) for key, value in fields.items()}
+    for key, value in given.items():  # MATLAB has no whole numbers, and pass methods ask for them
+        if isinstance(value, float) and value.is_integer():
+            given[key] = int(value)
     try:
         element = element_from_dict(given | ({} if known else {"FamName": "_"}), **options)
     except Exception as error:  # AT's constructors fail in their own ways
@@ -234,12 +237,17 @@ def _as_array(value: Any) -> Any:
     return value
 
 
+def _array(items: Any, dtype: Any = float, shape: Any = (-1,)) -> Any:
+    """An array as NumPy writes it; only an empty one has its shape."""
+    array = np.array(items)
+    return array if array.size else np.empty(shape if 0 in np.ravel(shape) else 0, dtype)
+
+
 @contextmanager
 def nothing_run() -> Iterator[None]:
-    """AT's readers of `.m` and `.repr` calculate where they would evaluate, and all of them look at
-    sizes first.
+    """AT's reader of `.repr` calculates where it would evaluate; all readers look at sizes first.
 
-    They find `eval` among the names of their own module first; one reading at a time has it there.
+    It finds `eval` among the names of its own module first; one reading at a time has it there.
     """
     import at
     from at.load import json, matfile, reprfile
@@ -247,7 +255,7 @@ def nothing_run() -> Iterator[None]:
     elements = {cls.__name__: _checked(cls) for cls in at.Element.subclasses()}
     make = json.element_from_dict
     numbers = {cls.__name__: cls for cls in (np.float64, np.float32, np.int64, np.int32, np.uint8)}
-    functions = {**elements, **numbers, "Particle": at.Particle, "array": np.array}
+    functions = {**elements, **numbers, "Particle": at.Particle, "array": _array}
     constants = {"pi": math.pi, "nan": math.nan, "NaN": math.nan, "inf": math.inf, "Inf": math.inf}
     names = {**functions, **constants}
     arithmetic = Arithmetic(functions.values())
@@ -259,12 +267,10 @@ def nothing_run() -> Iterator[None]:
             raise LatticeError(f"{error}: {plain(text, 60)}") from error
 
     with _ONE_AT_A_TIME:
-        for module in (matfile, reprfile):
-            module.eval = value
+        reprfile.eval = value
         json.element_from_dict = matfile.element_from_dict = _checked(of_fields)
         try:
             yield
         finally:
             json.element_from_dict = matfile.element_from_dict = make
-            for module in (matfile, reprfile):
-                del module.eval
+            del reprfile.eval
