@@ -159,7 +159,20 @@ def test_code_gives_the_ring_that_it_means(tmp_path, known, what):
     assert contents(read(tmp_path, CODE[what])) == contents(known)
 
 
-CELLS = f"ring = {CELL};"
+def test_a_ring_without_an_energy_takes_the_given_one(tmp_path):
+    code = f"c = {CELL}; ring = [c(2:8); {{atrfcavity('RF')}}];"
+    with pytest.raises(LatticeError, match="states no beam energy; give energy="):
+        read(tmp_path, function("", ring=code))
+    assert read(tmp_path, function("", ring=code), energy=2.0).energy == 2.0
+
+
+def test_cavities_are_set_to_a_voltage_and_a_harmonic(tmp_path):
+    code = f"c = {CELL}; RF = atrfcavity('RF'); ring = atsetcavity([c(1:2); {{RF; RF}}; c(3:8)],"
+    ring = read(tmp_path, function("", ring=f"{code} 5e5, 0, 11);"))
+    cavities = [e.source for e in ring.elements if e.kind == "cavity"]
+    assert len(cavities) == 32
+    assert cavities[0].v == pytest.approx(2.5e-4)  # GV
+    assert cavities[0].freq == pytest.approx(11 * 299792458 / 3.3)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import numpy as np
 
 from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.expressions import MOST_ITEMS
-from tmlattice.lattice.matlab_code import Code
+from tmlattice.lattice.matlab_code import Code, indices
 
 Element = dict[str, Any]
 
@@ -49,16 +49,17 @@ _DEFAULTS = {"Length": 0.0, "BendingAngle": 0.0, "Voltage": 0.0, "Frequency": 1.
              "HarmNumber": 1.0, "PolynomA": 0.0, "PolynomB": 0.0}  # fmt: skip
 
 
-def elements_of(text: str, name: str | None = None) -> list[Element]:
+def elements_of(text: str, name: str | None = None, energy: float | None = None) -> list[Element]:
     """The elements of a ring that is MATLAB code.
 
     Args:
         text: of the file.
         name: the variable that is the ring; None: the function's result, or `THERING` or `RING`,
             or the only one that is a list of elements.
+        energy: eV, of cavities without one; None: that of other elements, or `GLOBVAL.E0`.
 
     Raises:
-        LatticeError: the code is not read, or makes no single ring.
+        LatticeError: the code is not read, makes no single ring, or states no energy.
     """
     if "function v=False()" in text:  # by Python's AT
         text = _PYTHON_TEXT.sub(_matlab_text, _OF_FILE.sub(r"\1lattice", text, count=1))
@@ -75,12 +76,13 @@ def elements_of(text: str, name: str | None = None) -> list[Element]:
         others = f"; lists are {', '.join(lists)}: name one with sequence=" if lists else ""
         raise LatticeError(f"{plain(which, 100)} of AT's elements{plain(others, 200)}")
     stated = variables.get("GLOBVAL")
+    if isinstance(stated, dict) and "E0" in stated and not any("Energy" in e for e in ring):
+        ring = [e | {"Energy": stated["E0"]} for e in ring]
     energies = [e["Energy"] for e in ring if "Energy" in e]
-    if not energies and isinstance(stated, dict) and "E0" in stated:
-        energies = [stated["E0"]]
-        ring = [e | {"Energy": energies[0]} for e in ring]
-    if energies:  # a cavity of Python's AT needs it
-        ring = [{"Energy": energies[0]} | e if "Frequency" in e else e for e in ring]
+    own = energy or next(iter(energies), None)
+    if own is None:
+        raise LatticeError("its energy is not defined")
+    ring = [{"Energy": own} | e if "Frequency" in e else e for e in ring]  # Python's AT needs it
     return [
         {k: np.squeeze(v) if isinstance(v, np.ndarray) else v for k, v in e.items()} for e in ring
     ]
@@ -168,22 +170,23 @@ def _functions() -> dict[str, Callable[..., Any]]:
         **{name: partial(_constant, value) for name, value in constants.items()},
         **numbers,
         **{name: lambda ring, *_: ring for name in radiation},
-        "round": lambda v: np.floor(v + 0.5) if np.ndim(v) else float(math.floor(v + 0.5)),
-        "max": lambda *v: float(np.max(v)), "min": lambda *v: float(np.min(v)),
-        "sum": lambda v: float(np.sum(v)), "zeros": partial(_filled, 0.0),
-        "ones": partial(_filled, 1.0), "eye": lambda n: np.eye(int(n)),
-        "diag": lambda v: np.diag(np.ravel(v)), "cell": lambda *n: [np.zeros((0, 0))] * _product(n),
-        "length": _length, "numel": _length, "isempty": lambda v: _length(v) == 0.0,
+        "round": lambda v: math.copysign(math.floor(abs(v) + 0.5), v),
+        **{name: partial(_of_vector, getattr(np, name)) for name in ("max", "min", "sum")},
+        "zeros": partial(_filled, 0.0), "ones": partial(_filled, 1.0),
+        "eye": lambda n: np.diag(_filled(1.0, n)[0]), "diag": lambda v: np.diag(_vector(v)),
+        "cell": lambda *n: [np.zeros((0, 0))] * _product(n),
+        "length": _length, "isempty": lambda v: _length(v) == 0.0,
+        "numel": lambda v: float(len(v) if isinstance(v, list | str) else np.size(v)),
         "ischar": lambda v: isinstance(v, str), "iscell": lambda v: isinstance(v, list),
         "isstruct": lambda v: isinstance(v, dict), "isfield": lambda s, key: key in s,
         "strcmp": lambda a, b: a == b, "strcmpi": lambda a, b: a.lower() == b.lower(),
-        "strcat": lambda *v: "".join(v), "num2str": lambda v: f"{v:.5g}",
+        "strcat": lambda *v: "".join(v), "num2str": lambda v: f"{v:{'.5g' if v % 1 else '.0f'}}",
         "int2str": lambda v: f"{v:.0f}", "sprintf": _sprintf, "mfilename": lambda: "",
         "struct": _struct, "repmat": _repmat, "vertcat": lambda *v: [e for own in v for e in own],
         **dict.fromkeys(("reverse", "flip", "fliplr", "flipud"), _reverse),
         "horzcat": lambda *v: [e for own in v for e in own], "buildlat": list,
         "findcells": _findcells, "findspos": _findspos, "setcellstruct": _setcellstruct,
-        "atsetfieldvalues": lambda ring, *v: _set(ring, *([np.arange(1, 1 + len(ring)), *v][-3:])),
+        "atsetfieldvalues": _atsetfieldvalues,
         "atSetRingProperties": _properties, "atsetringproperties": _properties,
         "atsetcavity": _atsetcavity,
     }  # fmt: skip
@@ -196,6 +199,18 @@ def _constant(value: Any) -> Any:
 def _by_number(function: Any, *given: Any) -> Any:
     value = function(*given)
     return value if np.ndim(value) else value.item()
+
+
+def _vector(value: Any) -> Any:
+    if min(np.atleast_2d(value).shape) > 1:
+        raise ValueError("a matrix has no order here")
+    _product((float(np.size(value)),))  # as a diagonal
+    return np.ravel(value)
+
+
+def _of_vector(function: Any, *given: Any) -> float:
+    """Of a vector, or of numbers."""
+    return float(function(_vector(given[0]) if len(given) == 1 else [float(v) for v in given]))
 
 
 def _product(counts: tuple[float, ...]) -> int:
@@ -217,7 +232,7 @@ def _length(value: Any) -> float:
 
 
 def _sprintf(form: str, *given: Any) -> str:
-    if re.search(r"%[^%]*?[\d*.]{4}", form):
+    if re.search(r"%[^%a-z]*(\*|\d{4})", form):
         raise ValueError("the form of sprintf is not read")
     return form % tuple(int(v) if isinstance(v, float) and v == int(v) else v for v in given)
 
@@ -238,6 +253,8 @@ def _repmat(value: Any, *counts: Any) -> Any:
         _product((float(len(whole)), float(times)))
         return whole * times
     _product((float(np.size(value)), float(times)))
+    if isinstance(value, str):
+        raise ValueError("texts are not repeated")
     return np.tile(value, [int(n) for n in (counts * 2)[:2]])
 
 
@@ -256,12 +273,14 @@ def _findcells(ring: list[Element], field: str, *values: Any) -> Any:
 
 def _findspos(ring: list[Element], places: Any) -> Any:
     ends = np.cumsum([0.0, *(e.get("Length", 0.0) for e in ring)])
-    found = ends[np.ravel(places).astype(int) - 1]
+    found = ends[indices(places, len(ring))]
     return found[None] if found.size != 1 else float(found[0])
 
 
-def _set(ring: list[Element], places: Any, field: str, values: Any) -> list[Element]:
-    return _setcellstruct(ring, field, places, values)
+def _atsetfieldvalues(ring: list[Element], *given: Any) -> list[Element]:
+    """All elements where places are not given."""
+    *places, field, values = given
+    return _setcellstruct(ring, field, places[0] if places else slice(None), values)
 
 
 def _setcellstruct(
@@ -269,8 +288,8 @@ def _setcellstruct(
 ) -> list[Element]:
     """The ring with a field, or a number of one, of some elements changed."""
     new = list(ring)
-    places = np.ravel(places).astype(int) - 1
-    several = not isinstance(values, str) and np.size(values) == len(places)
+    places = indices(places, len(ring))
+    several = isinstance(values, float | np.ndarray) and np.size(values) == len(places)
     for k, place in enumerate(places):
         value = np.ravel(values)[k].item() if several else values
         if column:
@@ -295,7 +314,7 @@ def _properties(ring: list[Element], *given: Any) -> list[Element]:
 def _atsetcavity(ring: list[Element], voltage: Any, _: Any, harmonic: float) -> list[Element]:
     """The ring with a voltage in all, V, and the frequency of a harmonic."""
     cavities = _findcells(ring, "Frequency")
-    frequency = harmonic * 299792458.0 / _findspos(ring, len(ring) + 1)
+    frequency = harmonic * 299792458.0 / _findspos(ring, len(ring) + 1.0)
     for field, value in (("Voltage", voltage / cavities.size), ("Frequency", frequency),
                          ("HarmNumber", harmonic)):  # fmt: skip
         ring = _setcellstruct(ring, field, cavities, value)

@@ -87,7 +87,8 @@ def read_at(
     try:
         with quiet_at() as caught, nothing_run():
             if path.suffix.lower() == ".m":
-                elements = elements_of(decoded(content_of(path, LatticeError)), sequence)
+                text = decoded(content_of(path, LatticeError))
+                elements = elements_of(text, sequence, options.get("energy"))
                 lattice = load_var(elements, **options)
             else:
                 lattice = at.load_lattice(str(path), **options)

@@ -24,7 +24,7 @@ from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.expressions import MOST_ITEMS, Arithmetic
 
 Scope = dict[str, Any]
-FAILURES = (ValueError, TypeError, LookupError, ArithmeticError)
+FAILURES = (ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
 """Of a statement that cannot be worked out."""
 
 _TOKEN = re.compile(
@@ -467,8 +467,9 @@ class Code(Arithmetic):
             raise ValueError("nothing is divided by a matrix")
         product = kind is ast.MatMult and np.ndim(left) and np.ndim(right)
         self.work(np.size(left) if product else 1)
+        rows, columns = np.maximum(np.atleast_2d(left).shape, np.atleast_2d(right).shape)
+        self._room(int(rows) * int(columns))
         value = left @ right if product else _OPERATIONS[kind](left, right)
-        self._room(np.size(value))
         if np.iscomplexobj(value):
             raise ValueError("a number is complex")
         return _simple(value) if np.ndim(value) else value
@@ -530,21 +531,18 @@ def _part(kind: str, whole: Any, where: list[Any], room: Callable[[int], None]) 
         return whole[where[0]]
     if isinstance(whole, dict):
         whole, kind = [whole], "cell"
-    if isinstance(whole, list | str):
-        place = _only(where)
-        found = [whole[k] for k in _indices(place, len(whole))]
+    place = _only(where)
+    if isinstance(whole, list):
+        found = [whole[k] for k in indices(place, len(whole))]
         room(len(found))
-        if isinstance(whole, str):
-            return "".join(found)
         if kind == "call":
             return found
         return found[0] if not isinstance(place, slice) and np.size(place) == 1 else _Several(found)
-    if kind == "cell":
-        raise ValueError("it is no cell")
-    array = np.atleast_2d(whole)
-    if len(where) == 1:
-        return _simple(array.ravel(order="F")[_indices(where[0], array.size)])
-    return _simple(array[_grid(where, array)])
+    flat = _vector(whole)
+    if kind == "cell" or flat is None:
+        raise ValueError("only cells and vectors have places here")
+    part = flat[indices(place, flat.size)]
+    return _simple(part[:, None] if np.shape(whole)[1:] == (1,) else part)
 
 
 def _changed(
@@ -562,7 +560,7 @@ def _changed(
         return own | {where[0]: _changed(own.get(where[0]), rest, value, room)}
     if isinstance(old, list) or (empty and (kind == "cell" or isinstance(value, list | dict))):
         new = [] if empty else list(old)
-        places = _indices(_only(where), len(new))
+        places = indices(_only(where), len(new))
         room(max([len(new), *places]))
         if kind == "call" and not rest and not _count(value):  # x(2) = [] takes it out
             return [item for k, item in enumerate(new) if k not in set(places)]
@@ -572,23 +570,24 @@ def _changed(
         for place, item in zip(places, values, strict=True):
             new[place] = _changed(new[place], rest, item, room)
         return new
-    if rest or kind == "cell" or isinstance(old, str | dict):
+    flat = np.zeros(0) if empty else _vector(old)
+    if rest or kind == "cell" or flat is None:
         raise ValueError("this part cannot be assigned to")
-    array = np.zeros((1, 0)) if empty else np.array(np.atleast_2d(old), dtype=float)
-    if len(where) == 2:
-        array[_grid(where, array)] = value
-        return _simple(array)
-    flat = array.ravel(order="F")
-    places = _indices(where[0], flat.size)
+    places = indices(_only(where), flat.size)
     room(max(places, default=0))
-    if (more := max(places, default=-1) + 1 - flat.size) > 0:
-        array = np.zeros((1, flat.size + more))
-    flat = np.pad(flat, (0, max(more, 0)))
+    flat = np.pad(flat, (0, max(0, max(places, default=-1) + 1 - flat.size))).astype(float)
     flat[places] = np.ravel(value)
-    return _simple(flat.reshape(array.shape, order="F"))
+    return _simple(flat[:, None] if np.shape(old)[1:] == (1,) else flat)
 
 
-def _indices(place: Any, size: int) -> list[int]:
+def _vector(value: Any) -> Any:
+    """The numbers of one row or column; None: of a matrix, or no numbers."""
+    if isinstance(value, str | list | dict) or min(np.atleast_2d(value).shape) > 1:
+        return None
+    return np.ravel(value)
+
+
+def indices(place: Any, size: int) -> list[int]:
     """Places from 0."""
     if isinstance(place, slice):
         return list(range(size))
@@ -600,16 +599,10 @@ def _indices(place: Any, size: int) -> list[int]:
     return [int(k) - 1 for k in array]
 
 
-def _grid(where: Sequence[Any], array: Any) -> Any:
-    if len(where) != array.ndim:
-        raise ValueError("a matrix has rows and columns")
-    return np.ix_(*(_indices(own, size) for own, size in zip(where, array.shape, strict=True)))
-
-
 def _only(where: list[Any]) -> Any:
     """The place in what has one axis: `(k)`, `(k, 1)` and `(1, k)`."""
     if len(where) not in (1, 2):
-        raise ValueError("a cell has places along one axis")
+        raise ValueError("a place is along one axis")
     one = len(where) == 2 and not isinstance(where[1], slice | str) and np.size(where[1]) == 1
     return where[0] if one and float(where[1]) == 1.0 else where[-1]
 
