@@ -1,10 +1,12 @@
 """AT lattices that are MATLAB code: as AT writes them, and as people do."""
 
+import at
 import numpy as np
 import pytest
 
 from tmlattice import load_ring
 from tmlattice.errors import LatticeError
+from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.lattice.load import contents
 from tmlattice.maps import ring_matrix
 
@@ -159,6 +161,42 @@ def test_code_gives_the_ring_that_it_means(tmp_path, known, what):
     assert contents(read(tmp_path, CODE[what])) == contents(known)
 
 
+STR, BND = "'StrMPoleSymplectic4Pass'", "'BndMPoleSymplectic4Pass'"
+EDGES = {"EntranceAngle": 0.05, "ExitAngle": 0.05}
+SKEW, MULTIPOLE = at.Multipole("e", 0.2, [0, 0.3], [0, 0]), at.Multipole("e", 0.2, [0, 3], [0, 2])
+MADE = {
+    "atskewquad('E', 0.2, 0.3)": SKEW,
+    f"skewquad('E', 0.2, 0.3, {STR})": SKEW,
+    "atrbend('E', 1, 0.1, -0.4)": at.Dipole("e", 1.0, 0.1, -0.4, **EDGES),
+    f"sbend('E', 1, 0.1, 0.05, 0.05, -0.4, {BND})": at.Dipole("e", 1.0, 0.1, -0.4, **EDGES),
+    f"sextupole('E', 0.2, 12, {STR})": at.Sextupole("e", 0.2, 12.0),
+    f"multipole('E', 0.2, [0 3], [0 2], {STR})": MULTIPOLE,
+    f"atmultipole('E', 0.2, [0 3], [0 2], {STR})": MULTIPOLE,
+    "atthinmultipole('E', [0 0.1], [0; 0.2])": at.ThinMultipole("e", [0, 0.1], [0, 0.2]),
+    "atcorrector('HCM', 0.1, [1e-4 0])": at.Corrector("hcm", 0.1, [1e-4, 0.0]),
+    "corrector('HCM', 0.1, [0 0], 'CorrectorPass')": at.Corrector("hcm", 0.1, [0.0, 0.0]),
+    "solenoid('E', 0.3, 0.2, 'SolenoidLinearPass')": at.Element(
+        "e", Length=0.3, K=0.2, PassMethod="SolenoidLinearPass"
+    ),
+    "aperture('E', [-1 1 -1 1], 'AperturePass')": at.Aperture("e", [-1, 1, -1, 1]),
+    "rfcavity('E', 0.2, 1e6, 5e8, 100, 'CavityPass')": at.RFCavity("e", 0.2, 1e6, 5e8, 100, 3e9),
+    "atM66('E', diag([2 1/2 2 0.5 1 1]))": at.M66("e", np.diag([2, 0.5, 2, 0.5, 1, 1])),
+    "atwiggler('E', 0.6, 0.1, 1, 3e9)": at.Wiggler("e", 0.6, 0.1, 1.0),
+    f"atbaselem('E', {STR}, 'Length', 0.2, 'PolynomA', [0 3], 'PolynomB', [0 2])": MULTIPOLE,
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*left out of the model")
+@pytest.mark.parametrize("call", MADE)
+def test_an_element_is_made_as_by_at(tmp_path, call):
+    ring = read(tmp_path, function(f"ring = {{R; {call}}};", ring=""))
+    known = ring_from_at(at.Lattice([MADE[call].deepcopy()], energy=3e9, periodicity=16), "x")
+    assert contents(ring) == contents(known)
+    for one, other in zip(ring.elements, known.elements, strict=True):
+        for r, other_r in zip(one.source.R(3.0), other.source.R(3.0), strict=True):
+            np.testing.assert_allclose(r, other_r, rtol=0, atol=1e-12)
+
+
 def test_a_ring_without_an_energy_takes_the_given_one(tmp_path):
     code = f"c = {CELL}; ring = [c(2:8); {{atrfcavity('RF')}}];"
     with pytest.raises(LatticeError, match="states no beam energy; give energy="):
@@ -184,6 +222,7 @@ def test_cavities_are_set_to_a_voltage_and_a_harmonic(tmp_path):
         ("QD = atquadrupole('Q2', 0.4, [0 1.1]*2);", "line 8, .*the K of 'Q2' is no number"),
         ("QD = atquadrupole('Q2', 0.4, 1, 'PolynomB', [0 2]);", "K 1 and in PolynomB 2; MATLAB's"),
         ("QD = atdrift('D', 0.4, 3, 'K');", "'atdrift' has the arguments Length, PassMethod, then"),
+        ("k = 2^3^2; QD.Length = k;", "line 8, .*a power of a power needs brackets"),
         ("QD = rbend3('B', 1, 0.1, 0, 0, 0, 0.1, 1, 1, 'BendLinearPass');", "'rbend3' is no var"),
         ("QD.Length = missing(3); D1 = D1;", "line 8, 'QD.Length = missing.*: 'missing' is no var"),
         ("QD = D1(;", "line 8, 'QD = D1.;': a bracket is left open"),

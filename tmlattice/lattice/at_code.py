@@ -126,6 +126,12 @@ def _element(function: str, name: Any = "", *given: Any) -> Element:
         half = fields.get("BendingAngle", 0.0) / 2
         missing |= {"EntranceAngle": half, "ExitAngle": half}
     fields = {"FamName": name, "Class": kind} | missing | fields
+    if function == "atbaselem" and {"PolynomA", "PolynomB"} & fields.keys():
+        orders = max(np.size(fields.get(f"Polynom{k}", 0.0)) for k in "AB")
+        for k in ("PolynomA", "PolynomB"):
+            given_orders = np.ravel(fields.get(k, 0.0))
+            fields[k] = np.pad(given_orders, (0, orders - len(given_orders)))
+        fields = {"MaxOrder": orders - 1.0, "NumIntSteps": 10.0} | fields
     for key, polynom, order in (("K", "B", 1), ("H", "B", 2), ("Qs", "A", 1)):
         if key in places and kind != "Element":
             _strength(fields, key, f"Polynom{polynom}", order)

@@ -453,6 +453,8 @@ class Code(Arithmetic):
             case ast.BoolOp(op=op, values=values):
                 each_true = (_is_true(self._of(value, names)) for value in values)
                 return all(each_true) if isinstance(op, ast.And) else any(each_true)
+            case ast.BinOp(op=ast.Pow(), right=ast.BinOp(op=ast.Pow())):
+                raise ValueError("a power of a power needs brackets")  # MATLAB's order is another
             case ast.BinOp(op=op, left=left, right=right):
                 return self._two(type(op), self._of(left, names), self._of(right, names))
             case ast.Compare(ops=[op], left=left, comparators=[right]):
