@@ -571,7 +571,8 @@ def test_a_strength_beside_polynom_b_is_warned_of(tmp_path, suffix, own):
          "what ExactSectorBendPass has beyond the model"),
         ({"b": at.Dipole("b", 1.0, np.pi / 8, 0.0, PassMethod="StrMPoleSymplectic4Pass")},
          "tracks bends straight ahead"),
-        ({"m": at.EnergyLoss("m", 1e5, Length=0.2)}, "AT's IdentityPass skips the length"),
+        ({"m": at.EnergyLoss("m", 1e5, Length=0.2, PassMethod="EnergyLossRadPass")},
+         "AT's IdentityPass skips the length"),
     ],
 )  # fmt: skip
 def test_what_at_tracks_otherwise_is_warned_of(changed, message):
