@@ -250,7 +250,7 @@ class RingTunes:
         """
         turn, last = np.eye(4), 0
         changed = self.assembly.layers_with(self.assembly.changed({}, causes))
-        for k, ((_, matrix, _), _) in sorted(changed.items()):
+        for k, ((_, matrix, _), *_) in sorted(changed.items()):
             turn = matrix[:4, :4] @ self._between(last, k) @ turn
             last = k + 1
         return matrix_tunes(self._between(last, len(self._upto) - 1) @ turn)
