@@ -189,6 +189,11 @@ WARNED = {
 }
 
 
+@pytest.mark.parametrize("name", ["sequence as SAVE writes it", "list of a later element"])
+def test_what_has_no_effect_is_not_warned_of(tmp_path, name):
+    strictly(tmp_path, DECKS[name]["text"].encode())
+
+
 def test_expressions_of_the_beam_use_the_energy_that_is_given(tmp_path):
     text = PLAIN.split("\n", 1)[1].replace("k1=1.1", "k1:=11/beam->brho")
     ring = read(tmp_path, text, energy=3.0)

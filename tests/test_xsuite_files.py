@@ -51,6 +51,17 @@ def test_few_kicks_of_a_bend_are_named(tmp_path, model):
         load(line_of(deck), tmp_path)
 
 
+def test_kicks_of_a_strong_gradient_in_a_weak_bend_are_named(tmp_path):
+    """Xsuite has as many kicks as the angle asks for, 7 for each 0.022 rad."""
+    deck = {"elements": {"bb": {**REFEREE["elements"]["bb"], "k1": 0.4}}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(line_of(deck), tmp_path)
+    deck["elements"]["bb"]["angle"] = 0.01
+    with pytest.warns(UserWarning, match=r"the finite number of kicks of bb \(1\)"):
+        load(line_of(deck), tmp_path)
+
+
 @pytest.mark.parametrize("name", DECKS)
 def test_class_has_xtracks_figures(tmp_path, name):
     deck = DECKS[name]

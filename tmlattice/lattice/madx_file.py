@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,11 @@ from tmlattice.lattice.madx_language import (
     Undetermined,
     attributes,
     compiled,
+    evaluated,
     holds,
     split,
     statements,
     unquoted,
-    values,
 )
 from tmlattice.lattice.parts import (
     ACTING,
@@ -578,16 +578,9 @@ class _Reader:
                     f"{attribute.upper()} of '{definition.name}' has no value: 0, as in MAD-X"
                 )
             elif value.deferred:
-                definition.values[attribute] = self._deferred(value)
+                definition.values[attribute] = evaluated(value)
             else:
-                definition.values[attribute] = values(value, self)
-
-    def _deferred(self, given: Given) -> Callable[[Any], Any]:
-        text = given.text.strip()
-        if text[:1] in "{(":
-            values(given, self)  # what is no list of expressions is refused here
-            return lambda names: values(given, names)
-        return compiled(text)
+                definition.values[attribute] = evaluated(value)(self)
 
     def _set(self, owner: str, given: dict[str, Given]) -> None:
         """`owner->attribute = value`, and an element that is named again with other values."""
@@ -753,12 +746,17 @@ class _Reader:
         """Place what is defined already: of its attributes MAD-X changes shifts, at this place."""
         if "at" not in given:
             raise LatticeError(f"'{plain(name, 60)}' has no AT in its sequence")
-        moved = {k: v for k, v in given.items() if k in _SHIFTS and name in self.elements}
-        if given.keys() - moved.keys() - (WORDS | NO_EFFECT - {"l"}):
-            self.report.left_out("attributes given in the sequence (as in MAD-X)", name)
+        known = self.elements.get(name)
         own = _Definition(name, "", {}, "")
-        self._update(own, moved)
-        self._place(name, given, own.values)
+        self._update(own, {k: v for k, v in given.items() if k not in WORDS | NO_EFFECT - {"l"}})
+        moved = {k: v for k, v in own.values.items() if k in _SHIFTS} if known else {}
+        unknown = set(self.undefined)
+        # SAVE writes there what it has written in the definition
+        if any(not known or self._value(own, key) != self._value(known, key)
+               for key in own.values.keys() - moved.keys()):  # fmt: skip
+            self.report.left_out("attributes given in the sequence (as in MAD-X)", name)
+        self.undefined = unknown  # a value may come later
+        self._place(name, given, moved)
 
     def _length(self, name: str, nested: bool = False) -> float:
         """Of an element (along the arc) or a sequence, m."""

@@ -372,16 +372,19 @@ def unquoted(text: str) -> str:
     return bare
 
 
-def values(given: Given, names: Names) -> float | tuple[float, ...]:
+def evaluated(given: Given) -> Callable[[Names], float | tuple[float, ...]]:
     """What an attribute is worth: a number, or the numbers of `{a, b}`."""
     text = given.text.strip()
+    items = None
     if text[:1] == "{" and text[-1:] == "}":
-        return tuple(compiled(item)(names) for item in split(text[1:-1]) if item)
-    if text[:1] == "(" and len(split(text)) == 1 and text[-1:] == ")":
-        inner = split(text[1:-1]) if _encloses(text) else [text]
-        if len(inner) > 1:
-            return tuple(compiled(item)(names) for item in inner)
-    return compiled(text)(names)
+        items = [item for item in split(text[1:-1]) if item]
+    elif text[:1] == "(" and len(split(text)) == 1 and text[-1:] == ")" and _encloses(text):
+        items = split(text[1:-1])
+        items = items if len(items) > 1 else None
+    if items is None:
+        return compiled(text)
+    numbers = [compiled(item) for item in items]
+    return lambda names: tuple(number(names) for number in numbers)
 
 
 def _encloses(text: str) -> bool:
