@@ -27,7 +27,7 @@ endsequence;
 CELL = {"m1": 0.1, "qf": 0.5, "sf": 1.0, "ch": 1.3, "b_1": 2.2, "cv": 3.2, "qd": 4.5, "sd": 5.0,
         "b_2": 6.2, "qs": 7.0, "ck": 7.3, "rf": 7.9}  # fmt: skip
 COLUMNS = ["NAME", "KEYWORD", "S", "L", "ANGLE", "K0L", "K0SL", "K1L", "K1SL", "K2L", "TILT",
-           "E1", "E2", "HGAP", "FINT", "HKICK", "VKICK", "VOLT", "FREQ"]  # fmt: skip
+           "E1", "E2", "HGAP", "FINT", "WX", "HKICK", "VKICK", "VOLT", "FREQ"]  # fmt: skip
 KEYWORDS = {"bend": "SBEND", "hcorrector": "HKICKER", "vcorrector": "VKICKER",
             "cavity": "RFCAVITY"}  # fmt: skip
 
@@ -179,8 +179,10 @@ def test_header_that_states_other_figures_is_a_contradiction(madx, tmp_path):
 
 
 def test_figures_that_other_models_and_cavities_change_are_no_contradiction(madx, tmp_path):
-    """PTC may leave out products of curvature and gradient; with RF on MAD-X's ALFA is another."""
+    """PTC may leave out products of curvature and gradient; with RF on MAD-X's ALFA is another, and
+    so may be its chromaticity, by CHROM."""
     right = stated(madx)
+    load_ring(table(madx, tmp_path, drop=("WX",), **{**right, "DQ2": right["DQ2"] + 6.0}))
     path = table(madx, tmp_path, **{**right, "DQ2": right["DQ2"] + 6.0})
     path.write_text('@ NAME %s "PTC_TWISS"\n' + path.read_text())
     load_ring(path)

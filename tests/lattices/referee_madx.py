@@ -37,11 +37,12 @@ def figures(text):
 
 
 COLUMNS = ("name,keyword,s,l,angle,k0l,k0sl,k1l,k1sl,k2l,k2sl,e1,e2,h1,h2,hgap,fint,fintx,tilt,"
-           "hkick,vkick,lrad,ks,ksi,x,y,dx,dy")  # fmt: skip
-HEADER = ("MASS", "CHARGE", "ENERGY", "BV_FLAG", "LENGTH", "ALFA", "XCOMAX", "YCOMAX", "Q1", "Q2")
+           "hkick,vkick,lrad,ks,ksi,x,y,dx,dy,wx")  # fmt: skip
+HEADER = ("MASS", "CHARGE", "ENERGY", "BV_FLAG", "LENGTH", "ALFA", "XCOMAX", "YCOMAX", "Q1", "Q2",
+          "DQ1", "DQ2")  # fmt: skip
 
 
-def table(text):
+def table(text, options=""):
     from cpymad.madx import Madx
 
     with tempfile.TemporaryDirectory() as folder:
@@ -49,7 +50,7 @@ def table(text):
         mad.input(text)
         if "use," not in text:
             mad.input("use, sequence=ring;")
-        mad.input(f"select, flag=twiss, column={COLUMNS}; twiss, file=twiss.tfs;")
+        mad.input(f"select, flag=twiss, column={COLUMNS}; twiss, {options} file=twiss.tfs;")
         lines = [line.split() for line in Path(folder, "twiss.tfs").read_text().splitlines()]
         mad.exit()
     header = [line for line in lines if line[0] == "@" and line[1] in HEADER]
@@ -72,7 +73,7 @@ def main():
             continue
         content["decks"][name] = {"text": deck["text"], **own}
     for deck in content["tables"].values():
-        deck["table"] = table(deck["text"])
+        deck["table"] = table(deck["text"], deck.get("options", ""))
     FILE.write_text(json.dumps(content, indent=1) + "\n")
     print(f"{len(content['decks'])} decks, {content['version']}")
 

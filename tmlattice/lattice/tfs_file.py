@@ -14,6 +14,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.lines import with_gaps
 from tmlattice.lattice.madx_beam import Beam
@@ -176,8 +178,11 @@ def _check_columns(path: Path, rows: list[Row], columns: frozenset[str]) -> None
 def _advice(columns: Any, rows: list[Row]) -> str:
     if any(map(_bends_thinly, rows)) and "LRAD" not in columns:
         return "its thin bends focus by their length, which it does not state: add the column LRAD"
+    ends = [[rows[k].get(key) for key in ("BETX", "BETY")] for k in (0, -1)]
+    if None not in ends[0] and not np.allclose(*np.array(ends, dtype=float), rtol=1e-3):
+        return "BETX and BETY are not periodic: write it of the whole ring, without initial values"
     known = ("ANGLE", "K0L", "K1L", "K2L", "K0SL", "K1SL", "K2SL", "TILT", "E1", "E2", "H1", "H2",
-             "FINT", "HGAP", "HKICK", "VKICK")  # fmt: skip
+             "FINT", "FINTX", "HGAP", "HKICK", "VKICK")  # fmt: skip
     lacks = [column for column in known if column not in columns]
     rest = f" and the columns {', '.join(lacks)}" if lacks else ""
     return f"write it of the whole ring, with all elements{rest}"
