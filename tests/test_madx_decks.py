@@ -128,6 +128,10 @@ REFUSED = {
     "call": (PLAIN + "call;", "it calls"),
     "one of a list": (PLAIN + "sf->knl[1] = 0.03;", "one number of a list is not set so"),
     "undefined in a sequence": (with_element("qx, at=4.95;"), "no element or command 'qx' is"),
+    "argument of a macro": (
+        PLAIN + "f(x): macro = { qf->k1 = x; }; exec, f(2*0.5);",
+        r"of the argument '2\*0.5' of a macro MAD-X takes the first number or name",
+    ),
     "nested branches": (
         PLAIN + "if (1 == 1) { if (1 == 2) { qf, k1=2; } } else { frobnicate; } wrong;",
         "no element or command 'wrong'",
@@ -180,6 +184,10 @@ WARNED = {
         PLAIN.replace("energy=3", "energy=3, bv=-1").replace("bb: sbend", "bb: rbend"),
         r"MAD-X's TWISS gives half the angle in faces \(BV=-1\) of bb \(1\)",
     ),
+    "two signs of logic": (
+        PLAIN + "if (1 == 1 && 2 == 2 && 3 == 3) { qf, k1=0; }",
+        r"IF \(1 == 1 && 2 == 2 && 3 == 3\): what stands behind the first && or",
+    ),
     "exciter": (with_element("h: hkicker, sinkick=1, at=4.95;"), r"SINKICK of h \(1\)"),
     "attributes in the sequence": (
         PLAIN.replace("qf, at=0.3;", "qf, at=0.3, k1=1.15;"),
@@ -189,7 +197,9 @@ WARNED = {
 }
 
 
-@pytest.mark.parametrize("name", ["sequence as SAVE writes it", "list of a later element"])
+@pytest.mark.parametrize(
+    "name", ["sequence as SAVE writes it", "list of a later element", "length of a later value"]
+)
 def test_what_has_no_effect_is_not_warned_of(tmp_path, name):
     strictly(tmp_path, DECKS[name]["text"].encode())
 

@@ -23,6 +23,7 @@ from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_o
 from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.madx_language import (
     CONSTANTS,
+    LOGICAL,
     Evaluate,
     Given,
     Statement,
@@ -499,6 +500,11 @@ class _Reader:
                 self._read_text(body)
             return
         condition = head[head.index("(") + 1 : head.rindex(")")]
+        if len(LOGICAL.findall(condition)) > 1:
+            self.warnings.append(
+                f"{word.upper()} ({plain(condition, 60)}): what stands behind the first && or || "
+                "of several is false, as in MAD-X"
+            )
         if word == "while":
             while holds(condition, self):
                 self.work(10)
@@ -539,7 +545,9 @@ class _Reader:
         definition = _Definition(name, keyword, own, self._where(statement), parents=parents)
         self.elements[name] = definition
         self._update(definition, given)
+        unknown = set(self.undefined)
         definition.length = self._element_length(definition)
+        self.undefined = unknown  # a value that comes later counts in the ring
         self._place(name, given)
         return None
 
@@ -681,6 +689,11 @@ class _Reader:
             r"\$([\w.]+)", lambda m: str(int(self.variable(m[1].lower()))), match[2] or ""
         )
         for name, value in zip(names, split(given), strict=False):
+            if not _ARGUMENT.fullmatch(value):
+                raise LatticeError(
+                    f"of the argument '{plain(value, 60)}' of a macro MAD-X takes the first number "
+                    "or name; give a number, or the name of a variable"
+                )
             # wherever it stands, within words too, as MAD-X does
             body = re.sub(re.escape(name), value.replace("\\", r"\\"), body, flags=re.IGNORECASE)
         self._depth += 1
@@ -772,9 +785,7 @@ class _Reader:
         if definition.keyword == "multipole":
             return 0.0
         if definition.keyword == "rbend" and self.rbarc:
-            unknown = set(self.undefined)
             half = float(self._value(definition, "angle")) / 2
-            self.undefined = unknown  # a value that comes later counts for the field
             return length * half / math.sin(half) if half else length
         return length
 
@@ -1114,6 +1125,9 @@ _REFERENCE = {"entry": 0.5, "exit": -0.5}
 _SHIFTS = SHIFTS | {"dtheta", "dphi"}
 _COMMANDS = ("beam", "resbeam", "select", "call", "use", "option", "exec", *NOT_RUN)
 _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
+_ARGUMENT = re.compile(
+    r"\"[^\"]*\"|'[^']*'|(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[^-+*/^(){}]*(->[\w.]+)?", re.IGNORECASE
+)
 _ENTRY = re.compile(r"rm([1-6])([1-6])")
 _ATTRIBUTES = (WORDS | NO_EFFECT).union(*MODELLED.values()) - {"at", "from"}
 _ODD = ("angle", "k0", "k1", "k2", "k3", "k0s", "k1s", "k2s", "k3s", "ks", "ksi", "hkick", "vkick",

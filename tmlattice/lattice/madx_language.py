@@ -210,11 +210,20 @@ class _Parser:
         return value
 
 
+LOGICAL = re.compile(r"(&&|\|\|)")
+
+
 def holds(condition: str, names: Names) -> bool:
-    """Whether a condition of IF or WHILE holds: comparisons joined by && and ||."""
-    return any(
-        all(_comparison(part, names) for part in term.split("&&")) for term in condition.split("||")
-    )
+    """Whether a condition of IF or WHILE holds: one comparison, or two joined by && or ||.
+
+    As in MAD-X, what stands behind the first of several && and || is false.
+    """
+    first, *rest = LOGICAL.split(condition)
+    left = _comparison(first, names)
+    if not rest:
+        return left
+    right = len(rest) == 2 and _comparison(rest[1], names)
+    return left and right if rest[0] == "&&" else left or right
 
 
 def _comparison(text: str, names: Names) -> bool:
