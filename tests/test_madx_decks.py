@@ -129,8 +129,8 @@ REFUSED = {
     "one of a list": (PLAIN + "sf->knl[1] = 0.03;", "one number of a list is not set so"),
     "undefined in a sequence": (with_element("qx, at=4.95;"), "no element or command 'qx' is"),
     "argument of a macro": (
-        PLAIN + "f(x): macro = { qf->k1 = x; }; exec, f(2*0.5);",
-        r"of the argument '2\*0.5' of a macro MAD-X takes the first number or name",
+        PLAIN + "f(x): macro = { qf->k1 = x; }; exec, f(-0.5);",
+        "the argument '-0.5' of a macro is an expression, which MAD-X cuts off",
     ),
     "nested branches": (
         PLAIN + "if (1 == 1) { if (1 == 2) { qf, k1=2; } } else { frobnicate; } wrong;",

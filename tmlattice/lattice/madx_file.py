@@ -691,8 +691,8 @@ class _Reader:
         for name, value in zip(names, split(given), strict=False):
             if not _ARGUMENT.fullmatch(value):
                 raise LatticeError(
-                    f"of the argument '{plain(value, 60)}' of a macro MAD-X takes the first number "
-                    "or name; give a number, or the name of a variable"
+                    f"the argument '{plain(value, 60)}' of a macro is an expression, which MAD-X "
+                    "cuts off; give a number or a name"
                 )
             # wherever it stands, within words too, as MAD-X does
             body = re.sub(re.escape(name), value.replace("\\", r"\\"), body, flags=re.IGNORECASE)
@@ -1128,6 +1128,7 @@ _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
 _ARGUMENT = re.compile(
     r"\"[^\"]*\"|'[^']*'|(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[^-+*/^(){}]*(->[\w.]+)?", re.IGNORECASE
 )
+"""What MAD-X takes whole as an argument of a macro."""
 _ENTRY = re.compile(r"rm([1-6])([1-6])")
 _ATTRIBUTES = (WORDS | NO_EFFECT).union(*MODELLED.values()) - {"at", "from"}
 _ODD = ("angle", "k0", "k1", "k2", "k3", "k0s", "k1s", "k2s", "k3s", "ks", "ksi", "hkick", "vkick",
