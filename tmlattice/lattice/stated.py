@@ -138,7 +138,7 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
     rising = np.where(np.sin(2 * np.pi * np.array(stated.tunes)) >= 0, 1.0, -1.0)
     rank = np.argsort(np.argsort(tunes))  # modes are in the order of their tunes
     allowed = CHROMATICITY[0] + CHROMATICITY[1] * np.abs(stated.chromaticity)
-    found = []
+    slopes = list[Array]()
     for differences in (False, True) if stated.differences is None else (stated.differences,):
         shifted = []
         for delta in (STEP, -STEP):
@@ -148,10 +148,10 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
             if off is None:
                 return None
             shifted.append(off)
-        found.append(rising * ((shifted[0] - shifted[1]) / (2 * STEP))[rank])
-    if all((np.abs(own - stated.chromaticity) > allowed).any() for own in found):
+        slopes.append(rising * ((shifted[0] - shifted[1]) / (2 * STEP))[rank])
+    if all((np.abs(own - stated.chromaticity) > allowed).any() for own in slopes):
         return (
-            f"its chromaticities are {_two(found[0])}, the header states "
+            f"its chromaticities are {_two(slopes[0])}, the header states "
             f"{_two(stated.chromaticity)}"
         )
     return None

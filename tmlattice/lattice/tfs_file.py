@@ -178,8 +178,10 @@ def _check_columns(path: Path, rows: list[Row], columns: frozenset[str]) -> None
 def _advice(columns: Any, rows: list[Row]) -> str:
     if any(map(_bends_thinly, rows)) and "LRAD" not in columns:
         return "its thin bends focus by their length, which it does not state: add the column LRAD"
-    ends = [[rows[k].get(key) for key in ("BETX", "BETY")] for k in (0, -1)]
-    if None not in ends[0] and not np.allclose(*np.array(ends, dtype=float), rtol=1e-3):
+    start, end = (
+        np.array([rows[k].get(key, 0.0) for key in ("BETX", "BETY")], dtype=float) for k in (0, -1)
+    )
+    if not np.allclose(start, end, rtol=1e-3):
         return "BETX and BETY are not periodic: write it of the whole ring, without initial values"
     known = ("ANGLE", "K0L", "K1L", "K2L", "K0SL", "K1SL", "K2SL", "TILT", "E1", "E2", "H1", "H2",
              "FINT", "FINTX", "HGAP", "HKICK", "VKICK")  # fmt: skip
