@@ -128,6 +128,7 @@ REFUSED = {
     "call": (PLAIN + "call;", "it calls"),
     "one of a list": (PLAIN + "sf->knl[1] = 0.03;", "one number of a list is not set so"),
     "undefined in a sequence": (with_element("qx, at=4.95;"), "no element or command 'qx' is"),
+    "no momentum": (PLAIN.replace("energy=3", "pc=p0"), "BEAM has PC=0; give one above 0"),
     "argument of a macro": (
         PLAIN + "f(x): macro = { qf->k1 = x; }; exec, f(-0.5);",
         "the argument '-0.5' of a macro is an expression, which MAD-X cuts off",

@@ -67,13 +67,15 @@ class Beam:
         """Of a particle, rest energy included, GeV."""
         name = next((n for n in ENERGIES if n in self.given), "energy")
         value, mass = float(self.given.get(name, 1.0)), self.mass
+        if value <= 0:
+            raise LatticeError(f"BEAM has {name.upper()}={value:g}; give one above 0")
         match name:
             case "energy":
                 return value
             case "gamma":
                 return value * mass
             case "beta":
-                if not 0 <= value < 1:
+                if value >= 1:
                     raise LatticeError(f"BEAM has BETA={value:g}; give one below 1")
                 return mass / math.sqrt(1 - value**2)
             case "brho":
