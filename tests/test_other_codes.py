@@ -218,7 +218,7 @@ def test_table_off_momentum_is_of_the_same_ring(madx, tmp_path):
     [
         ('"QUADRUPOLE"', '"SOLENOID"', (), "SOLENOID 'QF' and no column KS or KSI"),
         ('"QF"', '"QF"', ("K1L",), "QUADRUPOLE 'QF' and no column K1L"),
-        ('"MONITOR"', '"DIPEDGE"', (), "DIPEDGE 'M1' and no column H1"),
+        ('"MONITOR"', '"DIPEDGE"', ("E1",), "DIPEDGE 'm1' without its H"),
     ],
 )
 def test_fields_that_a_table_lacks_are_named(madx, tmp_path, old, new, drop, message):

@@ -152,7 +152,6 @@ OWN_ORDER = {"quadrupole": 1, "sextupole": 2, "octupole": 3}
 NEEDED_BY = {
     "QUADRUPOLE": ("K1L",), "SEXTUPOLE": ("K2L",), "SBEND": ("ANGLE", "K0L"),
     "RBEND": ("ANGLE", "K0L"), "SOLENOID": ("KS", "KSI"), "MULTIPOLE": ("K1L", "K2L"),
-    "DIPEDGE": ("H1",),
 }  # fmt: skip
 """Without any of these columns the elements of a class would be read as drifts."""
 
@@ -237,14 +236,18 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
         if value is not None:
             own[attribute] = float(value)
     thin_solenoid = keyword == "solenoid" and own.get("ksi") and not (length or own.get("ks"))
-    edge = keyword == "dipedge" and any(own.get(k) for k in ("e1", "fint")) and not own.get("h1")
-    if keyword == "matrix" or thin_solenoid or edge:
+    if keyword == "matrix" or thin_solenoid:
         raise LatticeError(
             f"'{path}' has the {keyword.upper()} '{plain(name, 60)}', whose numbers a table does "
             "not hold; give the sequence instead"
         )
-    if keyword == "dipedge":  # its H stands in the column H1
-        own["h"] = own["h1"]
+    if keyword == "dipedge":
+        own["h"] = own.get("h1", 0.0)
+        if not own["h"] and (own.get("e1", 1.0) or own.get("fint")):
+            raise LatticeError(
+                f"'{path}' has the DIPEDGE '{plain(name, 60)}' without its H, which MAD-X 5.09 "
+                "writes into H1; write the table with E1 and H1"
+            )
     if keyword == "beambeam":  # no column has its charge; the header's tunes have what it does
         own["charge"] = 0.0
         report.left_out("what the BEAMBEAM does", name)
