@@ -118,7 +118,7 @@ def test_octupoles_are_warned_of_once(tmp_path):
     with pytest.warns(UserWarning, match="octupoles are drifts") as said:
         ring = load_ring(path)
     (octupoles,) = [str(own.message) for own in said if "octupole" in str(own.message)]
-    assert octupoles.endswith("not modelled: oct (5)")
+    assert octupoles.endswith("trajectories have them: oct (5)")
     assert ring["oct::0"].kind == "octupole"
 
 
