@@ -132,7 +132,8 @@ def bring_readings(
         both[where] = value * factor
         filled[where] = abs(value) == fill
     readings, silent = both[..., :SUM], no_beam(both[..., SUM])
-    missing = _taken_out(readings, filled[..., :SUM], fill)
+    negative = fill is not None and 2 * (values == fill).sum() < (np.abs(values) == fill).sum()
+    missing = _taken_out(readings, filled[..., :SUM], -fill if negative else fill)
     before = np.isfinite(readings).any(axis=3)
     readings[silent] = np.nan
     said_of_large = _without_large(path, readings, names)
