@@ -58,7 +58,7 @@ def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]
     if not hasattr(own, "monitors") or exact(own) or not ring_monitors:
         return data, []
     own = in_beam_order(own, ring_monitors)
-    said = []
+    said: list[str] = []
     if getattr(own, "READ", "") == "readings":
         own, said = _each_shot_once(own)
 
