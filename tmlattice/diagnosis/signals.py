@@ -153,7 +153,7 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     if not np.count_nonzero(values[there]):
         text = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen BPMs", text)]
-    checks = []
+    checks: list[Check] = []
     pairs = values[there.all(axis=2)]
     if len(pairs) > 1 and pairs.any() and (pairs[:, 0] == pairs[:, 1]).all():
         text = "x and y are the same to the last digit: one is a copy; give what was read in both"

@@ -132,8 +132,9 @@ def bring_readings(
         both[where] = value * factor
         filled[where] = abs(value) == fill
     readings, silent = both[..., :SUM], no_beam(both[..., SUM])
-    negative = fill is not None and 2 * (values == fill).sum() < (np.abs(values) == fill).sum()
-    missing = _taken_out(readings, filled[..., :SUM], -fill if negative else fill)
+    if fill is not None and 2 * (values == fill).sum() < (np.abs(values) == fill).sum():
+        fill = -fill
+    missing = _taken_out(readings, filled[..., :SUM], fill)
     before = np.isfinite(readings).any(axis=3)
     readings[silent] = np.nan
     said_of_large = _without_large(path, readings, names)
