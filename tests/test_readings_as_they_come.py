@@ -316,7 +316,7 @@ def test_numbers_and_words_that_stand_for_no_reading_are_missing(small_ring, dat
     path = tmp_path / "a.csv"
     path.write_text(long(data, edit=words.get))
     brought = bring_in([path], Options(ring=small_ring))
-    assert any("6 readings are 999, far above all others" in said for said in brought.assumed)
+    assert any("6 readings are -999, far above all others" in said for said in brought.assumed)
     expected = data.readings.copy()
     expected.reshape(-1, 2)[list(words)] = np.nan
     own = brought.measurement.select(monitors=data.monitors)
@@ -346,7 +346,7 @@ def test_a_number_that_no_beam_gives_is_no_reading_wherever_the_beam_was_lost(
     text = long(ordered, edit=lambda k, text: "-999" if k % count >= first else text)
     (tmp_path / "a.csv").write_text(text)
     brought = bring_in([tmp_path / "a.csv"], Options(ring=small_ring))
-    assert any("are 999, far above all others" in said for said in brought.assumed)
+    assert any("are -999, far above all others" in said for said in brought.assumed)
     expected = ordered.readings.copy()
     expected[:, :, first:] = np.nan
     own = brought.measurement.select(monitors=ordered.monitors).readings

@@ -80,7 +80,8 @@ DOCUMENTS = {
     "an energy in eV": (lambda d: d.update(energy_gev=3e9), "eV"),
     "a launch outside every pipe": (lambda d: d["shots"][0]["launch"].update(x=0.1), "lost"),
     "a kick of a radian": (
-        lambda d: d["shots"][0].update(settings={"ch::0": {"kick": 1.0}}), "settings"),
+        lambda d: [shot.update(settings={"ch::0": {"kick": 1.0}}) for shot in d["shots"]],
+        "settings"),
     "a number of 400 digits": (lambda d: d.update(energy_gev=10**400), "digits"),
     "a list in a list in a list": (
         lambda d: d.update(noise=json.loads("[" * 400 + "]" * 400)), "noise"),

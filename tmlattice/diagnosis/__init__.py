@@ -22,6 +22,7 @@ from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement, OrbitResponse, in_words
 from tmlattice.measurement.recorded import recorded
+from tmlattice.observe.spoilt import without_spoilt
 
 __all__ = ["Diagnosis", "Finding", "Member", "diagnose"]
 
@@ -110,6 +111,11 @@ def diagnose(
     try:
         with threadpool_limits(one, "blas"):
             found = _diagnosed(ring, measurement, options)
+    except np.linalg.LinAlgError as error:  # of data that no model of this ring describes
+        raise MeasurementError(
+            f"these data cannot be fitted with '{ring.name}' ({error}): run `tmlattice check`, and "
+            "check the names, the order and the number of turns"
+        ) from error
     except MeasurementError as error:
         if not messages:
             raise
@@ -124,7 +130,10 @@ def _usable(ring: Ring, measured: Any) -> tuple[Any, list[str]]:
     if not isinstance(measured, Mapping):
         own, absent = in_the_lattice(ring, measured)
         own, cut = recorded(own, [monitor.name for monitor in ring.monitors])
-        return own, [*absent, *cut]
+        spoilt: dict[str, str] = {}
+        if isinstance(own, Measurement):
+            own, spoilt = without_spoilt(ring, own)
+        return own, [*absent, *cut, *spoilt.values()]
     parts = {name: _usable(ring, own) for name, own in measured.items()}
     messages = [
         f"{name}: {sentence}" if len(parts) > 1 else sentence

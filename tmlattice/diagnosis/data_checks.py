@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.arrays import Array
+from tmlattice.beam.rf import speed_of
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
 from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
@@ -33,44 +34,63 @@ from tmlattice.errors import (
     UnknownNameError,
     first_of,
 )
-from tmlattice.inference.judgement import FEW, GROSS, MISSTATED
+from tmlattice.inference.judgement import FEW, MISSTATED, SIGNIFICANT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
+    Dispersion,
     Measurement,
     OrbitResponse,
     TuneReading,
     TurnByTurn,
 )
-from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of, with_read
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of
 from tmlattice.measurement.kinds import STORED
 from tmlattice.measurement.lost_beam import beam_lost, exact
-from tmlattice.measurement.monitors import LARGEST_READING, Names
+from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.recorded import recorded
-from tmlattice.observe.compared import ANOTHER, Compared, OfResponse, compared
+from tmlattice.observe.compared import (
+    ANOTHER,
+    Compared,
+    OfColumns,
+    OfResponse,
+    compared,
+    names_of_others,
+)
 from tmlattice.observe.global_errors import CERTAIN, OfTurns, Search, Verdict
 from tmlattice.observe.noise import PASSES, noise_scatter
 from tmlattice.observe.response_data import response_data
 from tmlattice.observe.sections import Passes, SectionFits
+from tmlattice.observe.spoilt import SPOILT, without_spoilt
 
 ENERGY = 0.02
 """Share by which a stated beam energy may differ from the lattice's."""
+CIRCUMFERENCE = 1e-3
+"""Relative difference between the length by the RF and the lattice's; eight real rings have 4e-5 at
+most, and a wrong harmonic number of 1000 makes it."""
 ALIEN = 0.85
 """Share of the orbit that no trajectory of a section explains from which on the data belong to
 another ring. Noise or readings in no order leave all of it, strong distributed errors 0.7."""
+RESOLVED = 0.45
+"""The same where signs, units or order were corrected, which another order changes by chance: at
+least 0.49 is left then, of the right one 0.37 at most in seven rings."""
+STRANGE = 0.4
+"""Share of the orbit that a section leaves, from which a BPM may have another's name: where the
+phase of a machine runs off its design's, sections leave 0.37 at most."""
 CORRECTED = 0.1
 """Misfit of the typical column with wrong signs, units or order corrected, from which on the
 lattice may be wrong."""
 FAR = 100.0
 """Square of the sigma by which launches may differ from the stated ones, by
 benchmarks/data_checks.py."""
+FACTOR = 1.2
+"""Ratio of all fitted to all stated launches, or its inverse, from which it is stated."""
 EXACT = 0.01
 """Share of the launches that gains of the first BPMs change."""
 NOTHING_FROM, SURE, NO_BEAM = 2, 4, 0.75
 """Sections at the end that follow no trajectory, from which on the beam may be lost, and is: a few
 swapped BPMs spoil less; the share of their readings that is left then, of noise 0.9."""
-SPOILT = 3.0
-"""Misfit of a section over the typical one above which it is not used."""
+UNSPOILT = {"shots": "no shot is unlike the others", "outliers": "no reading is an outlier"}
 GLOBAL = "signs, units and order"
 MOST_ERRORS = 4
 """Global errors of one measurement at most."""
@@ -105,11 +125,15 @@ def check_data(
     names = [monitor.name for monitor in ring.monitors]
     data, cut = recorded(data, names)
     checks = [*(note("names", sentence) for sentence in absent),
-              *(note("recording", sentence) for sentence in cut), _stated(ring, data)]  # fmt: skip
+              *(note("recording", sentence) for sentence in cut), _stated(ring, data),
+              *_period(ring, data)]  # fmt: skip
     few = signals.few(ring, data)
     if few is None:
         data = assume(in_beam_order(data, names), assumed, names)
         if isinstance(data, Measurement):
+            data, spoilt = without_spoilt(ring, data)
+            checks += [note(name, spoilt[name]) if name in spoilt else fine(name, text)
+                       for name, text in UNSPOILT.items()]  # fmt: skip
             checks += _of_first_turns(ring, data, expected_radiation(ring) if radiation else ())
         else:
             checks += _of_compared(ring, data)
@@ -127,7 +151,7 @@ def check_data(
     return Checkup(kind, tuple(checks), provenance)
 
 
-_REPORTED = ("energy", "large readings", "copied BPMs", "lost beam", GLOBAL, "launches")
+_REPORTED = ("energy", "copied BPMs", "lost beam", GLOBAL, "launches")
 """Notes that the diagnosis does not find by itself."""
 
 
@@ -162,7 +186,7 @@ def data_checks(
 
 
 def raise_if_wrong(ring: Ring, data: AnyMeasurement, problem: Any = None) -> None:
-    """Raise an error if a global error of a stored beam's data can be corrected.
+    """Raise an error if a stored beam's data are wrong as a whole.
 
     Args:
         ring: the design.
@@ -170,12 +194,12 @@ def raise_if_wrong(ring: Ring, data: AnyMeasurement, problem: Any = None) -> Non
         problem: their lines, if these are turns and the lines are known.
 
     Raises:
-        MeasurementError: the error, and its correction.
+        MeasurementError: what is wrong, and its correction.
     """
     names = [monitor.name for monitor in ring.monitors]
-    for check in _of_compared(ring, in_beam_order(data, names), problem):
-        if check.name == GLOBAL and check.status == "wrong":
-            raise MeasurementError(check.sentence)
+    checks = [*_period(ring, data), *_of_compared(ring, in_beam_order(data, names), problem)]
+    if bad := [check.sentence for check in checks if check.status == "wrong"]:
+        raise MeasurementError("; ".join(bad))
 
 
 Some = TypeVar("Some")
@@ -199,6 +223,21 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
             "name this machine's lattice, or its energy (`energy` in tmlattice.toml)",
         )
     return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
+
+
+def _period(ring: Ring, data: AnyMeasurement) -> list[Check]:
+    """The check of the RF's frequency and harmonic against the lattice's length."""
+    steps = data.steps if isinstance(data, Dispersion) else (getattr(data, "rf", None),)
+    if (rf := steps[0]) is None:
+        return []
+    length = rf.harmonic * speed_of(ring) / rf.frequency
+    text = f"the RF of {rf.frequency:g} Hz with harmonic {rf.harmonic:g}"
+    if abs(length / ring.length - 1) < CIRCUMFERENCE:
+        return [fine("RF", f"{text} fits the length of '{ring.name}'")]
+    return [wrong(
+        "RF", f"{text} belongs to a circumference of {length:.6g} m, and '{ring.name}' has "
+        f"{ring.length:.6g} m: correct the frequency, the harmonic or the lattice",
+    )]  # fmt: skip
 
 
 AnySearch = TypeVar("AnySearch", bound=Search)
@@ -233,14 +272,6 @@ def _sentence(searched: Search, verdict: Verdict) -> Check:
     return make(GLOBAL, text, before=chi2[0], after=chi2[1], assume=verdict.names)
 
 
-def _sensible(data: Some) -> Some:
-    """The data without readings that no beam gives, which would make a unit look wrong."""
-    if isinstance(data, TuneReading) or not signals.too_large(read_of(data)).any():
-        return data
-    kept: Some = with_read(data, lambda own: np.where(np.abs(own) > LARGEST_READING, np.nan, own))
-    return kept
-
-
 def _options(names: Iterable[str]) -> str:
     return " ".join(f"--assume {name}" for name in names)
 
@@ -261,31 +292,40 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     ]  # fmt: skip
     if any(check.status == "wrong" for check in checks):
         return checks  # nothing can be fitted to such turns
-    errors, checked = _global(OfTurns(ring, _sensible(data), known))
+    errors, checked = _global(OfTurns(ring, data, known))
     passes, found = checked.found(checked.data)
     if lost_too := _no_beam(ring, checked, passes, found):
         return [*checks, *errors, *lost_too]
-    lattice = _lattice(ring, checked, passes, found)
+    lattice = _lattice(
+        ring,
+        checked,
+        passes,
+        found,
+        RESOLVED if any(check.status != "fine" for check in errors) else ALIEN,
+    )
     if lattice.status == "wrong":  # no wrong sign, unit or order explains that
         return [*checks, lattice]
     checks += [*errors, lattice]
+    if all(check.status != "wrong" for check in checks):
+        checks += _order(checked, passes, found)
     if any(check.status == "wrong" for check in checks):
         return checks  # noise and launches have no meaning before that is corrected
     return [
         *checks,
         _launches(checked),
         _noise(checked, passes, found),
-        _outliers(checked, passes, found),
     ]
 
 
-def _lattice(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
+def _lattice(
+    ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits, most: float
+) -> Check:
     """The check whether the readings follow trajectories of this ring."""
     share = found.share(passes)
     if not np.isfinite(share):
         return fine("lattice", "too few BPMs to decide whether this is the machine's lattice")
     stated = checked.data.noise is not None
-    if share > ALIEN and not (stated and found.level < 4):
+    if share > most and not (stated and found.level < 4):
         return wrong(
             "lattice",
             f"the readings follow no trajectory of '{ring.name}': {100 * share:.0f} % of the orbit "
@@ -294,6 +334,18 @@ def _lattice(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
             before=found.level if stated else None,
         )
     return fine("lattice", f"the readings follow trajectories of '{ring.name}'")
+
+
+def _order(checked: OfTurns, passes: Passes, found: SectionFits) -> list[Check]:
+    """The check for BPMs with the names of others, whose sections follow no trajectory."""
+    read, made = checked.predicted()
+    if len(read) < FEW:
+        return []
+    names = checked.data.monitors
+    text, moved = names_of_others("BPM", names, *(np.moveaxis(v, 1, 0) for v in (read, made)))
+    strange = found.shares(passes)[0] > STRANGE
+    there = text and np.isin(found.owner[strange], moved).any()
+    return [wrong("order", text)] if there else []
 
 
 def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -> list[Check]:
@@ -340,10 +392,35 @@ def _launches(checked: OfTurns) -> Check:
     data = checked.data
     if data.launch_sigma is None or np.isinf(data.launch_sigma[:, :4]).all():
         return fine("launches", "no launch is stated; they are fitted")
-    own, misfit = checked.launches(square, EXACT)
-    good = misfit < SPOILT * square  # else a fault of the first magnets biases the fit
-    sections = checked.found(data)[1].misfit.shape[1]
-    if not good.any() or sections < FEW:
+    own, changes, misfit, ratio = checked.launches(square, EXACT)
+    sections = checked.found(data)[1].misfit
+    if sections.shape[1] < FEW:
+        return fine("launches", "too few BPMs to check the launches")
+    free = "or go on with --assume launches-unknown"
+    # else a fault of the first magnets biases the fit
+    good = misfit < SPOILT * max(square, float(np.median(sections)))
+    unlike, beyond = changes[:, good].max(axis=2)
+    usual, most = float(np.median(unlike)) if good.any() else 0.0, SIGNIFICANT**2
+    scaled = usual > most and max(ratio, 1 / ratio) > FACTOR
+    if good.sum() > FEW and (beyond.max() > most or scaled):
+        odd = unlike > max(most, MISSTATED**2 * usual)
+        which, size = "of every shot", usual
+        if usual < most and odd.any():
+            ids = ", ".join(str(data.shots[i]) for i in np.flatnonzero(good)[odd])
+            which, size = f"of shot {ids}", float(unlike[odd].min())
+        times = ""
+        if scaled:
+            times = f", being {ratio:.2g} times these (is that the unit or size of the readings?)"
+        return wrong(
+            "launches",
+            f"the fitted launches {which} differ from the stated ones by {np.sqrt(size):.0f} of "
+            "their launch_sigma, "
+            f"each in another way{times}: correct these launches (are they of these shots?) or "
+            f"their rms, {free}",
+            before=usual, assume=("launches-unknown",),
+        )  # fmt: skip
+    good = misfit < SPOILT * square
+    if not good.any():
         return fine("launches", "too few good BPMs near the start to check the launches")
     worst = float(np.median(own[good], axis=0).max())
     if worst > FAR:
@@ -351,7 +428,7 @@ def _launches(checked: OfTurns) -> Check:
             "launches",
             f"the fitted launches differ from the stated ones by {np.sqrt(worst):.0f} of their "
             "launch_sigma, unless there is a fault before the first BPMs: correct the launches "
-            "or their rms, or go on with --assume launches-unknown",
+            f"or their rms, {free}",
             before=worst, assume=("launches-unknown",),
         )  # fmt: skip
     return fine("launches", "the fitted launches are the stated ones")
@@ -407,29 +484,6 @@ def _micro(metres: float) -> str:
     return f"{1e6 * metres:.3g} µm"
 
 
-def _outliers(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
-    """The check for outliers, where the same section of other shots agrees."""
-    none = fine("outliers", "no reading is an outlier")
-    there = found.freedom > 2
-    if len(found.misfit) < 3 or not there.any():
-        return none
-    square = found.level
-    usual = np.median(found.misfit, axis=0) < SPOILT * square  # [section]
-    odd = there & (found.misfit > SPOILT * square) & usual
-    reported = []
-    for p, w in np.argwhere(odd):
-        alone = found.left[p, w] ** 2 / np.maximum(found.free[p, w], 0.05)
-        worst = int(alone.argmax())
-        rest = found.misfit[p, w] * found.freedom[p, w] - alone[worst]
-        if alone[worst] > GROSS**2 * square and rest < SPOILT**2 * square * found.freedom[p, w]:
-            name = checked.data.monitors[found.owner[w, worst]]
-            shot = checked.data.shots[passes.shot[p]]
-            reported.append(f"{name} in {'xy'[worst % 2]}, shot {shot}, turn {passes.turn[p]}")
-    if not reported:
-        return none
-    return note("outliers", f"{first_of(reported)}; leave them empty")
-
-
 # --- what is compared with the design's -----------------------------------------------------------
 def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[Check]:
     checks: list[Check] = []
@@ -442,7 +496,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
     if any(check.status == "wrong" for check in checks):
         return checks
     try:
-        search = compared(ring, _sensible(data), problem)
+        search = compared(ring, data, problem)
         checks += [note("lines", sentence) for sentence in search.warnings]
         checks += [fine("tunes", sentence) for sentence in search.tunes]
         errors, checked = _global(search)
@@ -453,8 +507,12 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
         text = "one orbit is the sum of all errors: it shows neither signs nor the order of BPMs"
         return [*checks, fine(GLOBAL, text)]
     typical = float(np.nanmedian(left))
-    more = _rf_step(checked) if isinstance(checked, OfResponse) else []
+    more = _rf_step(checked) if isinstance(checked, OfColumns) else []
     found = [check for check in errors if check.status == "wrong"]
+    if isinstance(checked, OfResponse) and not found:
+        order = [wrong("order", sentence) for sentence in checked.other_order()]
+        if order:
+            return [*checks, *more, *order]
     if isinstance(data, OrbitResponse) and typical > (CORRECTED if found else ANOTHER):
         guess = _far(ring, data)
         if guess is not None and guess.left < BETTER * typical:
@@ -469,7 +527,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
             units = [own for own in found if all(_UNIT in name for name in own.assume)]
             return [*checks, *units, *more, far]
     text = f"{search.of} {search.shown(typical)}"
-    if typical > ANOTHER:  # no wrong sign, unit or order explains that
+    if typical > ANOTHER and not more:  # no wrong sign, unit or order explains that
         return [*checks, wrong(
             "lattice",
             f"the data are not those of '{ring.name}': {text}; name the lattice of this machine, "
@@ -478,7 +536,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
     return [*checks, *errors, *more, fine("lattice", text)]
 
 
-def _rf_step(checked: OfResponse) -> list[Check]:
+def _rf_step(checked: OfColumns) -> list[Check]:
     scale = checked.rf_scale()
     if not max(abs(scale), 1 / abs(scale)) > MISSTATED:
         return []

@@ -14,6 +14,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import AnyMeasurement, Measurement, TuneReading
 from tmlattice.measurement.lost_beam import FEWEST, LostBeam
 from tmlattice.measurement.monitors import LARGEST_READING
+from tmlattice.measurement.recorded import SENSIBLE
 from tmlattice.measurement.shots import FEWEST as TURNS
 from tmlattice.observe.noise import SAME_PLACE
 
@@ -22,8 +23,6 @@ CUT = FEWEST
 HALF = 0.5
 """Share from which on all is wrong: of unknown names, of sections that follow no trajectory, of
 constant signals, and of the readings of a signal that repeat the one before."""
-SENSIBLE = LARGEST_READING / 100
-"""m; typical reading below which the readings are in metres, and larger ones are none."""
 STRAY = 0.02
 """Share of a turn's readings below which a turn far behind the others is a wrong number."""
 
@@ -126,12 +125,6 @@ def not_reached(silent: Flags) -> Flags:
     return np.asarray(runs.all(axis=0) & lost)
 
 
-def too_large(values: Array) -> Flags:
-    """Which readings are larger than those of any beam, where the others are in metres."""
-    typical = np.median(np.abs(values[np.isfinite(values)]))  # else the unit of all is wrong
-    return np.asarray((np.abs(values) > LARGEST_READING) & (typical < SENSIBLE))
-
-
 def one_plane(unread: str) -> str:
     """The message about a plane without readings."""
     return (
@@ -160,19 +153,19 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     if not np.count_nonzero(values[there]):
         text = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen BPMs", text)]
-    checks = []
-    large = too_large(values)
-    if large.any():
-        own = first_of([names[m] for m in np.flatnonzero(large.any(axis=(0, 2))).tolist()])
-        text = (
-            f"{large.sum()} of {there.sum()} readings are above {LARGEST_READING} m, of {own}: no "
-            "beam reads that; leave them out (NaN, or an empty field)"
-        )
-        checks.append(note("large readings", text))
+    checks: list[Check] = []
     pairs = values[there.all(axis=2)]
     if len(pairs) > 1 and pairs.any() and (pairs[:, 0] == pairs[:, 1]).all():
         text = "x and y are the same to the last digit: one is a copy; give what was read in both"
         return [*checks, wrong("planes", text)]
+    if moved and there.any(axis=(0, 1)).all():
+        x, y = (float(np.median(np.abs(values[..., p][there[..., p]]))) for p in (0, 1))
+        if max(x, y) > LARGEST_READING and min(x, y) < SENSIBLE / 10:
+            text = (
+                f"x and y are in different units: the typical reading is {x:.2g} m in x and {y:.2g}"
+                " m in y; give both in metres"
+            )
+            return [*checks, wrong("planes", text)]
     checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own

@@ -132,6 +132,8 @@ def bring_readings(
         both[where] = value * factor
         filled[where] = abs(value) == fill
     readings, silent = both[..., :SUM], no_beam(both[..., SUM])
+    if fill is not None and 2 * (values == fill).sum() < (np.abs(values) == fill).sum():
+        fill = -fill
     missing = _taken_out(readings, filled[..., :SUM], fill)
     before = np.isfinite(readings).any(axis=3)
     readings[silent] = np.nan

@@ -199,8 +199,9 @@ class Whitening:
     def projected_precision(self, projection: "Projection") -> Array:
         """The precision less what launches explain, in units of the readings' noise, [row, row]."""
         assert self._inverse is not None
-        Q = projection.Q[0].reshape(self.shots, -1, projection.Q.shape[2])[:, :-5]
-        along = self._inverse.T @ Q.reshape(len(self._inverse), -1)
+        _, rows, width = projection.Q.shape
+        Q = projection.Q[0].reshape(self.shots, rows // self.shots, width)[:, :-5]
+        along = self._inverse.T @ Q.reshape(len(self._inverse), width)
         return np.asarray(self.precision - along @ along.T)
 
     def back(self, rows: Array) -> Array:

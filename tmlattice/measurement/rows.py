@@ -59,10 +59,15 @@ class Rows:
         large = np.abs(self.xy) > LARGEST_READING  # false for NaN
         if metres and large.any():
             row, plane = (int(i) for i in np.argwhere(large)[0])
+            few = 4 * large.sum() < np.isfinite(self.xy).sum()
             raise self.error(
                 row,
-                f"{'xy'[plane]} = {self.xy[row, plane]:g} m is above {LARGEST_READING} m; readings "
-                "are in metres: divide millimetres by 1000",
+                f"{'xy'[plane]} = {self.xy[row, plane]:g} m is above {LARGEST_READING} m; "
+                + (
+                    "no beam reads that: leave the fields of missing readings empty"
+                    if few
+                    else "readings are in metres: divide millimetres by 1000"
+                ),
             )
         columns = [self.names[k][1] if k in self.names else self.whole[k] for k in keys]
         order = np.lexsort(columns[::-1])  # stable: of two equal rows the first stays first

@@ -16,11 +16,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
-from tmlattice.arrays import Array, ComplexArray
+from tmlattice.arrays import Array, ComplexArray, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import modelled
-from tmlattice.errors import MeasurementError
+from tmlattice.errors import MeasurementError, first_of
+from tmlattice.inference.judgement import GROSS
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, TuneReading, TurnByTurn
 from tmlattice.measurement.assume import assume, read_of
@@ -44,9 +46,20 @@ OF_RF = 1.4
 UNRELATED, RESEMBLING = 1.5, 0.5
 """Or: typical misfits before and after, of columns that were unrelated and now resemble the
 design."""
-SCALES, NEAR, SIMILAR = {"kicks-doubled": 2.0, "kicks-halved": 0.5}, 0.15, 0.8
+SCALES, NEAR, SIMILAR = (
+    {"kicks-doubled": 2.0, "kicks-halved": 0.5, "rf-doubled": 2.0, "rf-halved": 0.5},
+    0.15,
+    0.8,
+)
 """Or: ratio of the typical column to the design's, tolerance of its logarithm, and smallest
 correlation with the design."""
+ALIKE, APART = 0.95, 0.2
+"""Correlation of what was read at a BPM, or by a corrector, with the design's of another one, and
+by how much more than with its own, from which it has the name of that one."""
+LABELS = 2
+"""Names that a diagnosis finds exchanged by itself, at most."""
+MOVED = 0.75
+"""Quantile of the readings of a column that are those of the plane that is moved."""
 SEEN = 1e-3
 """Smallest share of the design's square at the monitors that read a column."""
 SHARE = 0.8
@@ -128,10 +141,14 @@ class OfColumns(Compared):
         """Columns as read, and as the design makes them, [column, monitor, 2], and the squares of
         the noise of their difference."""
 
+    def rf_scale(self) -> float:
+        """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
+        return float("nan")
+
     def misfit(self, names: Names = ()) -> Array:
         """See `Compared`: |measured - design|^2 over the mean of both squares, beyond the noise."""
         read, made, noise = (np.asarray(own) for own in self.pairs(self.assumed(names)))
-        there, flat = np.isfinite(read), (len(read), -1)
+        there, flat = np.isfinite(read) & ~_outliers(read), (len(read), -1)
         a, b = (np.where(there, own, 0.0).reshape(flat) for own in (read, made))
         square, own = ((values**2).sum(axis=1) for values in (a, b))
         left = ((a - b) ** 2).sum(axis=1) - np.where(there, noise, 0.0).reshape(flat).sum(1)
@@ -139,6 +156,42 @@ class OfColumns(Compared):
         whole = (made.reshape(flat) ** 2).sum(axis=1)
         seen = (size > 0) & (own > SEEN * whole)
         return np.where(seen, np.maximum(left, 0.0) / np.where(seen, size, 1.0), np.nan)
+
+
+def _outliers(read: Array) -> Flags:
+    """Which readings [column, monitor, 2] are far above those of their column in the plane that
+    is moved."""
+    size = np.abs(np.where(np.isfinite(read), read, 0.0))
+    usual = np.quantile(size, MOVED, axis=(1, 2), keepdims=True)
+    return np.asarray((size > GROSS * usual) & (usual > 0))
+
+
+def names_of_others(
+    what: str, names: Sequence[str], read: Array, made: Array, same: Any = True
+) -> tuple[str, NDArray[np.intp]]:
+    """Return a sentence about names that stand in another order, and which these are: what was read
+    [name, ...] is what the design makes of others. Empty if there are none.
+
+    Args:
+        what: a BPM, or a corrector.
+        names: of them.
+        read, made: as read and as the design makes it, NaN where missing.
+        same: which may be exchanged, [name, name].
+    """
+    a, b = (np.nan_to_num(own.reshape(len(own), -1)) for own in (read, made))
+    there = np.isfinite(read).reshape(a.shape)
+    size = np.sqrt((a**2).sum(axis=1)[:, None] * (there @ (b**2).T))
+    alike = np.where(same, a @ b.T / np.where(size > 0, size, 1.0), -1.0)
+    kept = np.flatnonzero(there.any(axis=1))
+    alike = alike[np.ix_(kept, kept)]
+    here, best = linear_sum_assignment(-alike)
+    then, now = alike[here, best], np.diag(alike)
+    moved = np.flatnonzero((then > ALIKE) & (now < then - APART))
+    if len(moved) <= LABELS or np.median(then) < ALIKE:
+        return "", moved[:0]
+    pairs = [f"{names[kept[i]]} has what {names[kept[best[i]]]} should have" for i in moved]
+    return (f"{len(moved)} {what}s have the names of others: {first_of(pairs, 3)}; give each "
+            f"{what} its own name"), kept[moved]  # fmt: skip
 
 
 def ratio(read: Array, made: Array) -> float:
@@ -197,14 +250,29 @@ class OfResponse(OfColumns):
 
     def is_scale(self, name: str) -> bool:
         """See `Compared`."""
-        return name in SCALES and abs(np.log(self.scale() / SCALES[name])) < NEAR
+        scale = self.rf_scale() if name[:2] == "rf" else self.scale()
+        return name in SCALES and abs(np.log(scale / SCALES[name])) < NEAR
 
     def rf_scale(self) -> float:
-        """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
+        """See `OfColumns`."""
         if not self.stepped or not read_rf(self.data):
             return float("nan")
         read, made, _ = self.pairs(self.data)
         return ratio(read[-1:], made[-1:])
+
+    def other_order(self) -> list[str]:
+        """Sentences about names of BPMs, and of correctors, that stand in another order."""
+        read, made, _ = self.pairs(replace(self.data, rf=None))
+        read = np.where(_outliers(read), np.nan, read)
+        planes, data = np.array(self.data.planes), self.data
+        found = [
+            names_of_others(
+                "BPM", data.monitors, *(np.moveaxis(own, 1, 0) for own in (read, made))
+            ),
+            names_of_others("corrector", data.correctors, read, made, planes[:, None] == planes),
+        ]
+        text = "; or ".join(own for own, _ in found if own)
+        return [text] if text else []
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""
@@ -250,6 +318,15 @@ class OfOrbits(OfColumns):
             read, made = (own - mean_pass(own, there) for own in (read, made))
         noise = np.zeros(2) if data.noise is None else np.nan_to_num(data.noise)
         return read, made, 2 * np.broadcast_to(noise, read.shape) ** 2
+
+    def rf_scale(self) -> float:
+        """See `OfColumns`."""
+        read, made, _ = self.pairs(self.data)
+        return ratio(read, made) if isinstance(self.data, Dispersion) else float("nan")
+
+    def is_scale(self, name: str) -> bool:
+        """See `Compared`."""
+        return name in SCALES and abs(np.log(self.rf_scale() / SCALES[name])) < NEAR
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""

@@ -295,8 +295,11 @@ def held_out_residuals(problem: FirstTurns, unknown: Array | None = None) -> Hel
         if not scored.any():
             continue
         known = np.where(np.isfinite(sigma[shots]), sigma[shots] ** -2.0, 0.0)
+        width = known.size
         first, second = (
-            Half(left[shots][half], slopes[half].reshape(half.sum(), -1), data.sigma[shots][half])
+            Half(
+                left[shots][half], slopes[half].reshape(half.sum(), width), data.sigma[shots][half]
+            )
             for half in (gives, scored)
         )
         order = np.concatenate([index[shots][gives], index[shots][scored]])

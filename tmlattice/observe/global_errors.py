@@ -66,6 +66,13 @@ Names = tuple[str, ...]
 GAIN, CERTAIN = 12.0, 15.0
 """Log evidence above which a global error is reported, and above which it is certain: no healthy
 measurement of `benchmarks/data_checks.py` gains as much."""
+LEFT, TOO_WELL = 4.0, 1e-3
+"""Ratio of what each of two corrections leaves to what both do, at least; and chi-square of
+launches below which they are no evidence: readings next to zero fit any."""
+ROUNDS = 20
+"""Reweighted least squares."""
+ALIKE = 0.95
+"""Correlation of fitted with stated launches, from which their ratio is a factor of all."""
 ERRORS = 4.0
 """Independent numbers by which a fault changes what is read in a section, or at a joint, whatever
 the number of shots: a kick and a gradient in each plane."""
@@ -196,6 +203,7 @@ class Verdict:
             the difference from the design, as `Compared.misfit`.
         of: what has this misfit.
         alike: other assumptions that explain the data as well.
+        left: largest chi-square per reading that any part of first turns leaves.
     """
 
     names: Names
@@ -204,6 +212,7 @@ class Verdict:
     after: float
     of: str
     alike: tuple[Names, ...] = ()
+    left: float = np.inf
 
     @property
     def worth(self) -> float:
@@ -270,7 +279,8 @@ def _verdict(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict:
     # the sections may agree either way: then the launches decide
     of_launch = not local > 2 * local_then and bool(np.isfinite(launch))
     of = "chi-square per reading" + " of the launches" * of_launch
-    return Verdict(names, gain, *pairs[of_launch], of)
+    left = float(np.nanmax([*other.levels, *other.launch]))
+    return Verdict(names, gain, *pairs[of_launch], of, left=left)
 
 
 def _parts(passes: Passes, found: SectionFits) -> tuple[Split, list[Split], list[Array]]:
@@ -402,7 +412,8 @@ class OfTurns(Search):
         data = self.assumed(names)
         passes, found = self.found(data)
         sections, joints, spreads = _parts(passes, found)
-        launch, each, blur = self._launch(data, passes, found, square, "beam-backwards" in names)
+        backwards = "beam-backwards" in names
+        launch, each, _, blur = self._launch(data, passes, found, square, backwards)
         times = _size(data) / self.scale
         blur += sum(log_uncertainty(own / times**2) / len(own) for own in spreads)
         ratio = 1.0
@@ -425,13 +436,32 @@ class OfTurns(Search):
             np.full(2, np.nan) if launch is None else np.array([_worse(each), launch.level(True)]),
         )
 
-    def launches(self, square: float, tolerance: float) -> tuple[Array, Array]:
-        """Mean squares of fitted less stated launches by plane, [shot, 2], and the misfit of the
-        sections that determine them, [shot]."""
+    def predicted(self) -> tuple[Array, Array]:
+        """Readings of first turns, and the design's with the launches of their first section, less
+        their mean over the shots, [shot, monitor, 2]."""
+        passes, found = self.found(self.data)
+        first = np.flatnonzero((passes.turn == 0) & np.isfinite(found.start[:, 0]).all(axis=1))
+        launches = np.concatenate([found.start[first, 0], found.delta[first, None]], axis=1)
+        made = self._section(1.0).predicted(launches, passes.shot[first])
+        read = passes.readings[first]
+        there = np.isfinite(read)
+        return np.where(there, read - mean_pass(read, there), np.nan), made - made.mean(axis=0)
+
+    def launches(self, square: float, tolerance: float) -> tuple[Array, Array, Array, float]:
+        """Mean squares of fitted less stated launches by plane, [shot, 2]; the same less
+        their median, and less what a fault before the first monitors makes, [2, shot, 2]; the
+        misfit of the sections that
+        determine them, [shot]; and the ratio of the fitted to the stated ones, NaN where they are
+        not proportional."""
         passes, found = self.found(self.data)
         first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
-        _, each, _ = self._launch(self.data, passes, found, square, False, tolerance)
-        return each, found.misfit[first, 0]
+        _, each, changes, _ = self._launch(self.data, passes, found, square, False, tolerance)
+        fitted, stated = found.start[first, 0], self.data.launches[passes.shot[first], :4]
+        size = np.maximum(np.abs(stated).max(axis=0), TINY)
+        a, b = (np.nan_to_num(own / size).ravel() for own in (fitted, stated))
+        inner, square_a, square_b = a @ b, a @ a, b @ b
+        alike = inner**2 > ALIKE**2 * square_a * square_b > 0
+        return each, changes, found.misfit[first, 0], inner / square_b if alike else np.nan
 
     def _launch(
         self,
@@ -441,9 +471,10 @@ class OfTurns(Search):
         square: float,
         backwards: bool,
         tolerance: float = LAUNCH_TOLERANCE,
-    ) -> tuple[Split | None, Array, float]:
-        """Fitted less stated launches by plane; their mean squares [shot, plane]; and the log of
-        their uncertainty. None if no launch is stated."""
+    ) -> tuple[Split | None, Array, Array, float]:
+        """Fitted less stated launches by plane; their mean squares [shot, plane]; those less their
+        median, and of `_beyond_a_fault`, [2, shot, plane]; and the log of their uncertainty. None
+        if no launch is stated."""
         if backwards:  # the end of the last turn, against the stated launches
             last = np.flatnonzero(np.append(np.diff(passes.shot) != 0, True))
             shot, fitted = passes.shot[last], found.end[last, -1] * _TURNED
@@ -463,7 +494,7 @@ class OfTurns(Search):
             if passes.turn[first].any():
                 stated, J = self._carried(data, passes, first)
         if sigma is None or np.isinf(sigma[shot, :4]).all():
-            return None, np.zeros((0, 2)), 0.0
+            return None, np.zeros((0, 2)), np.zeros((2, 0, 2)), 0.0
         own = np.minimum(sigma[shot, :4], 1e3)
         width = tolerance * np.sqrt(np.mean(fitted**2, axis=0))
         spread = square * covariance + (J * own[:, None] ** 2) @ np.swapaxes(J, 1, 2)
@@ -477,7 +508,10 @@ class OfTurns(Search):
         free = np.full(planes.shape[:2], 2)
         every = np.ones(planes.shape, dtype=bool)
         split = Split.of(planes, spreads, kicked.reshape(2, 2, -1), every, free, np.inf)
-        return split, distance(planes, spreads), blur
+        unlike = [planes - np.median(planes, axis=0)]
+        unlike.append(_beyond_a_fault(planes, spreads, stated[:, :4]))
+        changes = np.stack([distance(own, spreads) for own in unlike])
+        return split, distance(planes, spreads), changes, blur
 
     def _carried(
         self, data: Measurement, passes: Passes, first: NDArray[np.intp]
@@ -546,17 +580,43 @@ class OfTurns(Search):
         if not found or found[0].gain < GAIN:
             return []
         order = list(ASSUMPTIONS).index
-        found += gains(sorted({
+        alone = {own.names: own.left for own in found}
+        both = gains(sorted({
             tuple(sorted({*one.names, *two}, key=order))
             for one in found[:BEAM] for two in several if not _same_part(one.names[0], two[0])
         } - set(several)))  # fmt: skip
-        return [own for own in found if own.worth > GAIN]
+        found += [
+            own
+            for own in both  # two have to leave less than each of them
+            if LEFT * own.left < min(alone.get((name,), np.inf) for name in own.names)
+        ]
+        return [own for own in found if own.worth > GAIN
+                and not (own.of.endswith("launches") and own.after < TOO_WELL)]  # fmt: skip
 
     def corrected(self, names: Names) -> Self:
         """Return the search with assumptions corrected in the data."""
         data = self.assumed(names)
         sections = {1.0: self._section(self._times(data))}
         return replace(self, data=data, _sections=sections, _found={}, _made={})
+
+
+def _beyond_a_fault(miss: Array, spread: Array, launches: Array) -> Array:
+    """Mismatches of launches [shot, plane, 2] less their part that is a constant and a linear map
+    of the plane's launches [shot, 4], as kicks and gradients make it, by least absolute values."""
+    left = miss.copy()
+    size = np.sqrt(np.einsum("...ii->...i", spread))
+    number = len(miss)
+    for plane in (0, 1):
+        stated = launches[:, 2 * plane : 2 * plane + 2]
+        made = np.column_stack([np.ones(number), stated / np.maximum(np.abs(stated).max(0), TINY)])
+        target, weight = miss[:, plane] / size[:, plane], np.ones(number)
+        for _ in range(ROUNDS):
+            root = np.sqrt(weight)[:, None]
+            found = np.linalg.lstsq(root * made, root * target, rcond=None)[0]
+            rest = target - made @ found
+            weight = 1 / np.maximum(np.linalg.norm(rest, axis=1), 1.0)
+        left[:, plane] = rest * size[:, plane]
+    return np.asarray(left * np.sqrt(number / max(number - made.shape[1], 1)))
 
 
 def _same_part(one: str, other: str) -> bool:

@@ -389,6 +389,17 @@ class Sections:
             end_kicked=J[most] @ (moved_start - carried_back),
         )
 
+    def predicted(self, launches: Array, shot: Places) -> Array:
+        """Readings of one turn [pass, monitor, 2] by launches [pass, 5] of shots, m."""
+        seen, way, _ = self._made
+        x, group = launches, self.group[shot]
+        read = np.zeros((len(launches), len(self.monitors), 2))
+        for w, members in enumerate(self._members):
+            read[:, members] = seen[group[:, None], members](x[:, None])[0]
+            ends = np.clip(way[group, w](x)[0][:, :4], -FARTHEST, FARTHEST)
+            x = np.concatenate([np.nan_to_num(ends), x[:, 4:]], axis=1)
+        return np.clip(np.nan_to_num(read), -FARTHEST, FARTHEST)
+
     def carried(self, launches: Array, shot: Places, turns: int) -> tuple[Array, Array]:
         """Launches [pass, 5] of shots after whole turns, and the slopes [pass, 4, 4]."""
         _, way, _ = self._made
