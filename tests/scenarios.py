@@ -372,6 +372,12 @@ def rf_zeros(data: Any, rng: np.random.Generator) -> Any:
     return replace(data, rf=replace(data.rf, orbit=orbit))
 
 
+def rf_outliers(data: Any, rng: np.random.Generator) -> Any:
+    orbit = data.rf.orbit.copy()
+    orbit[[5, 15, 25]] += 1e-3 * rng.standard_normal((3, 2))
+    return replace(data, rf=replace(data.rf, orbit=orbit))
+
+
 def rf_copied(data: Any, rng: np.random.Generator) -> Any:
     """The design's dispersion, cell by cell the same."""
     orbit = data.rf.orbit.copy()
@@ -621,7 +627,8 @@ DEFECTS = (
     defect("the noise is stated ten times too large", noise_times(10.0), "noise is too large"),
     defect("no noise is stated", no_noise, "noise of the readings is not stated"),
     defect("no step of the RF", no_rf, "there is no RF step"),
-    defect("three zeros in the RF's orbit", rf_zeros, "RF's orbit"),
+    defect("three zeros in the RF's orbit", rf_zeros, "0 m, which no beam reads"),
+    defect("three outliers in the RF's orbit", rf_outliers, "RF's orbit"),
     defect("the RF's orbit is a copy", rf_copied, "simulated, not measured"),
     defect("zeros across", readings(zeros_across), "no corrector is read in the other plane"),
     defect("one-sided steps", lambda data, rng: data, made={"one_sided": True}),

@@ -208,8 +208,11 @@ def _report(
     small: FittedErrors | None,
     options: PartOptions,
     made: Mapping[str, Any],
+    refuted: bool = False,
 ) -> Diagnosis:
-    judgement = options.judgement
+    """The diagnosis; without its causes if they are refuted: by held-out readings, or because no
+    beam is stored with them and the distributed errors."""
+    judgement, given = options.judgement, (ring, parts, problem, found, small, options, made)
     found = finished(_by_ring(ring, problem, found))
     result = found.fit
     problem = problem.near(result.causes)
@@ -221,7 +224,9 @@ def _report(
     estimated = any(part.estimated for part in parts)
     findings = findings_of(ring, found, dead, judgement)
     fitted = Block("fitted readings", result.chi2, freedom(found.problem, result))
-    verdict, findings, messages = verdict_of(found, findings, fitted.p_value, estimated, judgement)
+    verdict, findings, messages = verdict_of(
+        found, findings, fitted.p_value, estimated, judgement, refuted
+    )
     if verdict == "none" and small is not None and small.errors and problem.alone:
         verdict = "distributed"  # the gap is of distributed errors; a reference has them too
     elif verdict != "distributed" and result.outcome is not Outcome.CONVERGED:
@@ -252,6 +257,8 @@ def _report(
         if turns.estimated:
             notes.append(noise_text(_noise(parts)))
         notes += about_launches(turns, findings)
+    if causes and (stages[-1].share < 1 or (heldout is not None and heldout.refutes)):
+        return _report(*given, refuted=True)
     warnings = [*stated, *notes, *messages, *too_large(stages)]
     corrected = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
