@@ -209,8 +209,9 @@ def test_real_sextupoles_with_coils_make_the_chromaticity(name, energy, count, d
         found = ring_from_at(lattice, name)
     assert found.counts()["sextupole"] == count
     ours = off_momentum(Chain.from_ring(found, 6), found.length).chromaticity
-    # second-order maps have the edges of bends but to second order: 0.2 in y of a small ring
-    np.testing.assert_allclose(ours, exact_chromaticity(found), rtol=0, atol=0.25)
+    # second-order maps have the edges of bends but to second order: 0.2 in y of a small ring; and
+    # AT's bends with a gradient lack what its curvature adds, which MAD-X and Xsuite have
+    np.testing.assert_allclose(ours, exact_chromaticity(found), rtol=0, atol=0.3)
     lattice.disable_6d()
     np.testing.assert_allclose(ours[0], at.get_chrom(lattice)[0], rtol=0, atol=0.1)
     np.testing.assert_allclose(

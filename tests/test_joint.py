@@ -9,6 +9,7 @@ import pytest
 from tests.command import tmlattice
 from tmlattice import Cause, diagnose, simulate, write_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.rf import speed_of
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.effects import apply, background_rms, find, monitors_with
 from tmlattice.errors import EffectError, MeasurementError
@@ -42,7 +43,8 @@ def _dispersion(ring, causes, seed=2):
     model = ResponseModel(apply(ring, causes))
     step = 5e-4 / model.rf_start[5]
     read = np.einsum("mij,mj->mi", monitors_with(ring, causes).matrix(), model.rf_change(step))
-    one = RfStep(5e8, 100, step * 5e8, _noisy(read, seed))
+    frequency = 180 * speed_of(ring) / ring.length
+    one = RfStep(frequency, 180, step * frequency, _noisy(read, seed))
     return Dispersion(steps=(one,), monitors=_names(ring), noise=(NOISE, NOISE))
 
 

@@ -61,7 +61,7 @@ def test_unstable_rings_are_counted_apart(small_ring):
 
 def test_a_sextupole_is_found(small_ring):
     name = next(e.name for e in small_ring.magnets if e.kind == "sextupole")
-    case = run_case(small_ring, name, "sparse", change=-0.5, shots=4, noise=1e-8,
+    case = run_case(small_ring, name, "sparse", change=-0.5, shots=4, noise=2e-7,
                     launch=(1e-3, 0.0, 1e-3, 0.0))  # fmt: skip
     assert case.right, case
 

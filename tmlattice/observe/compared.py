@@ -56,6 +56,8 @@ correlation with the design."""
 ALIKE, APART = 0.95, 0.2
 """Correlation of what was read at a BPM, or by a corrector, with the design's of another one, and
 by how much more than with its own, from which it has the name of that one."""
+MOST = 0.1
+"""Share of them that may be unlike each: in a design far off some are alike by chance, not all."""
 LABELS = 2
 """Names that a diagnosis finds exchanged by itself, at most."""
 MOVED = 0.75
@@ -187,7 +189,7 @@ def names_of_others(
     here, best = linear_sum_assignment(-alike)
     then, now = alike[here, best], np.diag(alike)
     moved = np.flatnonzero((then > ALIKE) & (now < then - APART))
-    if len(moved) <= LABELS or np.median(then) < ALIKE:
+    if len(moved) <= LABELS or np.quantile(then, MOST) < ALIKE:
         return "", moved[:0]
     pairs = [f"{names[kept[i]]} has what {names[kept[best[i]]]} should have" for i in moved]
     return (f"{len(moved)} {what}s have the names of others: {first_of(pairs, 3)}; give each "

@@ -217,11 +217,11 @@ def _pairs(
     found: list[Label] = []
     for a, b in pairs:
         crossed = left[a, b] < SHARE * left[a, a] and left[b, a] < SHARE * left[b, b]
-        pair = (names[a], names[b])
-        if crossed and not any(set(pair) & set(label.elements) for label in found):
-            gain = left[a, a] + left[b, b] - left[a, b] - left[b, a]
+        statistic = float(left[a, a] + left[b, b] - left[a, b] - left[b, a]) / noise**2
+        pair, seen = (names[a], names[b]), statistic > SIGNIFICANT**2
+        if crossed and seen and not any(set(pair) & set(label.elements) for label in found):
             columns = (int(a), int(b)) if what == "correctors" else ()
-            found.append(Label(f"swapped {what}", pair, columns, statistic=float(gain / noise**2)))
+            found.append(Label(f"swapped {what}", pair, columns, statistic=statistic))
     return found
 
 
