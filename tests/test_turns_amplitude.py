@@ -11,8 +11,6 @@ from numpy.testing import assert_allclose
 from tests.scenarios import ring_of
 from tmlattice import Cause, diagnose, load_ring
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.layers import Layers
-from tmlattice.beam.nonlinear import third_orders
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.errors import MeasurementError
@@ -46,8 +44,7 @@ def tracked(ring, launch, turns):
     model = ResponseModel(ring)
     state = model.state.copy()
     state[:4] += launch
-    layers = Layers.of(model.maps, third_orders(model.layers))
-    return positions(state[None], turns, layers, cavities_of(ring, model))[0]
+    return positions(state[None], turns, model.turn, cavities_of(ring, model))[0]
 
 
 @pytest.mark.parametrize("launch", [(2e-3, 0, 1e-3, 0), (-1e-3, 1e-4, 2e-3, -1e-4)])

@@ -282,6 +282,11 @@ class ResponseModel:
         """Whether a monitor reads behind the corrector, [column, monitor]."""
         return np.asarray(self.maps.at[None] > columns.layer[:, None])
 
+    @property
+    def turn(self) -> Layers:
+        """A copy of the layers of one turn, with their third order."""
+        return Layers.of(self.maps, third_orders(self.layers))
+
     def closed_orbits(self, correctors: Sequence[str], kicks: Sequence[float] | Array) -> Array:
         """The closed orbit with one corrector stepped, not linearised, m, [orbit, monitor, 2].
 
@@ -296,7 +301,7 @@ class ResponseModel:
             UnstableRingError: no closed orbit is found.
         """
         n, ring = self.dimension, self.ring
-        turn = Layers.of(self.maps, third_orders(self.layers))
+        turn = self.turn
         layer = np.empty(len(correctors), dtype=np.int64)
         replaced = []
         paths = np.empty((len(correctors), turn.steps + 1, n))

@@ -51,28 +51,23 @@ def _places(third, z, b):  # type: ignore[no-untyped-def]
 
 
 @jit
-def bend(third, x, px, y, py):  # type: ignore[no-untyped-def]
-    """Change of x + i y and px + i py at a layer's exit by the third order of its magnet."""
-    one, two, three = _places(third, x + 1j * y - third[3], px + 1j * py)
+def bend_state(third, x):  # type: ignore[no-untyped-def]
+    """Add the third order of a layer's magnet to the state at its exit, [n]."""
+    if third[0] == 0 and third[2] == 0:
+        return
+    one, two, three = _places(third, x[0] + 1j * x[2] - third[3], x[1] + 1j * x[3])
     late = third[0] * one * one * three.conjugate()
     middle = -(third[2] * two * two * two).conjugate()
-    return third[1] * (late / 4 + middle / 2), late + middle
-
-
-@jit
-def bend_state(third, x):  # type: ignore[no-untyped-def]
-    """Add `bend` to a state [n]."""
-    if third[0] != 0 or third[2] != 0:
-        place, slope = bend(third, x[0], x[1], x[2], x[3])
-        x[0] += place.real
-        x[1] += slope.real
-        x[2] += place.imag
-        x[3] += slope.imag
+    place, slope = third[1] * (late / 4 + middle / 2), late + middle
+    x[0] += place.real
+    x[1] += slope.real
+    x[2] += place.imag
+    x[3] += slope.imag
 
 
 @jit
 def bend_tangent(third, x, tangent):  # type: ignore[no-untyped-def]
-    """Add `bend` to a state [n], and its derivative to the tangent [n, n] there."""
+    """Do the same, and add its derivative to the tangent [n, n] there."""
     if third[0] == 0 and third[2] == 0:
         return
     one, two, three = _places(third, x[0] + 1j * x[2] - third[3], x[1] + 1j * x[3])

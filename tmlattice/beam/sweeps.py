@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
-from tmlattice.beam.nonlinear import bend
+from tmlattice.beam.nonlinear import bend_state
 from tmlattice.beam.threads import share
 from tmlattice.compiled import jit, jit_sums
 
@@ -114,14 +114,9 @@ def turn(first, last, size, W0, W1, W2, curved, third, exits, rf, states):  # ty
             if k > 0:
                 x, y = states[block, k - 1], states[block, k]
                 _polynomial(size, k - 1, W0, W1, W2, curved, x, y)
-                high = third[k - 1]
-                if high[0] != 0 or high[2] != 0:
+                if third[k - 1, 0] != 0 or third[k - 1, 2] != 0:
                     for v in range(lanes):
-                        place, slope = bend(high, y[0, v], y[1, v], y[2, v], y[3, v])
-                        y[0, v] += place.real
-                        y[1, v] += slope.real
-                        y[2, v] += place.imag
-                        y[3, v] += slope.imag
+                        bend_state(third[k - 1], y[:, v])
             for c in range(len(exits)):
                 if exits[c] == k:
                     for v in range(lanes):

@@ -125,20 +125,14 @@ def check_data(
     names = [monitor.name for monitor in ring.monitors]
     data, cut = recorded(data, names)
     checks = [*(note("names", sentence) for sentence in absent),
-              *(note("recording", sentence) for sentence in cut), _stated(ring, data),
-              *_period(ring, data)]  # fmt: skip
-    few = signals.few(ring, data)
-    if few is None:
+              *(note("recording", sentence) for sentence in cut)]  # fmt: skip
+    if signals.few(ring, data) is None:
         data = assume(in_beam_order(data, names), assumed, names)
         if isinstance(data, Measurement):
             data, spoilt = without_spoilt(ring, data)
             checks += [note(name, spoilt[name]) if name in spoilt else fine(name, text)
                        for name, text in UNSPOILT.items()]  # fmt: skip
-            checks += _of_first_turns(ring, data, expected_radiation(ring) if radiation else ())
-        else:
-            checks += _of_compared(ring, data)
-    else:
-        checks.append(few)
+    checks += _whole(ring, data, radiation)
     plain = "trajectory" if isinstance(data, Measurement) else "orbit_response"
     kind = next((name for name, own in STORED.items() if isinstance(data, own.record)), plain)
     provenance = {
@@ -151,6 +145,18 @@ def check_data(
     return Checkup(kind, tuple(checks), provenance)
 
 
+def _whole(ring: Ring, data: AnyMeasurement, radiation: bool) -> list[Check]:
+    """The checks of data without readings that are rejected."""
+    checks = [_stated(ring, data), *_period(ring, data)]
+    if (few := signals.few(ring, data)) is not None:
+        return [*checks, few]
+    if isinstance(data, Measurement):
+        known = expected_radiation(ring) if radiation else ()
+        return [*checks, *_of_first_turns(ring, data, known)]
+    data = in_beam_order(data, [monitor.name for monitor in ring.monitors])
+    return [*checks, *_of_compared(ring, data)]
+
+
 _REPORTED = ("energy", "copied BPMs", "lost beam", GLOBAL, "launches")
 """Notes that the diagnosis does not find by itself."""
 
@@ -161,17 +167,21 @@ def data_checks(
     radiation: bool = False,
     reference: Measurement | OrbitResponse | None = None,
 ) -> list[str]:
-    """The notes on these data, and on a reference, for a diagnosis.
+    """The notes on these data, and on a reference, for a diagnosis: without what is rejected
+    before, see `check_data`.
 
     Raises:
         MeasurementError: a check failed.
-        UnknownNameError: see `check_data`.
     """
-    own = check_data(ring, data, radiation=radiation)
+
+    def of(one: Measurement | OrbitResponse) -> Checkup:
+        return Checkup("", tuple(_whole(ring, one, radiation)), {})
+
+    own = of(data)
     if reference is None:
         own.stop()
         return [check.sentence for check in own.reported if check.name in _REPORTED]
-    other = check_data(ring, reference, radiation=radiation)
+    other = of(reference)
     wrong, as_wrong = (
         {check.name for check in one.checks if check.status == "wrong"} for one in (own, other)
     )
@@ -403,11 +413,11 @@ def _launches(checked: OfTurns) -> Check:
     usual, most = float(np.median(unlike)) if good.any() else 0.0, SIGNIFICANT**2
     scaled = usual > most and max(ratio, 1 / ratio) > FACTOR
     if good.sum() > FEW and (beyond.max() > most or scaled):
-        odd = unlike > max(most, MISSTATED**2 * usual)
+        alone = unlike > max(most, MISSTATED**2 * usual)
         which, size = "of every shot", usual
-        if usual < most and odd.any():
-            ids = ", ".join(str(data.shots[i]) for i in np.flatnonzero(good)[odd])
-            which, size = f"of shot {ids}", float(unlike[odd].min())
+        if usual < most and alone.any():
+            ids = ", ".join(str(data.shots[i]) for i in np.flatnonzero(good)[alone])
+            which, size = f"of shot {ids}", float(unlike[alone].min())
         times = ""
         if scaled:
             times = f", being {ratio:.2g} times these (is that the unit or size of the readings?)"

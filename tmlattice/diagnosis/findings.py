@@ -192,12 +192,11 @@ def verdict_of(
     p_value: float,
     estimated: bool,
     judgement: Judgement,
-    refuted: bool = False,
+    refuted: str = "",
 ) -> tuple[str, tuple[Finding, ...], tuple[str, ...]]:
     """The verdict, the accepted findings, and the notes."""
     _, far_more = judgement.noise
-    worse = "with them the gap of the held-out readings stays; are all settings of the shots given?"
-    if findings and (why := worse if refuted else _no_solution(explanation)):
+    if findings and (why := refuted or _no_solution(explanation)):
         return "distributed", (), (f"no cause is named: {why}",)
     if explanation.full and explanation.scan.chance < judgement.false_alarm:
         many = f"as many as {len(findings)} causes do" if len(findings) > 1 else "one cause does"

@@ -208,10 +208,9 @@ def _report(
     small: FittedErrors | None,
     options: PartOptions,
     made: Mapping[str, Any],
-    refuted: bool = False,
+    refuted: str = "",
 ) -> Diagnosis:
-    """The diagnosis; without its causes if they are refuted: by held-out readings, or because no
-    beam is stored with them and the distributed errors."""
+    """The diagnosis; without its causes if they are refuted, for this reason."""
     judgement, given = options.judgement, (ring, parts, problem, found, small, options, made)
     found = finished(_by_ring(ring, problem, found))
     result = found.fit
@@ -257,8 +256,10 @@ def _report(
         if turns.estimated:
             notes.append(noise_text(_noise(parts)))
         notes += about_launches(turns, findings)
-    if causes and (stages[-1].share < 1 or (heldout is not None and heldout.refutes)):
-        return _report(*given, refuted=True)
+    if causes and stages[-1].share < 1:
+        return _report(*given, refuted="no beam is stored with them and the distributed errors")
+    if causes and heldout is not None and heldout.refutes:
+        return _report(*given, refuted="with them the gap of the held-out readings stays")
     warnings = [*stated, *notes, *messages, *too_large(stages)]
     corrected = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]

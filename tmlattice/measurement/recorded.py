@@ -66,7 +66,7 @@ def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]
         nonlocal own
         if bad.any():
             names = [own.monitors[m] for m in np.flatnonzero(bad.any(axis=(0, 2)))]
-            said.append(f"{bad.sum()} readings are {what}, and are left out, of "
+            said.append(f"{bad.sum()} readings are {what}, and are rejected, of "
                         f"{first_of(names, SHOWN)}; {correction}")  # fmt: skip
             left = np.where(bad, np.nan, _rows(own))
 

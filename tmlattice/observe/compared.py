@@ -46,11 +46,9 @@ OF_RF = 1.4
 UNRELATED, RESEMBLING = 1.5, 0.5
 """Or: typical misfits before and after, of columns that were unrelated and now resemble the
 design."""
-SCALES, NEAR, SIMILAR = (
-    {"kicks-doubled": 2.0, "kicks-halved": 0.5, "rf-doubled": 2.0, "rf-halved": 0.5},
-    0.15,
-    0.8,
-)
+SCALES = {f"{what}-{by}": factor for what in ("kicks", "rf")
+          for by, factor in (("doubled", 2.0), ("halved", 0.5))}  # fmt: skip
+NEAR, SIMILAR = 0.15, 0.8
 """Or: ratio of the typical column to the design's, tolerance of its logarithm, and smallest
 correlation with the design."""
 ALIKE, APART = 0.95, 0.2
@@ -59,7 +57,7 @@ by how much more than with its own, from which it has the name of that one."""
 MOST = 0.1
 """Share of them that may be unlike each: in a design far off some are alike by chance, not all."""
 LABELS = 2
-"""Names that a diagnosis finds exchanged by itself, at most."""
+"""Names that a diagnosis finds swapped by itself, at most."""
 MOVED = 0.75
 """Quantile of the readings of a column that are those of the plane that is moved."""
 SEEN = 1e-3
@@ -143,9 +141,19 @@ class OfColumns(Compared):
         """Columns as read, and as the design makes them, [column, monitor, 2], and the squares of
         the noise of their difference."""
 
+    def scale(self) -> float:
+        """Ratio of the typical corrector's column to the design's; NaN without one, or if they are
+        unrelated."""
+        return float("nan")
+
     def rf_scale(self) -> float:
         """Ratio of the RF's orbit to the design's; NaN without one, or if they are unrelated."""
         return float("nan")
+
+    def is_scale(self, name: str) -> bool:
+        """See `Compared`."""
+        scale = self.rf_scale() if name.startswith("rf-") else self.scale()
+        return name in SCALES and abs(np.log(scale / SCALES[name])) < NEAR
 
     def misfit(self, names: Names = ()) -> Array:
         """See `Compared`: |measured - design|^2 over the mean of both squares, beyond the noise."""
@@ -178,7 +186,7 @@ def names_of_others(
         what: a BPM, or a corrector.
         names: of them.
         read, made: as read and as the design makes it, NaN where missing.
-        same: which may be exchanged, [name, name].
+        same: which may be swapped, [name, name].
     """
     a, b = (np.nan_to_num(own.reshape(len(own), -1)) for own in (read, made))
     there = np.isfinite(read).reshape(a.shape)
@@ -246,14 +254,9 @@ class OfResponse(OfColumns):
         return np.array(read), np.array(made), 0.0
 
     def scale(self) -> float:
-        """Ratio of the typical corrector's column to the design's; NaN if they are unrelated."""
+        """See `OfColumns`."""
         read, made, _ = self.pairs(replace(self.data, rf=None))
         return ratio(read, made)
-
-    def is_scale(self, name: str) -> bool:
-        """See `Compared`."""
-        scale = self.rf_scale() if name[:2] == "rf" else self.scale()
-        return name in SCALES and abs(np.log(scale / SCALES[name])) < NEAR
 
     def rf_scale(self) -> float:
         """See `OfColumns`."""
@@ -325,10 +328,6 @@ class OfOrbits(OfColumns):
         """See `OfColumns`."""
         read, made, _ = self.pairs(self.data)
         return ratio(read, made) if isinstance(self.data, Dispersion) else float("nan")
-
-    def is_scale(self, name: str) -> bool:
-        """See `Compared`."""
-        return name in SCALES and abs(np.log(self.rf_scale() / SCALES[name])) < NEAR
 
     def candidates(self) -> list[Names]:
         """Return the assumptions that these data allow."""

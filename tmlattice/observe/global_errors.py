@@ -448,11 +448,10 @@ class OfTurns(Search):
         return np.where(there, read - mean_pass(read, there), np.nan), made - made.mean(axis=0)
 
     def launches(self, square: float, tolerance: float) -> tuple[Array, Array, Array, float]:
-        """Mean squares of fitted less stated launches by plane, [shot, 2]; the same less
-        their median, and less what a fault before the first monitors makes, [2, shot, 2]; the
-        misfit of the sections that
-        determine them, [shot]; and the ratio of the fitted to the stated ones, NaN where they are
-        not proportional."""
+        """Mean squares of fitted less stated launches by plane, [shot, 2]; the same less their
+        median, and less what a fault before the first monitors makes, [2, shot, 2]; the misfit of
+        the sections that determine them, [shot]; and the ratio of the fitted to the stated ones,
+        NaN where they are not proportional."""
         passes, found = self.found(self.data)
         first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
         _, each, changes, _ = self._launch(self.data, passes, found, square, False, tolerance)

@@ -45,17 +45,18 @@ def without_spoilt(ring: Ring, data: Measurement) -> tuple[Measurement, dict[str
         return data, said
     data = in_beam_order(data, [monitor.name for monitor in ring.monitors])
     outliers: list[Place] = []
-    odd: list[int] = []
+    unlike: list[int] = []
     for shots in np.array_split(np.arange(count), -(-count // SHOTS)):
-        some = data.select(shots=[data.shots[i] for i in shots])
         try:
-            own = _odd(OfTurns(ring, some))
+            search = OfTurns(ring, data.select(shots=[data.shots[i] for i in shots]))
+            own = _unlike(search)
             left = [i for i in range(len(shots)) if i not in own]
-            some = data.select(shots=[data.shots[shots[i]] for i in left])
-            found = _outliers(OfTurns(ring, some))
+            if own:
+                search = OfTurns(ring, data.select(shots=[data.shots[shots[i]] for i in left]))
+            found = _outliers(search)
         except MeasurementError:  # nothing can be fitted; reported elsewhere
             continue
-        odd += [int(shots[i]) for i in own]
+        unlike += [int(shots[i]) for i in own]
         outliers += [(int(shots[left[i]]), turn, m, plane) for i, turn, m, plane in found]
     if outliers:
         bad = np.zeros(data.readings.shape, dtype=bool)
@@ -64,12 +65,12 @@ def without_spoilt(ring: Ring, data: Measurement) -> tuple[Measurement, dict[str
             f"{data.monitors[m]} in {'xy'[plane]}, shot {data.shots[i]}, turn {turn}"
             for i, turn, m, plane in sorted(outliers)
         ]
-        said["outliers"] = f"outliers, left out: {first_of(names)}; leave them empty"
+        said["outliers"] = f"outliers, rejected: {first_of(names)}; leave them empty"
         data = replace(data, readings=np.where(bad, np.nan, data.readings))
-    if odd:
-        ids = [data.shots[i] for i in odd]
+    if unlike:
+        ids = [data.shots[i] for i in unlike]
         said["shots"] = (
-            f"shot {', '.join(map(str, ids))} is left out: it follows no trajectory of "
+            f"shot {', '.join(map(str, ids))} is rejected: it follows no trajectory of "
             f"'{ring.name}', and the others do; record it again, or correct its readings or "
             "settings"
         )
@@ -77,7 +78,7 @@ def without_spoilt(ring: Ring, data: Measurement) -> tuple[Measurement, dict[str
     return data, said
 
 
-def _odd(search: OfTurns) -> list[int]:
+def _unlike(search: OfTurns) -> list[int]:
     """Shots of which sections leave more of the orbit than those of all others."""
     passes, found = search.found(search.data)
     number = len(search.data.shots)
@@ -102,11 +103,11 @@ def _outliers(search: OfTurns) -> list[Place]:
     if not fits.share(passes) < HALF:
         return []
     most = SPOILT * fits.level
-    odd = (fits.freedom > 2) & (fits.misfit > most) & (np.median(fits.misfit, axis=0) < most)
+    bad = (fits.freedom > 2) & (fits.misfit > most) & (np.median(fits.misfit, axis=0) < most)
     taken: dict[tuple[int, int], list[Place]] = {}
     readings = data.readings.copy()
     for _ in range(ROUNDS):
-        each = {(int(p), int(w)): _worst(passes, fits, p, w) for p, w in np.argwhere(odd)}
+        each = {(int(p), int(w)): _worst(passes, fits, p, w) for p, w in np.argwhere(bad)}
         worst = {own: place for own, place in each.items() if place is not None}
         for own, place in worst.items():
             taken.setdefault(own, []).append(place)
@@ -114,9 +115,9 @@ def _outliers(search: OfTurns) -> list[Place]:
         if not worst:
             break
         passes, fits = search.found(replace(data, readings=readings.copy()))
-        if fits.misfit.shape != odd.shape:  # nothing is left of a turn
+        if fits.misfit.shape != bad.shape:  # nothing is left of a turn
             return []
-        odd &= (fits.freedom > 2) & (fits.misfit > most)
+        bad &= (fits.freedom > 2) & (fits.misfit > most)
     good = fits.misfit < most
     return [place for own, places in taken.items() if good[own] for place in places]
 

@@ -32,8 +32,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
-from tmlattice.beam.layers import Layers
-from tmlattice.beam.nonlinear import third_orders
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
@@ -171,7 +169,7 @@ def _tracked(
     """Lines of the design over their amplitudes [shot, monitor, 2, mode], tunes and actions [shot,
     mode], and whether the beam survived [shot], for about these amplitudes [shot, mode], of which
     the last is small."""
-    layers = Layers.of(beam.model.maps, third_orders(beam.model.layers))
+    layers = beam.model.turn
     names = tuple(monitor.name for monitor in ring.monitors)
 
     def seen(launched: ComplexArray, turns: int) -> tuple[ComplexArray, Lines, Flags]:
