@@ -9,6 +9,7 @@ from places import PLACES
 
 from tests.scenarios import ring_of
 from tmlattice import TaylorNetwork, load_ring
+from tmlattice.beam.model import Model
 from tmlattice.effects import CATALOGUE, Cause, ReadingEffect, apply
 from tmlattice.effects.effect import RingEffect
 from tmlattice.errors import LatticeError
@@ -149,6 +150,13 @@ def test_a_first_turn_of_millimetres_follows_at_through_strong_sextupoles():
     lacks = np.sqrt(((at - second) ** 2).mean())
     assert lacks > 2e-5
     assert np.sqrt(((at - ocelot) ** 2).mean()) < 0.05 * lacks
+    model, own = Model(ring, [{}] * 2, known=causes), launches[:, [0, 1, 2, 3, 5]]
+    np.testing.assert_allclose(model.readings(own), ocelot, rtol=0, atol=1e-12)
+    slopes, step = model.paths(own).launch, 1e-7
+    for coordinate, change in enumerate(step * np.eye(5)):
+        measured = (model.readings(own + change) - model.readings(own - change)) / (2 * step)
+        size = np.abs(measured).max()
+        np.testing.assert_allclose(slopes[..., coordinate], measured, atol=1e-6 * size)
 
 
 def test_a_rolled_bend_with_a_gradient_kicks_alike_in_both_engines(small_ring):
