@@ -26,9 +26,9 @@ from tmlattice.beam.nonlinear import third_orders
 from tmlattice.beam.settle import settle
 from tmlattice.beam.threads import share
 from tmlattice.errors import MeasurementError, UnstableRingError
-from tmlattice.lattice import Element, Ring
+from tmlattice.lattice import Ring
 from tmlattice.maps import LayerMaps, RingMaps, changed_maps, ring_maps
-from tmlattice.maps.quadratic import Quadratic, difference, each_after
+from tmlattice.maps.quadratic import Quadratic, slopes, stacked
 from tmlattice.maps.taylor import second_derivatives
 
 KICK = 1e-4
@@ -347,29 +347,26 @@ class ResponseModel:
     def _kicks(self, place: Indices, layer: Indices) -> tuple[Array, Array]:
         """Correctors' kicks at their layers' exits, [column, n], and their slopes by the state at
         the entrances, [column, n, n]; the maps are the same on every orbit."""
-        memory, key = self.layers.memory, ("kicks", place.tobytes())
-        if key not in memory:
-            slopes = [self._map_slope(self.ring.elements[i]) for i in place]
-            ways = [self.layers.way(int(k)) for k in layer]
-            B, R, T = each_after(slopes, ways, self.dimension)
-            memory[key] = B, R, 2 * T
-        W0, W1, curved = memory[key]
-        x = self.path[layer]
-        bent = np.einsum("caij,cj->cai", curved, x)
-        return W0 + np.einsum("cai,ci->ca", W1 + bent / 2, x), W1 + bent
-
-    def _map_slope(self, corrector: Element) -> Quadratic:
-        """d map / d kick; shared by equal correctors."""
-        layers = self.layers
-        key = ("kick", layers.physics(corrector))
+        layers, n, key = self.layers, self.dimension, ("kicks", place.tobytes())
         if key not in layers.memory:
+            correctors = [self.ring.elements[i] for i in place]
+            physics = [layers.physics(element) for element in correctors]
+            different = dict(zip(physics, correctors, strict=True))
             ends = [
-                (side, layers.map(corrector.changed(angle=corrector.angle + side * KICK)))
-                for side in (1, -1)
-            ]
-            layers.memory[key] = difference(ends, 2 * KICK)
-        known: Quadratic = layers.memory[key]
-        return known
+                element.changed(angle=element.angle + side * KICK)
+                for element in different.values() for side in (1, -1)
+            ]  # fmt: skip
+            which = {own: i for i, own in enumerate(different)}
+            per_kick = slopes(stacked(layers.maps(ends), n), 2 * KICK)[[which[p] for p in physics]]
+            per_kick = per_kick.after(stacked([layers.way(int(k)) for k in layer], n))
+            layers.memory[key] = per_kick
+        found: Quadratic = layers.memory[key]
+        x = self.path[layer]
+        bent = np.zeros_like(found.R)
+        if found.T is not None:
+            bent = (found.T @ x[:, None, :, None])[..., 0]
+        kick = found.B + ((found.R + bent) @ x[:, :, None])[..., 0]
+        return kick, found.R + 2 * bent
 
 
 def feed_down(

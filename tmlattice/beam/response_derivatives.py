@@ -26,7 +26,7 @@ from tmlattice.compiled import jit_sums
 from tmlattice.effects import RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions, ring_effect
 from tmlattice.errors import EffectError
-from tmlattice.maps.quadratic import Quadratic, difference
+from tmlattice.maps.quadratic import Quadratic, slopes, stacked
 from tmlattice.maps.taylor import second_derivatives
 
 Hypothesis = tuple[str, str | None]
@@ -267,12 +267,12 @@ class ResponseSlopes:
         element, h = layers.ring.elements[place], STEP * effect.largest
         key = (effect.name, layers.physics(element))
         if key not in self._mixes:
-            ends = []
-            for kick, amount in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-                set_to = element.changed(angle=element.angle + kick * KICK)
-                there = effect.changed(set_to, amount * h, layers.ring.energy)
-                ends.append((kick * amount, layers.map(there)))
-            self._mixes[key] = difference(ends, 4 * KICK * h)
+            ends = [
+                effect.changed(element.changed(angle=angle), amount, layers.ring.energy)
+                for angle in (element.angle + KICK, element.angle - KICK) for amount in (h, -h)
+            ]  # fmt: skip
+            by_amount = slopes(stacked(layers.maps(ends), layers.dimension), 2 * h)
+            self._mixes[key] = slopes(by_amount, 2 * KICK).each()[0]
         return self._mixes[key]
 
 

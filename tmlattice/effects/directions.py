@@ -22,7 +22,7 @@ from tmlattice.effects.effect import FamilyEffect, RingEffect, find
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
-from tmlattice.maps.quadratic import Quadratic, Weights, difference
+from tmlattice.maps.quadratic import Quadratic, Weights, quadratic_maps, slopes, stacked
 
 STEP = 1e-3
 """Step of differences over the largest fault: their error is STEP^2 of an effect's nonlinearity."""
@@ -187,10 +187,13 @@ def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) 
         hypotheses: (effect, place); see `Effect.places`.
     """
     ring, n = layers.ring, layers.dimension
-    known: dict[Hashable, Quadratic | None] = {}
-    moved: dict[Hashable, Weights] = {}
-    rows = _Rows(n, n)
-    reads = _Rows(2, n)
+    ends: list[Element] = []
+    steps: list[float] = []
+    known: dict[Hashable, int | None] = {}  # index of the derivative of an element's map
+    pairs: dict[tuple[int, int], int] = {}  # of a derivative and the way to the element
+    ways: list[Quadratic] = []
+    magnets: list[tuple[int, int, int]] = []  # owner, layer, pair
+    rows, reads = _Rows(n, n), _Rows(2, n)
     first_monitor = np.concatenate([[0], np.cumsum([e.kind == "monitor" for e in ring.elements])])
     for owner, (name, place) in enumerate(hypotheses):
         effect = ring_effect(name)
@@ -201,13 +204,19 @@ def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) 
             if element.is_magnet:
                 key = (name, layers.physics(element))
                 if key not in known:
-                    known[key] = _derivative(layers, effect, element, h)
+                    plus, minus = (effect.changed(element, a, ring.energy) for a in (h, -h))
+                    # the same one: a corrector's calibration without a kick
+                    known[key] = None if plus is minus else len(steps)
+                    if plus is not minus:
+                        ends += [plus, minus]
+                        steps.append(2 * h)
                 own = known[key]
                 if own is not None:
                     way = layers.way(k)
-                    if (key, id(way)) not in moved:
-                        moved[key, id(way)] = own.after(way).reduced()
-                    rows.add(owner, k, moved[key, id(way)])
+                    pair = pairs.setdefault((own, id(way)), len(ways))
+                    if pair == len(ways):
+                        ways.append(way)
+                    magnets.append((owner, k, pair))
                 continue
             (up, up_read), (down, down_read) = (
                 layers.layer(k, {member: effect.changed(element, a, ring.energy)}) for a in (h, -h)
@@ -218,21 +227,16 @@ def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) 
                 slope = _slope(a, b, h)
                 if any(m.any() for m in slope):
                     reads.add(owner, int(start + i), slope)
+    if magnets:
+        maps = quadratic_maps(ends, ring.map_energy, n)
+        each = slopes(maps, np.array(steps))[[own for own, _ in pairs]]
+        D0, D1, D2 = each.after(stacked(ways, n)).reduced()
+        for owner, k, pair in magnets:
+            rows.add(owner, k, (D0[pair], D1[pair], D2[pair]))
     return Directions(tuple(hypotheses), *rows.stacked(), *reads.stacked())
 
 
 ARRAYS = ("owner", "layer", "D0", "D1", "D2", "read_owner", "monitor", "E0", "E1", "E2")
-
-
-def _derivative(
-    layers: LayerMaps, effect: RingEffect, element: Element, h: float
-) -> Quadratic | None:
-    """d (map of the element) / d amount; None if the effect does not change it."""
-    energy = layers.ring.energy
-    plus, minus = (effect.changed(element, a, energy) for a in (h, -h))
-    if plus is minus:  # a corrector's calibration without a kick
-        return None
-    return difference([(1, layers.map(plus)), (-1, layers.map(minus))], 2 * h)
 
 
 def _slope(up: Weights, down: Weights, h: float) -> Weights:

@@ -22,13 +22,14 @@ from tmlattice.lattice.ring import KEPT, NO_ERRORS, Element, Errors, Ring
 from tmlattice.maps.quadratic import (
     Quadratic,
     Weights,
-    composed,
     drift,
     identity,
     of_ocelot,
     parts_of,
     physics_of,
     quadratic_map,
+    quadratic_maps,
+    stacked,
 )
 from tmlattice.maps.taylor import TaylorMap
 
@@ -140,9 +141,8 @@ class LayerMaps:
         self._first = np.searchsorted(self.layer_of, np.arange(len(ring.magnets) + 2))
         self._known: dict[Hashable, Quadratic] = {}
         self._kept: list[Any] = []
-        self._ways: dict[int, Quadratic] = {}
-        self._equal: dict[Hashable, Quadratic] = {}
-        self._layers: dict[Hashable, tuple[Weights, list[Weights]]] = {}
+        self._ways: dict[int, tuple[Quadratic, list[Weights]]] = {}
+        self._equal: dict[Hashable, tuple[Quadratic, list[Weights]]] = {}
         self.origin: tuple[LayerMaps, tuple[int, ...]] | None = None
         self.memory: dict[Hashable, Any] = {}
 
@@ -157,9 +157,14 @@ class LayerMaps:
         other.origin = (self, tuple(places))
         other.memory = {}
         moving = (i for i in places if not _both_at_rest(own[i], ring.elements[i]))
-        touched = sorted({int(self.layer_of[i]) for i in moving})
-        other._ways = {k: way for k, way in self._ways.items() if k not in touched}
-        return other, touched
+        touched: set[int] = set()
+        other._ways = self._ways.copy()
+        for i in moving:
+            k = int(self.layer_of[i])
+            touched.add(k)
+            if not own[i].is_magnet:
+                other._ways.pop(k, None)
+        return other, sorted(touched)
 
     @staticmethod
     def physics(element: Element) -> tuple[Hashable, Hashable]:
@@ -168,21 +173,25 @@ class LayerMaps:
 
     def map(self, element: Element) -> Quadratic:
         """Return the map of one element, of this ring or not."""
-        key = self.physics(element)
-        known = self._known.get(key)
-        if known is None:
-            self._forget(self._known)
-            known = self._known[key] = quadratic_map(element, self.ring.map_energy, self.dimension)
-            if isinstance(key[0], int):  # an id: keep its source alive
-                self._kept.append(element.source)
-        return known
+        return self.maps([element])[0]
 
-    def _forget(self, known: Mapping[Hashable, Any]) -> None:
-        """Drop all entries by id when a fit asks for ever new amounts."""
-        if len(known) > KNOWN:
-            for memory in (self._known, self._layers, self._equal):
-                memory.clear()
-            self._kept.clear()
+    def maps(self, elements: Sequence[Element]) -> list[Quadratic]:
+        """Return the maps of elements; together they take a fraction of the time."""
+        if len(self._known) > KNOWN:  # a fit asks for ever new amounts
+            self._known.clear()
+            self._equal.clear()
+            self._kept.clear()  # no entry by id is left
+        keys = [self.physics(element) for element in elements]
+        fresh = {
+            key: element
+            for key, element in zip(keys, elements, strict=True) if key not in self._known
+        }  # fmt: skip
+        if fresh:
+            found = quadratic_maps(list(fresh.values()), self.ring.map_energy, self.dimension)
+            self._known.update(zip(fresh, found.each(), strict=True))
+            # an id: keep its source alive
+            self._kept += [e.source for key, e in fresh.items() if isinstance(key[0], int)]
+        return [self._known[key] for key in keys]
 
     def first_element(self, k: int) -> int:
         """Index in `ring.elements` of the first element of layer k."""
@@ -190,38 +199,55 @@ class LayerMaps:
 
     def way(self, k: int) -> Quadratic:
         """Return the map from the exit of layer k - 1 to its magnet; equal ones are one object."""
+        return self._between(k)[0]
+
+    def _between(self, k: int) -> tuple[Quadratic, list[Weights]]:
+        """The way to the magnet of layer k, and the read-outs of the monitors there; read-only."""
         if k not in self._ways:
-            between = self.ring.elements[self._first[k] : self._first[k + 1] - 1]
-            moving = [e for e in between if _moves(e)]
-            physics = tuple(self.physics(e) for e in moving)
+            own = [self.ring.elements[i] for i in self._ahead(k)]
+            own = [element for element in own if _moves(element) or element.kind == "monitor"]
+            physics = tuple((self.physics(e), e.kind == "monitor") for e in own)
             if physics not in self._equal:
-                parts = [self.map(e) for e in moving]
-                self._equal[physics] = composed([identity(self.dimension), *parts])
+                self._equal[physics] = self._composed(own)
             self._ways[k] = self._equal[physics]
         return self._ways[k]
+
+    def _ahead(self, k: int) -> range:
+        """Indices of the elements before the magnet of layer k."""
+        first, last = self._first[k : k + 2]
+        return range(first, last - (k < len(self.ring.magnets)))
 
     def layer(
         self, k: int, replaced: Mapping[int, Element] | None = None
     ) -> tuple[Weights, list[Weights]]:
         """Return the weights of layer k, and the read-outs of the monitors before its magnet.
 
-        Equal layers share them: they are read-only.
-
         Args:
             k: up to the number of layers, which means the drift from the last magnet to the end.
             replaced: other elements by index in the ring.
         """
-        first, last = self._first[k : k + 2]
-        own = self.ring.elements[first:last]
-        if replaced:
-            return self._composed([replaced.get(first + i, e) for i, e in enumerate(own)])
-        physics = tuple((self.physics(e), e.kind == "monitor") for e in own)
-        if physics not in self._layers:
-            self._forget(self._layers)
-            self._layers[physics] = self._composed(own)
-        return self._layers[physics]
+        given, ahead = replaced or {}, self._ahead(k)
+        if any(i in given for i in ahead):
+            own = (given.get(i, self.ring.elements[i]) for i in ahead)
+            way, readouts = self._composed(own)
+        else:
+            way, readouts = self._between(k)
+        if k < len(self.ring.magnets):
+            magnet = given.get(ahead.stop, self.ring.elements[ahead.stop])
+            way = self.map(magnet).after(way)
+        return way.reduced(), readouts
 
-    def _composed(self, elements: Iterable[Element]) -> tuple[Weights, list[Weights]]:
+    def weights(self, layers: Sequence[int]) -> Weights:
+        """Return the weights of layers with magnets, stacked; see `layer`."""
+        maps, ways = self.maps([self.ring.magnets[k] for k in layers]), map(self.way, layers)
+        n = self.dimension
+        return stacked(maps, n).after(stacked(list(ways), n)).reduced()
+
+    def readouts(self, k: int) -> list[Weights]:
+        """Return the read-outs of the monitors before the magnet of layer k; read-only."""
+        return self._between(k)[1]
+
+    def _composed(self, elements: Iterable[Element]) -> tuple[Quadratic, list[Weights]]:
         way = identity(self.dimension)
         readouts = []
         for element in elements:
@@ -232,7 +258,7 @@ class LayerMaps:
                 readouts.append((W0[:3:2], W1[:3:2], W2[:3:2]))
             if _moves(element):
                 way = self.map(element).after(way)
-        return way.reduced(), readouts
+        return way, readouts
 
 
 def _both_at_rest(one: Element, other: Element) -> bool:
@@ -283,17 +309,16 @@ def changed_maps(maps: RingMaps, layers: LayerMaps, touched: Sequence[int]) -> R
         touched: layers, up to their number, which means the drift from the last magnet to the end.
     """
     arrays = {name: getattr(maps, name).copy() for name in ("W0", "W1", "W2", "R0", "R1", "R2")}
-    closing = maps.closing
+    end = len(maps.layers)
+    magnets = [k for k in touched if k < end]
+    if magnets:
+        for name, weights in zip(("W0", "W1", "W2"), layers.weights(magnets), strict=True):
+            arrays[name][magnets] = weights
     for k in touched:
-        own, read = layers.layer(k)
-        if k == len(maps.layers):
-            closing = TaylorMap(list(own))
-        else:
-            for name, value in zip(("W0", "W1", "W2"), own, strict=True):
-                arrays[name][k] = value
-        for m, readout in zip(np.flatnonzero(maps.at == k), read, strict=True):
+        for m, readout in enumerate(layers.readouts(k), maps.start[k]):
             for name, value in zip(("R0", "R1", "R2"), readout, strict=True):
                 arrays[name][m] = value
+    closing = TaylorMap(layers.layer(end)[0]) if end in touched else maps.closing
     return replace(maps, closing=closing, **arrays)
 
 
@@ -327,22 +352,15 @@ def _read(ring: Ring, dimension: int, content: bytes) -> RingMaps:
 
 def _made(ring: Ring, dimension: int, layers: LayerMaps) -> RingMaps:
     magnets = ring.magnets
-    weights: list[Weights] = []
-    readouts: list[Weights] = []
-    at: list[int] = []
-    for k in range(len(magnets) + 1):
-        own, read = layers.layer(k)
-        weights.append(own)
-        readouts += read
-        at += [k] * len(read)
+    read = [layers.readouts(k) for k in range(len(magnets) + 1)]
     ends = np.cumsum([element.length for element in ring.elements])
     exits = ends[[i for i, element in enumerate(ring.elements) if element.is_magnet]]
-    *chain, closing = weights
-    W0, W1, W2 = (np.ascontiguousarray(w) for w in map(np.stack, zip(*chain, strict=True)))
+    W0, W1, W2 = layers.weights(range(len(magnets)))
     pairs = dimension * (dimension + 1) // 2
     R0, R1, R2 = np.empty((0, 2)), np.empty((0, 2, dimension)), np.empty((0, 2, pairs))
-    if readouts:
-        R0, R1, R2 = (np.ascontiguousarray(r) for r in map(np.stack, zip(*readouts, strict=True)))
+    if any(read):
+        every = (own for some in read for own in some)
+        R0, R1, R2 = (np.array(own) for own in zip(*every, strict=True))
     return RingMaps(
         layers=tuple(e.name for e in magnets),
         s=exits,
@@ -351,11 +369,11 @@ def _made(ring: Ring, dimension: int, layers: LayerMaps) -> RingMaps:
         W2=W2,
         monitors=tuple(e.name for e in ring.monitors),
         s_monitors=np.array([e.s for e in ring.monitors]),
-        at=np.array(at, dtype=np.int64),
+        at=np.repeat(np.arange(len(read)), [len(own) for own in read]),
         R0=R0,
         R1=R1,
         R2=R2,
-        closing=TaylorMap(closing),
+        closing=TaylorMap(layers.layer(len(magnets))[0]),
     )
 
 

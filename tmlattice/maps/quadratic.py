@@ -7,7 +7,8 @@ each x -> B + R x + x^T T x. The parts are composed to second order.
 import cmath
 import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.arrays import Array
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import NO_ERRORS, Element, Slopes
+from tmlattice.lattice.ring import NO_ERRORS, Element, Errors
 
 Weights = tuple[Array, Array, Array]
 Made = TypeVar("Made")
@@ -30,7 +31,10 @@ def _pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """x -> B + R x + x^T T x with T [out, n, n] symmetric in its last two indices, or None if 0."""
+    """x -> B + R x + x^T T x, or a stack of such maps, [..., out, n, n].
+
+    T is symmetric in its last two indices, or None if 0.
+    """
 
     B: Array
     R: Array
@@ -38,63 +42,60 @@ class Quadratic:
 
     def after(self, first: "Quadratic") -> "Quadratic":
         """Return this map after `first`, to second order in x."""
+        into = first.B[..., None]
         if self.T is None:
             bent = None if first.T is None else _on_rows(self.R, first.T)
-            return Quadratic(self.B + self.R @ first.B, self.R @ first.R, bent)
-        fed = self.T @ first.B  # [out, n]: half of the constant part's feed-down
+            return Quadratic(self.B + (self.R @ into)[..., 0], self.R @ first.R, bent)
+        fed = (self.T @ into[..., None, :, :])[..., 0]  # half of the constant part's feed-down
         slope = self.R + 2.0 * fed
-        bent = first.R.T @ self.T @ first.R
+        turn = first.R[..., None, :, :]
+        bent = turn.swapaxes(-1, -2) @ self.T @ turn
         if first.T is not None:
-            bent = bent + _on_rows(slope, first.T)
-        return Quadratic(self.B + (self.R + fed) @ first.B, slope @ first.R, bent)
+            bent += _on_rows(slope, first.T)
+        return Quadratic(self.B + ((self.R + fed) @ into)[..., 0], slope @ first.R, bent)
 
     def reduced(self) -> tuple[Array, Array, Array]:
-        """Return W0 [out], W1 [out, n], W2 [out, n (n + 1) / 2] in the reduced Kronecker order."""
-        i, j, _ = _pairs(self.R.shape[1])
+        """Return W0 [..., out], W1 [..., out, n], and W2 [..., out, n (n + 1) / 2] in the reduced
+        Kronecker order."""
+        i, j, counts = _pairs(self.R.shape[-1])
         if self.T is None:
-            return self.B, self.R, np.zeros((len(self.B), len(i)))
-        return self.B, self.R, _pairs(self.R.shape[1])[2] * self.T[:, i, j]
+            return self.B, self.R, np.zeros((*self.B.shape, len(i)))
+        return self.B, self.R, counts * self.T[..., i, j]
+
+    def __getitem__(self, which: Sequence[int]) -> "Quadratic":
+        """Some maps of a stack."""
+        return Quadratic(self.B[which], self.R[which], None if self.T is None else self.T[which])
+
+    def each(self) -> list["Quadratic"]:
+        """The maps of a stack."""
+        if self.T is None:
+            return [Quadratic(B, R, None) for B, R in zip(self.B, self.R, strict=True)]
+        return [Quadratic(B, R, T if T.any() else None)
+                for B, R, T in zip(self.B, self.R, self.T, strict=True)]  # fmt: skip
 
 
-def each_after(
-    later: Sequence[Quadratic], first: Sequence[Quadratic], n: int
-) -> tuple[Array, Array, Array]:
-    """Return `Quadratic.after` of many pairs: B [pair, n], R [pair, n, n], T [pair, n, n, n]."""
-    (B2, R2, T2), (B1, R1, T1) = _stacked(later, n), _stacked(first, n)
-    fed = (T2 @ B1[:, None, :, None])[..., 0]
-    slope = R2 + 2.0 * fed
-    bent = R1.swapaxes(1, 2)[:, None] @ T2 @ R1[:, None]
-    bent += (slope @ T1.reshape(-1, n, n * n)).reshape(T1.shape)
-    B = B2 + ((R2 + fed) @ B1[:, :, None])[..., 0]
-    return B, slope @ R1, bent
+def stacked(maps: Sequence[Quadratic], n: int) -> Quadratic:
+    """Return maps of n coordinates as a stack, [map, ...]."""
+    T = None
+    if any(own.T is not None for own in maps):
+        none = np.zeros((n, n, n))
+        T = np.array([none if own.T is None else own.T for own in maps])
+    B, R = np.array([own.B for own in maps]), np.array([own.R for own in maps])
+    return Quadratic(B.reshape(-1, n), R.reshape(-1, n, n), T)
 
 
-def _stacked(maps: Sequence[Quadratic], n: int) -> tuple[Array, Array, Array]:
-    nothing = np.zeros((n, n, n))
-    B = np.array([m.B for m in maps]).reshape(-1, n)
-    R = np.array([m.R for m in maps]).reshape(-1, n, n)
-    T = np.array([nothing if m.T is None else m.T for m in maps]).reshape(-1, n, n, n)
-    return B, R, T
-
-
-def difference(ends: Iterable[tuple[int, Quadratic]], step: float) -> Quadratic:
-    """Return the sum of maps with signs, over a step: a derivative by differences."""
-    signs, maps = zip(*ends, strict=True)
-
-    def total(arrays: Iterable[Array | None]) -> Array | None:
-        given = [sign * own for sign, own in zip(signs, arrays, strict=True) if own is not None]
-        return functools.reduce(np.add, given) / step if given else None
-
-    B, R = total(m.B for m in maps), total(m.R for m in maps)
-    assert B is not None
-    assert R is not None
-    return Quadratic(B, R, total(m.T for m in maps))
+def slopes(ends: Quadratic, step: float | Array) -> Quadratic:
+    """Return derivatives by differences: of a stack of pairs each first map less the second, over
+    a step, [pair, ...]."""
+    B, R = (((own[::2] - own[1::2]).T / step).T for own in (ends.B, ends.R))
+    T = None if ends.T is None else ((ends.T[::2] - ends.T[1::2]).T / step).T
+    return Quadratic(B, R, T)
 
 
 def _on_rows(matrix: Array, T: Array) -> Array:
-    """`np.tensordot(matrix, T, 1)` without its checks, which cost more than the product."""
-    rows, n = len(T), T.shape[-1]
-    return (matrix @ T.reshape(rows, n * n)).reshape(-1, n, n)
+    """`np.tensordot(matrix, T, 1)`, also of stacks, in one product."""
+    flat = matrix @ T.reshape(*T.shape[:-2], -1)
+    return flat.reshape(*flat.shape[:-1], *T.shape[-2:])
 
 
 def identity(n: int) -> Quadratic:
@@ -164,34 +165,54 @@ def of_ocelot(part: Weights, n: int) -> Quadratic:
 
 
 def quadratic_map(element: Element, energy: float, n: int) -> Quadratic:
-    """Return the map of one element, its errors included; LatticeError: it is not finite, or it
-    loses energy, which needs six coordinates."""
-    errors = element.errors
-    if element.kind == "cavity":  # its gain depends on the turn, see `beam.rf`
-        element = _empty(element)
-    if errors == NO_ERRORS:
-        total = composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
-    else:
-        # unchanged by errors in the middle
-        first, second = _remembered(
-            _halved, element, (energy, n), lambda: _halves(element, energy, n)
-        )
-        ratio_x, ratio_y = _in_the_middle(element)
-        kicks = errors.kick_x * ratio_x, errors.kick_y * ratio_y
-        total = composed([
-            _way(n, errors.ds, energy),
-            _thin(n, k1l=errors.entrance_k1l, slopes=errors.entrance),
-            _shift(n, -errors.dx, -errors.dy), _turn(n, errors.roll), first,
-            _thin(n, *kicks, errors.k1l, errors.k1sl, errors.middle),
-            _loss(n, errors.loss, element), second, _turn(n, -errors.roll),
-            _shift(n, errors.dx, errors.dy), _way(n, -errors.ds, energy),
-        ])  # fmt: skip
-    finite = np.isfinite(total.R).all() and np.isfinite(total.B).all()
-    if not finite or (total.T is not None and not np.isfinite(total.T).all()):
-        raise LatticeError(
-            f"OCELOT's map of {element.kind} '{element.name}' is not finite; check its strengths"
-        )
+    """Return the map of one element, see `quadratic_maps`."""
+    return quadratic_maps([element], energy, n).each()[0]
+
+
+def quadratic_maps(elements: Sequence[Element], energy: float, n: int) -> Quadratic:
+    """Return the maps of elements, their errors included, as a stack.
+
+    Raises:
+        LatticeError: a map is not finite, or it loses energy, which needs six coordinates.
+    """
+    # a cavity's gain depends on the turn, see `beam.rf`
+    given = [_empty(element) if element.kind == "cavity" else element for element in elements]
+    wrong = [element for element in given if element.errors != NO_ERRORS]
+    with_errors = iter(_with_errors(wrong, energy, n).each() if wrong else ())
+    total = stacked([
+        composed(of_ocelot(part, n) for part in parts_of(element, energy, False))
+        if element.errors == NO_ERRORS else next(with_errors)
+        for element in given
+    ], n)  # fmt: skip
+    for own in (total.B, total.R, total.T):
+        if own is not None and not np.isfinite(own).all():
+            bad = elements[int(np.argwhere(~np.isfinite(own))[0, 0])]
+            raise LatticeError(
+                f"OCELOT's map of {bad.kind} '{bad.name}' is not finite; check its strengths"
+            )
     return total
+
+
+def _with_errors(elements: Sequence[Element], energy: float, n: int) -> Quadratic:
+    # unchanged by errors in the middle
+    halves = [
+        _remembered(_halved, element, (energy, n), partial(_halves, element, energy, n))
+        for element in elements
+    ]
+    first, second = (stacked(own, n) for own in zip(*halves, strict=True))
+    e = {own.name: np.array([getattr(element.errors, own.name) for element in elements])
+         for own in fields(Errors)}  # fmt: skip
+    ratio_x, ratio_y = np.array([_in_the_middle(element) for element in elements]).T
+    kicks = e["kick_x"] * ratio_x, e["kick_y"] * ratio_y
+    none = np.zeros(len(elements))
+    return composed([
+        _way(n, e["ds"], energy),
+        _thin(n, none, none, e["entrance_k1l"], none, e["entrance"]),
+        _shift(n, -e["dx"], -e["dy"]), _turn(n, e["roll"]), first,
+        _thin(n, *kicks, e["k1l"], e["k1sl"], e["middle"]),
+        _loss(n, e["loss"], elements), second, _turn(n, -e["roll"]),
+        _shift(n, e["dx"], e["dy"]), _way(n, -e["ds"], energy),
+    ])  # fmt: skip
 
 
 def _in_the_middle(element: Element) -> tuple[float, float]:
@@ -242,42 +263,40 @@ def _halves(element: Element, energy: float, n: int) -> tuple[Quadratic, Quadrat
 
 
 def _thin(
-    n: int,
-    kick_x: float = 0.0,
-    kick_y: float = 0.0,
-    k1l: float = 0.0,
-    k1sl: float = 0.0,
-    slopes: Slopes = NO_ERRORS.middle,
+    n: int, kick_x: Array, kick_y: Array, k1l: Array, k1sl: Array, slopes: Array
 ) -> Quadratic | None:
     """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x, and the slopes' kicks."""
-    if kick_x == kick_y == k1l == k1sl == 0 and not any(slopes):
+    if not any(own.any() for own in (kick_x, kick_y, k1l, k1sl, slopes)):
         return None
-    B, R = np.zeros(n), np.eye(n)
-    B[1], B[3] = kick_x, kick_y
-    R[1, 0], R[3, 2] = -k1l, k1l
-    R[1, 2] = R[3, 0] = k1sl
-    R[1, 0] += slopes[0]
-    R[1, 2] += slopes[1]
-    R[3, 0] += slopes[2]
-    R[3, 2] += slopes[3]
+    B, R = _nothing(n, len(k1l))
+    B[:, 1], B[:, 3] = kick_x, kick_y
+    R[:, 1, 0] = slopes[:, 0] - k1l
+    R[:, 1, 2] = slopes[:, 1] + k1sl
+    R[:, 3, 0] = slopes[:, 2] + k1sl
+    R[:, 3, 2] = slopes[:, 3] + k1l
     return Quadratic(B, R, None)
 
 
-def _shift(n: int, dx: float, dy: float) -> Quadratic | None:
-    if dx == dy == 0:
-        return None
-    B = np.zeros(n)
-    B[0], B[2] = dx, dy
-    return Quadratic(B, np.eye(n), None)
+def _nothing(n: int, count: int) -> tuple[Array, Array]:
+    """B and R of identities."""
+    return np.zeros((count, n)), np.tile(np.eye(n), (count, 1, 1))
 
 
-def _way(n: int, length: float, energy: float) -> Quadratic | None:
-    """A drift, forwards or backwards."""
-    if length == 0:
+def _shift(n: int, dx: Array, dy: Array) -> Quadratic | None:
+    if not (dx.any() or dy.any()):
         return None
-    metre, eye = _metre(n, energy), np.eye(n)
-    bent = None if metre.T is None else length * metre.T
-    return Quadratic(metre.B, eye + length * (metre.R - eye), bent)
+    B, R = _nothing(n, len(dx))
+    B[:, 0], B[:, 2] = dx, dy
+    return Quadratic(B, R, None)
+
+
+def _way(n: int, length: Array, energy: float) -> Quadratic | None:
+    """Drifts, forwards or backwards."""
+    if not length.any():
+        return None
+    metre, eye, some = _metre(n, energy), np.eye(n), length[:, None, None]
+    bent = None if metre.T is None else some[..., None] * metre.T
+    return Quadratic(length[:, None] * metre.B, eye + some * (metre.R - eye), bent)
 
 
 @functools.cache
@@ -289,31 +308,31 @@ def _metre(n: int, energy: float) -> Quadratic:
     return composed(of_ocelot(part, n) for part in parts)
 
 
-def _turn(n: int, roll: float) -> Quadratic | None:
-    """Rotation to axes that are turned by `roll` from x towards y."""
-    if roll == 0:
+def _turn(n: int, roll: Array) -> Quadratic | None:
+    """Rotations to axes that are turned by `roll` from x towards y."""
+    if not roll.any():
         return None
-    R = np.eye(n)
-    cos, sin = np.cos(roll), np.sin(roll)
-    R[0, 0] = R[1, 1] = R[2, 2] = R[3, 3] = cos
-    R[0, 2] = R[1, 3] = sin
-    R[2, 0] = R[3, 1] = -sin
-    return Quadratic(np.zeros(n), R, None)
+    B, R = _nothing(n, len(roll))
+    for i in (0, 1):
+        R[:, i, i] = R[:, i + 2, i + 2] = np.cos(roll)
+        R[:, i, i + 2] = np.sin(roll)
+        R[:, i + 2, i] = -np.sin(roll)
+    return Quadratic(B, R, None)
 
 
-def _loss(n: int, loss: float, element: Element) -> Quadratic | None:
-    """Energy loss of loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
-    if loss == 0:
+def _loss(n: int, loss: Array, elements: Sequence[Element]) -> Quadratic | None:
+    """Energy losses of loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
+    if not loss.any():
         return None
     if n != 6:
+        losing = elements[int(np.flatnonzero(loss)[0])]
         raise LatticeError(
-            f"{element.kind} '{element.name}' loses energy, which needs six coordinates "
-            "(dimension=6)"
+            f"{losing.kind} '{losing.name}' loses energy, which needs six coordinates (dimension=6)"
         )
-    B, R = np.zeros(n), np.eye(n)
-    B[5] = -loss
-    R[5, 5] = 1 - 2 * loss
-    R[1, 1] = R[3, 3] = 1 - loss
+    B, R = _nothing(n, len(loss))
+    B[:, 5] = -loss
+    R[:, 5, 5] = 1 - 2 * loss
+    R[:, 1, 1] = R[:, 3, 3] = 1 - loss
     return Quadratic(B, R, None)
 
 
