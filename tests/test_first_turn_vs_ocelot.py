@@ -7,9 +7,10 @@ import pytest
 import torch
 from ocelot.cpbd.tm_utils import SecondOrderMult, transfer_maps_mult_full_py
 
-from tmlattice import TaylorNetwork
+from tmlattice import Cause, TaylorNetwork
+from tmlattice.effects import apply
 from tmlattice.lattice.ocelot import SecondTM
-from tmlattice.maps import element_map, ring_maps
+from tmlattice.maps import LayerMaps, element_map, ring_maps
 
 
 def parts(element, energy):
@@ -109,6 +110,25 @@ def test_element_map_matches_ocelot_to_second_order(small_ring, name, dimension,
         SecondOrderMult().tmat_multip(x, R, T)
         x += B
     np.testing.assert_allclose(image, x[:dimension].T, rtol=0, atol=1e-15)
+
+
+ERRORS = [
+    Cause("quadrupole_gradient", "QF::3", 0.02), Cause("quadrupole_offset_y", "QF::3", 1e-3),
+    Cause("dipole_roll", "bend::7", 2e-3), Cause("quadrupole_roll", "QF::1", 0.01),
+    Cause("skew_gradient", "sf::2", 1e-3), Cause("vertical_focusing", "wig_1", 1e-3),
+    Cause("corrector_position", "v5", 0.02),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dimension", [4, 6])
+def test_maps_of_many_elements_are_those_of_each(small_ring, dimension):
+    """Each of these has another kind of error, and most have none."""
+    ring = apply(small_ring, ERRORS)
+    together = LayerMaps(ring, dimension).maps(ring.elements)
+    for element, own in zip(ring.elements, together, strict=True):
+        alone = element_map(element, ring.map_energy, dimension).coefficients
+        for a, b in zip(own.reduced(), alone, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
 
 
 def test_layers_hold_one_magnet_each(petra3, petra3_network):

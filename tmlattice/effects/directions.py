@@ -193,6 +193,7 @@ def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) 
     pairs: dict[tuple[int, int], int] = {}  # of a derivative and the way to the element
     ways: list[Quadratic] = []
     magnets: list[tuple[int, int, int]] = []  # owner, layer, pair
+    others: list[tuple[int, int, int, float, list[Element]]] = []
     rows, reads = _Rows(n, n), _Rows(2, n)
     first_monitor = np.concatenate([[0], np.cumsum([e.kind == "monitor" for e in ring.elements])])
     for owner, (name, place) in enumerate(hypotheses):
@@ -218,15 +219,17 @@ def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) 
                         ways.append(way)
                     magnets.append((owner, k, pair))
                 continue
-            (up, up_read), (down, down_read) = (
-                layers.layer(k, {member: effect.changed(element, a, ring.energy)}) for a in (h, -h)
-            )
-            rows.add(owner, k, _slope(up, down, h))
-            start = first_monitor[layers.first_element(k)]
-            for i, (a, b) in enumerate(zip(up_read, down_read, strict=True)):
-                slope = _slope(a, b, h)
-                if any(m.any() for m in slope):
-                    reads.add(owner, int(start + i), slope)
+            up_down = [effect.changed(element, amount, ring.energy) for amount in (h, -h)]
+            others.append((owner, k, member, h, up_down))
+    layers.maps([element for *_, up_down in others for element in up_down])  # together
+    for owner, k, member, h, up_down in others:
+        (up, up_read), (down, down_read) = (layers.layer(k, {member: own}) for own in up_down)
+        rows.add(owner, k, _slope(up, down, h))
+        start = first_monitor[layers.first_element(k)]
+        for i, (a, b) in enumerate(zip(up_read, down_read, strict=True)):
+            slope = _slope(a, b, h)
+            if any(m.any() for m in slope):
+                reads.add(owner, int(start + i), slope)
     if magnets:
         maps = quadratic_maps(ends, ring.map_energy, n)
         each = slopes(maps, np.array(steps))[[own for own, _ in pairs]]

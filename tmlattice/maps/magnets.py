@@ -156,7 +156,8 @@ class LayerMaps:
         other.ring = ring
         other.origin = (self, tuple(places))
         other.memory = {}
-        moving = (i for i in places if not _both_at_rest(own[i], ring.elements[i]))
+        moving = [i for i in places if not _both_at_rest(own[i], ring.elements[i])]
+        self.maps([ring.elements[i] for i in moving])  # together
         touched: set[int] = set()
         other._ways = self._ways.copy()
         for i in moving:
