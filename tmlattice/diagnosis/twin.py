@@ -4,7 +4,7 @@ The estimated ring is a lattice file. A second file has calibrations, and the di
 with their posterior covariance. A diagnosis of the lattice file reads both.
 """
 
-import base64
+import binascii
 import hashlib
 import logging
 from collections.abc import Mapping, Sequence
@@ -156,6 +156,7 @@ def known_document(known: DistributedErrors, lattice: Path) -> dict[str, Any]:
     """The content of the file that belongs to the lattice file."""
     from tmlattice import __version__
 
+    rounded = known.seen.astype("<f4").tobytes()
     return {
         "format": FORMAT,
         "version": 1,
@@ -172,7 +173,7 @@ def known_document(known: DistributedErrors, lattice: Path) -> dict[str, Any]:
         ],
         "seen": {
             "directions": len(known.share),
-            "float32": base64.b64encode(known.seen.astype("<f4").tobytes()).decode(),
+            "float32": binascii.b2a_base64(rounded, newline=False).decode(),
             "share": known.share.tolist(),
         },
     }
@@ -221,7 +222,7 @@ def _directions(path: Path, seen: Mapping[str, Any], errors: int) -> Array:
     """Orthonormal again after the rounding."""
     count = int(seen["directions"])
     try:
-        raw = base64.b64decode(seen["float32"], validate=True)
+        raw = binascii.a2b_base64(seen["float32"], strict_mode=True)
         rows = np.frombuffer(raw, dtype="<f4").astype(float).reshape(count, errors)
     except ValueError:
         raise MeasurementError(f"{path}: its directions are damaged; write it anew") from None
