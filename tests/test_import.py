@@ -754,8 +754,9 @@ def test_turns_of_the_beam(lattice, tmp_path, rng):
             bring_in([tmp_path / f"{name}.sdds"], Options(lattice=lattice[0]))
     (tmp_path / "b.sdds").write_text("nothing")
     unknown = "is no file that is known: for its columns name the lattice"
-    with pytest.raises(TmlatticeError, match=unknown):
-        bring_in([tmp_path / "b.sdds"])
+    for path, why in ((tmp_path / "b.sdds", unknown), (tmp_path, "is a folder; give a file")):
+        with pytest.raises(TmlatticeError, match=why):
+            bring_in([path])
 
 
 # --- the files of real rings ----------------------------------------------------------------------

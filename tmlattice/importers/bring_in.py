@@ -39,6 +39,7 @@ from tmlattice.importers.middle_layer import bring_middle_layer
 from tmlattice.importers.readings import bring_readings, with_unit
 from tmlattice.importers.stated import Stated
 from tmlattice.importers.tables import bring_table, bring_turns, is_response_table
+from tmlattice.input_files import check_regular
 from tmlattice.lattice import Ring, load_ring
 from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import (
@@ -111,8 +112,7 @@ def bring_in(
         raise MeasurementError("a frame is imported alone; give no file with it")
     files = [] if frames else [Path(path) for path in paths]
     for path in files:
-        if not path.is_file():
-            raise MeasurementError(f"no file '{path}'; check the path")
+        check_regular(path, MeasurementError)
         if path.suffix.lower() in SHEETS:
             text_of(path)  # its error states what to do
     if options.turns and len(files) != 1:
