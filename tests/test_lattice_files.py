@@ -421,6 +421,8 @@ FOREIGN = {
     "a table of SDDS": "SDDS1\n&column name=s, type=double &end\n",
     "a lattice of Bmad": "parameter[e_tot] = 3e9\nq: quadrupole, l = 0.4\n",
     "a lattice of SAD": "FFS;\nQUAD QF = (L=.4 K1=.44);\nLINE RING=(QF);\n",
+    "a lattice of MAD-NG": "local quadrupole in MAD.element\nlocal q = quadrupole 'q' {l=1}\n",
+    "a lattice of PALS": '{"PALS": {"facility": []}}\n',
     "a lattice of Tracy": "{ring}\ndefine lattice;\nqf: quadrupole, l=0.4, k=1.1;\n",
     "a lattice of OPA": "energy = 2.4;\nb: bending, l=1, t=22.5;\nring: b, b;\n",
     "a lattice of MAD-8": "TITLE\n A\nBEAM, ENERGY=3\nQ: QUADRUPOLE, L=1, &\n K1=1\nR: LINE=(Q)\n",

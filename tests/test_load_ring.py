@@ -113,12 +113,13 @@ def test_octupoles_are_warned_of_once(tmp_path):
         tmp_path,
         "from ocelot import *\nenergy = 1.0\n"
         "octs = [Octupole(l=0.1, k3=50.0, eid='oct') for _ in range(5)]\n"
-        "cell = [Quadrupole(l=0.1, k1=1.0, eid='q'), *octs]",
+        "named = Octupole(l=0.1, k3=50.0)\n"
+        "cell = [Quadrupole(l=0.1, k1=1.0, eid='q'), *octs, named]",
     )
     with pytest.warns(UserWarning, match="octupoles are drifts") as said:
         ring = load_ring(path)
     (octupoles,) = [str(own.message) for own in said if "octupole" in str(own.message)]
-    assert octupoles.endswith("trajectories have them: oct (5)")
+    assert octupoles.endswith("trajectories have them: oct, named (6)")
     assert ring["oct::0"].kind == "octupole"
 
 

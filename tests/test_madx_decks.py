@@ -133,6 +133,8 @@ REFUSED = {
         PLAIN + "f(x): macro = { qf->k1 = x; }; exec, f(-0.5);",
         "the argument '-0.5' of a macro is an expression, which MAD-X cuts off",
     ),
+    "branch without braces": (PLAIN + "if (1 == 1) qf, k1=2;", "IF is not followed by"),
+    "kick of a kicker": (with_element("k: kicker, kick=1e-4, at=4.95;"), "KICK of KICKER 'k'"),
     "nested branches": (
         PLAIN + "if (1 == 1) { if (1 == 2) { qf, k1=2; } } else { frobnicate; } wrong;",
         "no element or command 'wrong'",
@@ -184,6 +186,14 @@ WARNED = {
     "rectangular bend of bv": (
         PLAIN.replace("energy=3", "energy=3, bv=-1").replace("bb: sbend", "bb: rbend"),
         r"MAD-X's TWISS gives half the angle in faces \(BV=-1\) of bb \(1\)",
+    ),
+    "beam of a sequence without an energy": (
+        PLAIN + "beam, sequence=ring, charge=-1;",
+        "BEAM of the sequence 'ring' states no energy, which is 1 GeV in MAD-X",
+    ),
+    "mass of a known particle": (
+        DECKS["beam mass of a known particle"]["text"],
+        "MASS AND CHARGE OF BEAM: those of the proton are taken, as in MAD-X",
     ),
     "two signs of logic": (
         PLAIN + "if (1 == 1 && 2 == 2 && 3 == 3) { qf, k1=0; }",

@@ -124,6 +124,10 @@ CODE = {
         f"c = {CELL};",
         ring="ring = atSetRingProperties(c(2:8), 'Energy', 3e9, 'Periodicity', 16);",
     ),
+    "ring properties without periods": function(
+        "R = atringparam('fodo', 3e9); R.Periodicity = 1;",
+        ring=f"c = {CELL}; ring = [{{R}}; repmat(c(2:8), 16, 1)];",
+    ),
     "energy of elements": function(
         "", ring=f"c = {CELL}; ring = atsetfieldvalues(c(2:8), 'Energy', 3e9);"
     ),
@@ -176,6 +180,9 @@ MADE = {
     "atcorrector('HCM', 0.1, [1e-4 0])": at.Corrector("hcm", 0.1, [1e-4, 0.0]),
     "corrector('HCM', 0.1, [0 0], 'CorrectorPass')": at.Corrector("hcm", 0.1, [0.0, 0.0]),
     "solenoid('E', 0.3, 0.2, 'SolenoidLinearPass')": at.Element(
+        "e", Length=0.3, K=0.2, PassMethod="SolenoidLinearPass"
+    ),
+    "atsolenoid('E', 0.3, 0.2)": at.Element(
         "e", Length=0.3, K=0.2, PassMethod="SolenoidLinearPass"
     ),
     "aperture('E', [-1 1 -1 1], 'AperturePass')": at.Aperture("e", [-1, 1, -1, 1]),

@@ -213,6 +213,15 @@ def test_table_off_momentum_is_of_the_same_ring(madx, tmp_path):
     load_ring(table(madx, tmp_path, DELTAP=1e-3, XCOMAX=2e-3, Q1=0.1, Q2=0.2))
 
 
+def test_a_cavity_without_its_voltage_may_be_on(madx, tmp_path):
+    x, y = ring_tunes(madx)
+    path = table(madx, tmp_path, drop=("VOLT",), Q1=x + 5e-4, Q2=y)
+    assert load_ring(path).counts()["cavity"] == 8
+    path.write_text(path.read_text().replace('"RFCAVITY"', '"MARKER"'))
+    with pytest.raises(LatticeError, match="its tunes are"):
+        load_ring(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "drop", "message"),
     [

@@ -15,6 +15,7 @@ from tmlattice.optics import off_momentum, twiss
 REFEREE = json.loads((Path(__file__).parent / "lattices" / "xsuite_classes.json").read_text())
 DECKS = REFEREE["decks"]
 NAMED = {
+    "magnet": "the finite number of kicks",
     "octupole": "above the sextupole",
     "rbend_k1_thin_slices": "products of curvature and gradient",
     "thin_bend_k1": "products of curvature and gradient",
@@ -60,6 +61,17 @@ def test_kicks_of_a_strong_gradient_in_a_weak_bend_are_named(tmp_path):
     deck["elements"]["bb"]["angle"] = 0.01
     with pytest.warns(UserWarning, match=r"the finite number of kicks of bb \(1\)"):
         load(line_of(deck), tmp_path)
+
+
+@pytest.mark.parametrize("rule", ["adaptive", "yoshida-4"])
+def test_few_kicks_of_a_magnet_are_named(tmp_path, rule):
+    magnet = {"__class__": "Magnet", "length": 0.4, "k1": 1.1, "integrator": rule}
+    with pytest.warns(UserWarning, match=r"the finite number of kicks of qf \(1\)"):
+        load(line_of({"elements": {"qf": magnet}}), tmp_path)
+    magnet |= {"num_multipole_kicks": 21, "integrator": "yoshida-6"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(line_of({"elements": {"qf": magnet}}), tmp_path)
 
 
 @pytest.mark.parametrize("name", DECKS)
@@ -228,6 +240,9 @@ def test_line_by_positions(tmp_path):
         twiss(Chain.from_ring(ring)).total_tunes, deck["tunes"], rtol=0, atol=1e-6
     )
     composer = deck["file"]["lines"]["cell"]["composer"]
+    changed = json.loads(json.dumps(deck["file"]))
+    changed["lines"]["cell"]["composer"]["l"] = f"sqrt(({composer['l']})*({composer['l']}))"
+    assert load(changed, tmp_path).length == pytest.approx(deck["length"], abs=1e-9)
     for change, message in (
         ({"components": [{"name": "qf", "at": 1.0, "from_": "bb"}]}, "refers to no element"),
         ({"components": [{"name": "qf", "at": "1/0"}]}, "position '1/0' cannot be worked out"),

@@ -46,7 +46,7 @@ _SILENT = frozenset((
 """Statements that change no element."""
 
 _DEFAULTS = {"Length": 0.0, "BendingAngle": 0.0, "Voltage": 0.0, "Frequency": 1.0,
-             "HarmNumber": 1.0, "PolynomA": 0.0, "PolynomB": 0.0}  # fmt: skip
+             "HarmNumber": 1.0, "PolynomA": 0.0, "PolynomB": 0.0, "Periodicity": 1.0}  # fmt: skip
 
 
 def elements_of(text: str, name: str | None = None, energy: float | None = None) -> list[Element]:
@@ -122,6 +122,8 @@ def _element(function: str, name: Any = "", *given: Any) -> Element:
         if isinstance(fields.get(place), str) and place not in may_be_text:
             raise ValueError(f"the {place} of '{plain(str(name), 40)}' is a text")
     missing = {k: v for k, v in _DEFAULTS.items() if k in places}
+    if function == "atsolenoid":
+        missing["PassMethod"] = "SolenoidLinearPass"
     if function == "atrbend":
         half = fields.get("BendingAngle", 0.0) / 2
         missing |= {"EntranceAngle": half, "ExitAngle": half}

@@ -160,10 +160,13 @@ _FOREIGN = {
     "a table of SDDS and no lattice: give the lattice (.lte)": r"\ASDDS\d",
     "a lattice of Bmad": r"^\s*(parameter|beginning|particle_start)\s*\[",
     "a lattice of SAD": r"^\s*FFS\b|^\s*(DRIFT|BEND|QUAD|SEXT|MARK|LINE)\s+\w+\s*=\s*\(",
+    "a lattice of MAD-NG": r"^\s*local\b.*(\bin\s+MAD\b|\brequire\b.*\bmadl?\b)",
+    "a lattice of PALS": r"^\s*\{?\s*\"?PALS\"?\s*:",
     "a lattice of Tracy": r"^\s*define\s+lattice\b",
     "a lattice of OPA": r"\A\s*\{[^}]*\.opa\}|:\s*bending\b",
     "a lattice of MAD-8 (no ';' ends its statements)":
-        r"\A(?=[^;]*^\s*(beam|title)\b)[^;]*:\s*(line|quadrupole|sbend|rbend)\b[^;]*\Z",
+        r"\A(?=[^;]*^\s*(beam|title|twiss|option|survey)\b)"
+        r"[^;]*:\s*(line|quadrupole|sbend|rbend)\b[^;]*\Z",
 }  # fmt: skip
 """Formats that are not read, by what their files hold."""
 

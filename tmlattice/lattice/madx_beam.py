@@ -22,13 +22,31 @@ class Beam:
     def __init__(self, given: Mapping[str, float | str] | None = None) -> None:
         self.given: dict[str, float | str] = dict(given or {})
 
-    def update(self, given: Mapping[str, float | str]) -> None:
-        """Apply another BEAM statement: a new energy replaces an earlier one."""
-        if any(name in given for name in ENERGIES):
+    def update(self, given: Mapping[str, float | str]) -> list[str]:
+        """Apply another BEAM statement; return those of its attributes that MAD-X passes over.
+
+        The energy stays what it is unless another one is given. A particle that MAD-X knows has its
+        own mass and charge; a later MASS alone makes it one without a name.
+        """
+        own = dict(given)
+        if not own.keys() & set(ENERGIES) and self.has_energy:
+            own["energy"] = self.energy
+        if own.keys() & set(ENERGIES):
             self.given = {k: v for k, v in self.given.items() if k not in ENERGIES}
-        if "particle" in given:
+        named = "particle" in own
+        if named:
             self.given = {k: v for k, v in self.given.items() if k not in ("mass", "charge")}
-        self.given |= given
+        self.given |= {k: v for k, v in own.items() if k not in ("mass", "charge")}
+        stated = {k: float(own[k]) for k in ("mass", "charge") if k in own}
+        known = self._particle in PARTICLES.keys() - {"ion"} and "particle" in self.given
+        if known and (named or "mass" not in stated):
+            ours = {"mass": self.mass, "charge": self.charge}
+            return [k for k, v in stated.items() if not math.isclose(v, ours[k], rel_tol=1e-3)]
+        if known:
+            stated = {"charge": self.charge, **stated}
+            self.given["particle"] = "default"
+        self.given |= stated
+        return []
 
     @property
     def has_energy(self) -> bool:

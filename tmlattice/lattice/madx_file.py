@@ -20,7 +20,7 @@ import numpy as np
 from tmlattice.errors import LatticeError, first_of, plain, unknown_name
 from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.lines import Items, chosen, inner_names, items_of, laid_out, with_gaps
-from tmlattice.lattice.madx_beam import Beam
+from tmlattice.lattice.madx_beam import ENERGIES, Beam
 from tmlattice.lattice.madx_language import (
     CONSTANTS,
     LOGICAL,
@@ -336,6 +336,7 @@ class _Reader:
         self.lines: dict[str, Items] = {}
         self.macros: dict[str, tuple[list[str], str]] = {}
         self._with_arguments: dict[str, tuple[list[str], str]] = {}
+        self._given_energy = energy
         self.beams: dict[str, Beam] = {"": Beam({} if energy is None else {"energy": energy})}
         self.order: list[str] = []
         self.used = ""
@@ -452,8 +453,10 @@ class _Reader:
             self.macros[match[1].lower()] = (names, match[3])
             return None
         match = re.fullmatch(
-            r"(?:(real|int)\s+)?(const\s+)?([\w.$%]+)\s*(:?=)\s*(.*)", text, re.I | re.DOTALL
-        )
+            # of CONST REAL MAD-X takes neither word
+            r"(?:const\s+(?:real|int)\s+|(?:(real|int)\s+)?(const\s+)?)([\w.$%]+)\s*(:?=)\s*(.*)",
+            text, re.I | re.DOTALL,
+        )  # fmt: skip
         if match:
             name, given = match[3].lower(), Given(match[5], match[4] == ":=")
             self._assign(name, given, whole=str(match[1]).lower() == "int")
@@ -493,7 +496,9 @@ class _Reader:
         self.variables[name] = value
 
     def _block(self, text: str, word: str) -> None:
-        head, _, body = text.partition("{")
+        head, brace, body = text.partition("{")
+        if not brace or (word != "else" and ")" not in head):
+            raise LatticeError(f"{word.upper()} is not followed by (...) and braces; write both")
         body = body.rpartition("}")[0]
         if word == "else":
             if not self._branched:
@@ -703,18 +708,35 @@ class _Reader:
         self._depth -= 1
 
     def beam(self, sequence: str) -> Beam:
-        """The beam of a sequence, else the default one."""
-        return self.beams.get(sequence) or self.beams[""]
+        """The beam of a sequence, else the default one.
+
+        One that states no energy has 1 GeV in MAD-X, whatever the default one has.
+        """
+        default, own = self.beams[""], self.beams.get(sequence, self.beams[""])
+        if own.has_energy or not default.has_energy:
+            return own
+        text = (
+            f"BEAM of the sequence '{sequence}' states no energy, which is 1 GeV in MAD-X: that of "
+            "the BEAM without a sequence is taken"
+        )
+        if text not in self.warnings and not self._given_energy:
+            self.warnings.append(text)
+        kept = ENERGIES if "particle" in own.given else (*ENERGIES, "particle", "mass", "charge")
+        return Beam({k: v for k, v in default.given.items() if k in kept} | own.given)
 
     def _update_beam(self, owner: str, given: dict[str, Given]) -> None:
-        beam = self.beams.setdefault(owner, Beam(self.beams[""].given))
+        beam = self.beams.setdefault(owner, Beam())
         own: dict[str, float | str] = {}
         for name, value in given.items():
             if name == "particle":
                 own[name] = unquoted(value.text)
             elif value.text[:1] != "{":  # lists are of its synchrotron radiation integrals
                 own[name] = float(compiled(value.text)(self))
-        beam.update(own)
+        if idle := beam.update(own):
+            what = f"{' and '.join(idle)} of BEAM".upper()
+            self.warnings.append(
+                f"{what}: those of the {beam.given['particle']} are taken, as in MAD-X"
+            )
 
     def _use(self, given: dict[str, Given]) -> None:
         named = next((given[k].text for k in ("sequence", "period") if k in given), None)
@@ -950,7 +972,10 @@ class _Reader:
         edited, slots = self._opened()
         name = unquoted(given["element"].text).lower()
         if "class" in given and name not in self.elements:
-            self._define(name, given["class"].text, Statement("", 0))
+            word = unquoted(given["class"].text).lower()
+            self._define(name, word, Statement("", 0))
+            if word in self.elements:  # in MAD-X they are one: what changes one changes both
+                self.elements[name].values = self.elements[word].values
         self._is_element(name)
         reference = _REFERENCE.get(edited.refer, 0.0)
         length = self._length(name)

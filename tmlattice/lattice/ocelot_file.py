@@ -149,18 +149,18 @@ def _flatten(sequence: Any) -> Iterator[Any]:
             yield from _flatten(item)
 
 
-def _modelled(source: Any) -> Any:
+def _modelled(source: Any, named: str) -> Any:
     """The element; a copy of a matrix element that was born without a longitudinal block, or of a
     displaced one without its offset; a thin bend in the place of a multipole that bends the design
-    orbit."""
+    orbit. Messages call it `named`."""
     from tmlattice.lattice.ocelot import elements
 
     cls = type(source).__name__
     for name in _NOT_MODELLED:
         if getattr(source, name, 0.0):
-            raise LatticeError(f"{name} of the {cls} '{source.id}' is not modelled; set it to 0")
+            raise LatticeError(f"{name} of the {cls} '{named}' is not modelled; set it to 0")
     if cls == "TDCavity" and source.v:
-        warnings.warn(f"'{source.id}': what the voltage does in a {cls} is left out", stacklevel=2)
+        warnings.warn(f"'{named}': what the voltage does in a {cls} is left out", stacklevel=2)
     if _displaced(source):
         source = copied(source)
         source.dx = source.dy = 0.0
@@ -171,16 +171,16 @@ def _modelled(source: Any) -> Any:
         matrix[4, 4] = matrix[5, 5] = 1.0
         source.r = matrix
     if isinstance(source, elements.Multipole) and source.kn[0]:  # it bends the design orbit
-        source = _thin_bend(source)
+        source = _thin_bend(source, named)
     return source
 
 
-def _thin_bend(source: Any) -> Any:
+def _thin_bend(source: Any, named: str) -> Any:
     from tmlattice.lattice.combined import CombinedMultipole
 
     angle, k1, k2, *higher = [*map(float, source.kn), 0.0, 0.0]
     if any(higher):
-        warnings.warn(f"'{source.id}': fields above the sextupole are left out", stacklevel=2)
+        warnings.warn(f"'{named}': fields above the sextupole are left out", stacklevel=2)
     return CombinedMultipole(angle=angle, k1=k1, k2=k2, tilt=source.tilt, eid=source.id)
 
 
@@ -194,7 +194,8 @@ def _name_places(places: list[Any], variables: Mapping[str, Any]) -> tuple[Eleme
         else str(source.id)
         for source in places
     ]
-    modelled = {id(source): _modelled(source) for source in {id(p): p for p in places}.values()}
+    first = {id(source): (source, name) for name, source in zip(families, places, strict=True)}
+    modelled = {key: _modelled(*own) for key, own in first.items()}
     elements = place_elements(families, [modelled[id(source)] for source in places])
     return tuple(
         e.with_errors(dx=float(source.dx), dy=float(source.dy)) if _displaced(source) else e

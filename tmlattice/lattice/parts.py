@@ -63,7 +63,6 @@ SHIFTS = frozenset({"dx", "dy", "ds", "dpsi"})
 _EDGES = frozenset({
     "angle", "e1", "e2", "h1", "h2", "hgap", "fint", "fintx", "kill_ent_fringe", "kill_exi_fringe",
 })  # fmt: skip
-_KICKS = frozenset({"hkick", "vkick", "kick"})
 _PASSIVE = frozenset[str]()
 
 MODELLED: dict[str, frozenset[str]] = {
@@ -71,7 +70,9 @@ MODELLED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("blmonitor", "imonitor", "slmonitor"), _PASSIVE),  # of losses, current, light
     **dict.fromkeys(("collimator", "ecollimator", "rcollimator"), _PASSIVE),
     **dict.fromkeys(("monitor", "hmonitor", "vmonitor"), _PASSIVE),
-    **dict.fromkeys(("hkicker", "vkicker", "kicker", "tkicker"), _KICKS | {"tilt"}),
+    "hkicker": frozenset({"kick", "hkick", "tilt"}),
+    "vkicker": frozenset({"kick", "vkick", "tilt"}),
+    **dict.fromkeys(("kicker", "tkicker"), frozenset({"hkick", "vkick", "tilt"})),
     "sbend": _STRENGTHS | SHIFTS | _EDGES | {"tilt"},
     **dict.fromkeys(("quadrupole", "sextupole", "octupole"), _STRENGTHS | SHIFTS | {"tilt"}),
     "multipole": _STRENGTHS | SHIFTS | {"tilt", "lrad", "angle"},
@@ -355,9 +356,8 @@ def _places(part: Part, ring: Ring, charge: float, report: Report) -> list[Place
             source = ocelot.Cavity(l=length, v=voltage, freq=frequency, eid=name)
             return [(name, "cavity", source)]
         case "solenoid" if length:
-            return [
-                (name, "solenoid", ocelot.Solenoid(l=length, k=part.number("ks") / 2, eid=name))
-            ]
+            half = (part.number("ks") or part.number("ksi") / length) / 2
+            return [(name, "solenoid", ocelot.Solenoid(l=length, k=half, eid=name))]
         case "solenoid" | "dipedge" | "srotation" | "matrix":
             return [_matrix(part, ring)]
         case "sbend" if length:

@@ -127,7 +127,7 @@ def place_elements(
     """
     for source in {id(source): source for source in sources}.values():
         _check(source)
-    _warn_of_octupoles(sources)
+    _warn_of_octupoles(families, sources)
     if kinds is None:
         kinds = [source_kind(source, name) for source, name in zip(sources, families, strict=True)]
     placed = []
@@ -154,10 +154,13 @@ def place_elements(
     return tuple(placed)
 
 
-def _warn_of_octupoles(sources: Sequence[Any]) -> None:
+def _warn_of_octupoles(families: Sequence[str], sources: Sequence[Any]) -> None:
     from tmlattice.lattice.ocelot import elements
 
-    names = [str(s.id) for s in sources if isinstance(s, elements.Octupole) and s.k3 != 0]
+    names = [
+        family for family, source in zip(families, sources, strict=True)
+        if isinstance(source, elements.Octupole) and source.k3 != 0
+    ]  # fmt: skip
     if names:
         kinds = list(dict.fromkeys(names))
         warnings.warn(

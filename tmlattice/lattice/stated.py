@@ -82,7 +82,8 @@ class Stated:
         # products of curvature and gradient
         other = number("BV_FLAG") == -1 or "PTC" in str(header.get("NAME"))
         slopes = None if other else pair("DQ1", "DQ2")
-        rf = any(row.get("VOLT") for row in rows)
+        # without the column of its voltage a cavity may be on
+        rf = any(row.get("VOLT", row.get("KEYWORD") == "RFCAVITY") for row in rows)
         chrom = any(row["WX"] for row in rows) if "WX" in last else None  # 0 without CHROM
         return cls(
             number("LENGTH"), pair("Q1", "Q2") or phases,

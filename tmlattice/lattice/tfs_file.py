@@ -259,8 +259,6 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
             own |= {e: own.get(e, 0.0) + own.get("angle", 0.0) / 2 for e in ("e1", "e2")}
     if keyword == "multipole" and not own.get("angle"):
         own.pop("angle", None)
-    if keyword == "solenoid" and not own.get("ks") and length:
-        own["ks"] = own.get("ksi", 0.0) / length
     for attribute, column in STRENGTHS.items():
         values = [float(row.get(column.format(n)) or 0.0) for n in ORDERS]
         if keyword in OWN_ORDER:

@@ -83,10 +83,10 @@ BENDS = ("Bend", "RBend", "CombinedFunctionMagnet", "Magnet")
 MAIN = {"Bend": "k0", "RBend": "k0", "CombinedFunctionMagnet": "k0", "Quadrupole": "k1",
         "Sextupole": "k2", "Octupole": "k3"}  # fmt: skip
 MOST_KICKS = 1000
-LUMPED = 2e-5
+LUMPED = 1e-5
 """1/m; by so much a magnet's focusing may differ for its gradient's being spread over its length:
 1e-5 of a tune at a beta of 10 m."""
-SLICE_ANGLE, YOSHIDA = 0.022, 5.8e-3
+SLICE_ANGLE, KICKS, YOSHIDA = 0.022, 7, 5.8e-3
 """rad: Xsuite has seven kicks for each such angle of a bend. In a slice of length l they change a
 gradient by YOSHIDA (k1 l^2)^3 of itself (measured between 0.12 and 0.5)."""
 SKEW_SHARE = 0.1
@@ -270,8 +270,10 @@ class _Reader:
         self.momentum = 1e9 * energy * self.beta
         self.report = Report()
         variables = (content.get("_var_management_data") or {}).get("var_values") or {}
-        self.variables = {k: v for k, v in variables.items() if isinstance(v, int | float)}
-        self._arithmetic = Arithmetic((math.sqrt, math.sin, math.cos, math.tan, math.exp))
+        functions = (math.sqrt, math.sin, math.cos, math.tan, math.exp)
+        self.variables: dict[str, Any] = {own.__name__: own for own in functions}
+        self.variables |= {k: v for k, v in variables.items() if isinstance(v, int | float)}
+        self._arithmetic = Arithmetic(functions)
         self._steering = {
             key: {str(name).partition("::")[0] for name in own or ()}
             for key, own in (line.get("_extra_config") or {}).items() if key.startswith("steering_")
@@ -627,10 +629,10 @@ class _Reader:
         exact = ["mat-kick-mat", "mat-kick-mat-exact", "expanded"]
         if rule not in ("uniform", "teapot"):
             exact += ["adaptive", "full", "0"]
-        k1, length = abs(fields.number("k1")), _way_of(fields)
-        step = length / max(1, math.ceil(abs(angle) / SLICE_ANGLE))
-        coarse = not model.startswith("mat") and YOSHIDA * (k1 * step**2) ** 3 * k1 * length
-        if (fields.number("num_multipole_kicks") and model not in exact) or coarse > LUMPED:
+        k1, length = fields.number("k1"), _way_of(fields)
+        slices = math.ceil(abs(angle) / SLICE_ANGLE)
+        coarse = not model.startswith("mat") and _coarse(k1, length, slices)
+        if (fields.number("num_multipole_kicks") and model not in exact) or coarse:
             self.report.left_out("the finite number of kicks", name)
 
     def _straight(self, fields: _Fields, name: str, where: str) -> list[Part]:
@@ -664,7 +666,8 @@ class _Reader:
         if lumped < LUMPED or not 0 <= count < MOST_KICKS or not length:
             return [whole]
         if rule not in ("uniform", "teapot"):
-            if rule in ("yoshida4", "yoshida-4") and count:
+            six = rule in ("yoshida6", "yoshida-6")
+            if not six or _coarse(knl[1] / length, length, math.ceil(count / KICKS)):
                 self.report.left_out("the finite number of kicks", whole.name)
             return [whole]
         return _kicks(whole, knl, ksl, max(1, count), rule == "teapot", body / length)
@@ -877,12 +880,15 @@ class _Bend:
         return Part(name, "sbend", {**values, **self.reader._alignment(self.fields)}, where)
 
     def _check_body(self, knl: Array, ksl: Array) -> None:
-        if self.fields.word(
-            "rbend_model", "adaptive", {2: "straight-body"}
-        ) == "straight-body" and (knl[1:].any() or ksl[1:].any()):
+        body = self.fields.word("rbend_model", "adaptive", {2: "straight-body"})
+        turned = any(
+            self.active(side) and self.fields.number(f"edge_{key}_angle")
+            for side, key in enumerate(("entry", "exit"))
+        )
+        if body == "straight-body" and (knl[1:].any() or ksl[1:].any() or turned):
             raise LatticeError(
-                f"{self.fields.named} has a straight body with a gradient, which is not modelled; "
-                "give it the rbend_model curved-body"
+                f"{self.fields.named} has a straight body with a gradient or with angles of its "
+                "faces, which is not modelled; give it the rbend_model curved-body"
             )
 
     def whole(self, name: str, where: str) -> list[Part]:
@@ -920,6 +926,12 @@ def _passive(name: str, length: float) -> Part:
 def _monitor(fields: _Fields, name: str, where: str) -> Part:
     fields.used |= set(fields.values)
     return Part(name, "monitor", {}, where)
+
+
+def _coarse(k1: float, length: float, slices: int) -> bool:
+    """Whether seven kicks in each slice of a magnet focus otherwise than its gradient (1/m2)."""
+    step = length / max(1, slices)
+    return YOSHIDA * abs(k1 * step**2) ** 3 * abs(k1) * length > LUMPED
 
 
 def _anchor(anchor: str) -> float:
