@@ -22,7 +22,8 @@ def figures(text):
 
     with tempfile.TemporaryDirectory() as folder:
         mad = Madx(stdout=False, cwd=folder)
-        mad.input(text)
+        Path(folder, "ring.madx").write_text(f"{text};\n")
+        mad.call("ring.madx")
         if "use," not in text:
             mad.input("use, sequence=ring;")
         mad.input("twiss;")
@@ -47,7 +48,8 @@ def table(text, options=""):
 
     with tempfile.TemporaryDirectory() as folder:
         mad = Madx(stdout=False, cwd=folder)
-        mad.input(text)
+        Path(folder, "ring.madx").write_text(f"{text};\n")
+        mad.call("ring.madx")
         if "use," not in text:
             mad.input("use, sequence=ring;")
         mad.input(f"select, flag=twiss, column={COLUMNS}; twiss, {options} file=twiss.tfs;")

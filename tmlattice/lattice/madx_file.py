@@ -468,8 +468,9 @@ class _Reader:
             # worked out at once even after `:=`, as MAD-X does
             owner, given = unquoted(match[1]).lower(), Given(match[4])
             return self._set(owner, {match[2].lower(): given})
-        match = re.fullmatch(r"([\w.$%]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?\s*:\s*([^=].*)", text,
-                             re.DOTALL)  # fmt: skip
+        match = re.fullmatch(  # a comma is a blank to MAD-X
+            r"([\w.$%]+|\"[^\"]*\"|'[^']*')\s*(\([^)]*\))?[\s,]*:[\s,]*([^=].*)", text, re.DOTALL
+        )
         if match:
             name, rest = unquoted(match[1]).lower(), match[3]
             line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)

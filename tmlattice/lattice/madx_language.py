@@ -290,13 +290,11 @@ def statements(text: str) -> Iterator[Statement]:
                 raise LatticeError(f"the quotation that begins in line {line} does not end")
             begin = begin if buffer else line
             stop = at if apostrophe else stop + 1
-            buffer.append(text[match.start() : stop])
+            buffer.append(text[match.start() : stop].replace("\n", ""))
             line += text.count("\n", at, stop)
             at = stop
-        elif sign == "\n":
+        elif sign == "\n":  # is no blank: MAD-X's SAVE breaks lines within words and numbers
             line += 1
-            if buffer:
-                buffer.append(" ")
             if buffer and line - begin > LONGEST_STATEMENT:
                 raise LatticeError(
                     f"no ';' ends the statement of line {begin} within {LONGEST_STATEMENT} lines"
