@@ -132,6 +132,14 @@ CODE = {
         "", ring=f"c = {CELL}; ring = atsetfieldvalues(c(2:8), 'Energy', 3e9);"
     ),
     "of AT 1": function("", "fodo", AT_1, "ELIST = [M QF D1 BB D1 QD D1];\nbuildlat(ELIST');"),
+    "of AT 1, element by element": function(
+        "ELIST = [D1 QD D1 BB D1 QF M];", "fodo", AT_1,
+        "ELIST = reverse(ELIST);\nTHERING=cell(size(ELIST));\nfor i=1:size(ELIST, 2)\n"
+        "  THERING{i} = FAMLIST{ELIST(i)}.ElemData;\n"
+        "  FAMLIST{ELIST(i)}.NumKids=FAMLIST{ELIST(i)}.NumKids+1;\n"
+        "  FAMLIST{ELIST(i)}.KidsList = [FAMLIST{ELIST(i)}.KidsList i];\nend\n"
+        "THERING = setcellstruct(THERING,'Energy',1:length(THERING),GLOBVAL.E0);",
+    ),
     "of AT 1, as a Middle Layer's": function(
         "HALF = [D1 QD D1 BB];", "varargout = fodo", AT_1,
         "ELIST = [M QF reverse(HALF(2:4)) QD D1];\nELIST(3:5) = [D1 BB D1];\nbuildlat(ELIST);\n"

@@ -39,6 +39,10 @@ _OF_FILE = re.compile(r"\A(function ring = ).*(?=\(\)\r?\n)")
 _PYTHON_TEXT = re.compile(r"'(?:[^'\\\n]|\\.)*'|\"(?:[^\"\\\n]|\\.)*\"")
 """Python's AT calls the function as the file, which need not be a name, and has Python's texts."""
 
+_FAMILY = re.compile(r"FAMLIST\{(\w+)\((\w+)\)\}\.ElemData")
+_COUNTED = re.compile(r"^[ \t]*FAMLIST\{[^=\n]*=.*", re.MULTILINE)
+"""Before AT 1 had BUILDLAT, files took elements from their families, and counted them."""
+
 _SILENT = frozenset((
     "disp", "display", "fprintf", "clear", "clearvars", "clc", "close", "format", "tic", "toc",
     "warning", "evalin", "assignin", "atsummary", "figure", "plot", "hold", "drawnow", "addpath",
@@ -63,6 +67,7 @@ def elements_of(text: str, name: str | None = None, energy: float | None = None)
     """
     if "function v=False()" in text:  # by Python's AT
         text = _PYTHON_TEXT.sub(_matlab_text, _OF_FILE.sub(r"\1lattice", text, count=1))
+    text = _COUNTED.sub("", _FAMILY.sub(r"\1{\2}", text))
     variables, result = Code(text, _functions(), _SILENT).run()
     lists = [key for key, value in variables.items() if _is_ring(value)]
     if result in ("", "varargout"):  # a script, or a function that leaves a global variable
@@ -121,7 +126,7 @@ def _element(function: str, name: Any = "", *given: Any) -> Element:
     for place in places:
         if isinstance(fields.get(place), str) and place not in may_be_text:
             raise ValueError(f"the {place} of '{plain(str(name), 40)}' is a text")
-    missing = {k: v for k, v in _DEFAULTS.items() if k in places}
+    missing: Element = {k: v for k, v in _DEFAULTS.items() if k in places}
     if function == "atsolenoid":
         missing["PassMethod"] = "SolenoidLinearPass"
     if function == "atrbend":
@@ -182,7 +187,8 @@ def _functions() -> dict[str, Callable[..., Any]]:
         **{name: partial(_of_vector, getattr(np, name)) for name in ("max", "min", "sum")},
         "zeros": partial(_filled, 0.0), "ones": partial(_filled, 1.0),
         "eye": lambda n: np.diag(_filled(1.0, n)[0]), "diag": lambda v: np.diag(_vector(v)),
-        "cell": lambda *n: [np.zeros((0, 0))] * _product(n),
+        "cell": lambda *n: [np.zeros((0, 0))] * _product(tuple(np.hstack([*map(np.ravel, n)]))),
+        "size": _size,
         "length": _length, "isempty": lambda v: _length(v) == 0.0,
         "numel": lambda v: float(len(v) if isinstance(v, list | str) else np.size(v)),
         "ischar": lambda v: isinstance(v, str), "iscell": lambda v: isinstance(v, list),
@@ -231,6 +237,12 @@ def _product(counts: tuple[float, ...]) -> int:
 def _filled(value: float, *counts: float) -> Any:
     _product(counts)
     return np.full([int(n) for n in (counts * 2)[:2]], value)
+
+
+def _size(value: Any, *axis: float) -> Any:
+    rows, columns = (1, len(value)) if isinstance(value, list | str) else np.atleast_2d(value).shape
+    sizes = np.array([[rows, columns]], dtype=float)
+    return float(sizes[0, int(axis[0]) - 1]) if axis else sizes
 
 
 def _length(value: Any) -> float:

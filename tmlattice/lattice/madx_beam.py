@@ -37,7 +37,7 @@ class Beam:
         if named:
             self.given = {k: v for k, v in self.given.items() if k not in ("mass", "charge")}
         self.given |= {k: v for k, v in own.items() if k not in ("mass", "charge")}
-        stated = {k: float(own[k]) for k in ("mass", "charge") if k in own}
+        stated: dict[str, float] = {k: float(own[k]) for k in ("mass", "charge") if k in own}
         known = self._particle in PARTICLES.keys() - {"ion"} and "particle" in self.given
         if known and (named or "mass" not in stated):
             ours = {"mass": self.mass, "charge": self.charge}

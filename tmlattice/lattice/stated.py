@@ -99,7 +99,7 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
     if stated.orbit > STRAIGHT and not any(map(_kicks, ring.elements)):
         return (
             f"nothing in it bends the orbit, the table has one of {1e3 * stated.orbit:.3g} mm: "
-            "errors of elements are not in a table"
+            "errors of elements and losses by radiation are not in a table"
         )
     chain = _maps(ring)
     if stated.orbit > STRAIGHT and all(e.errors == NO_ERRORS for e in ring.elements):
@@ -107,7 +107,8 @@ def contradiction(ring: Ring, stated: Stated) -> str | None:
         if abs(largest - stated.orbit) > ORBIT * stated.orbit + STRAIGHT:
             return (
                 f"its closed orbit is {1e3 * largest:.3g} mm at most, the table has "
-                f"{1e3 * stated.orbit:.3g} mm: errors of elements are not in a table"
+                f"{1e3 * stated.orbit:.3g} mm: "
+                "errors of elements and losses by radiation are not in a table"
             )
     if stated.tunes is None:
         return None
