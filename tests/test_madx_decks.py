@@ -133,6 +133,9 @@ REFUSED = {
         PLAIN + "f(x): macro = { qf->k1 = x; }; exec, f(-0.5);",
         "the argument '-0.5' of a macro is an expression, which MAD-X cuts off",
     ),
+    "length of a sequence": (
+        PLAIN + "qf, k1=ring->l/40;", "'ring->l' of a sequence is 0 in MAD-X; write its value"
+    ),
     "branch without braces": (PLAIN + "if (1 == 1) qf, k1=2;", "IF is not followed by"),
     "kick of a kicker": (with_element("k: kicker, kick=1e-4, at=4.95;"), "KICK of KICKER 'k'"),
     "nested branches": (
@@ -187,6 +190,7 @@ WARNED = {
         PLAIN.replace("energy=3", "energy=3, bv=-1").replace("bb: sbend", "bb: rbend"),
         r"MAD-X's TWISS gives half the angle in faces \(BV=-1\) of bb \(1\)",
     ),
+    "last statement": (PLAIN + "qf, k1=1.05", r"'qf, k1=1.05' \(line \d+ of .*\) has no ';'"),
     "beam of a sequence without an energy": (
         PLAIN + "beam, sequence=ring, charge=-1;",
         "BEAM of the sequence 'ring' states no energy, which is 1 GeV in MAD-X",

@@ -382,15 +382,15 @@ class _Reader:
             self._depth -= 1
 
     def attribute(self, owner: str, name: str) -> float:
-        """The value of `owner->name`: of a beam, a sequence's length, an element's attribute."""
+        """The value of `owner->name`: of a beam, or an element's attribute."""
         self.work()
         if owner == "beam" or owner.startswith("beam%"):
             return self.beam(owner.partition("%")[2]).attribute(name)
         if owner in self.elements:
             value = self._value(self.elements[owner], name)
             return float(value[0] if isinstance(value, tuple) else value)
-        if owner in self.sequences and name == "l":
-            return self._valued(self.sequences[owner].length, owner)
+        if owner in self.sequences:
+            raise Undetermined(f"'{owner}->{name}' of a sequence is 0 in MAD-X; write its value")
         raise Undetermined(f"'{owner}->{name}': no element '{owner}' is defined")
 
     def _value(self, definition: _Definition, attribute: str) -> Any:
@@ -413,16 +413,21 @@ class _Reader:
             raise LatticeError(f"it calls '{path}': too many files, or too large ones")
         self._files.append(path)
         try:
-            self._read_text(decoded(content_of(path, LatticeError)))
+            self._read_text(decoded(content_of(path, LatticeError)), whole=True)
         except _Stop as stop:
             if stop.everything:
                 raise
         finally:
             self._files.pop()
 
-    def _read_text(self, text: str) -> None:
+    def _read_text(self, text: str, whole: bool = False) -> None:
         for statement in statements(text):
             self.work(10)
+            if whole and not statement.ended and not _LAST.match(statement.text):
+                self.warnings.append(
+                    f"'{plain(statement.text, 60)}' ({self._where(statement)}) has no ';', without "
+                    "which MAD-X does not carry it out: it is carried out here"
+                )
             try:
                 self._carry_out(statement)
             except (LatticeError, ArithmeticError, ValueError, TypeError, LookupError) as error:
@@ -1151,6 +1156,8 @@ _REFERENCE = {"entry": 0.5, "exit": -0.5}
 _SHIFTS = SHIFTS | {"dtheta", "dphi"}
 _COMMANDS = ("beam", "resbeam", "select", "call", "use", "option", "exec", *NOT_RUN)
 _EDITS = ("install", "remove", "move", "replace", "cycle", "flatten", "reflect")
+_LAST = re.compile(r"(return|exit|quit|stop|twiss|endsequence)\b", re.IGNORECASE)
+"""Statements that end a file as well without their `;`."""
 _ARGUMENT = re.compile(
     r"\"[^\"]*\"|'[^']*'|(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[^-+*/^(){}]*(->[\w.]+)?", re.IGNORECASE
 )

@@ -239,10 +239,11 @@ def _comparison(text: str, names: Names) -> bool:
 
 @dataclass(frozen=True)
 class Statement:
-    """Of a file: its text with blanks folded, and the line in which it begins."""
+    """Of a file: its text with blanks folded, the line in which it begins, and whether it ends."""
 
     text: str
     line: int
+    ended: bool = True
 
 
 _BLOCK = re.compile(r"(?:if|while|elseif)\s*\(|else\b|[\w.]+\s*(?:\([^)]*\))?\s*:\s*macro\b", re.I)
@@ -261,11 +262,11 @@ def statements(text: str) -> Iterator[Statement]:
     line = begin = 1
     depth = at = 0
 
-    def statement() -> Iterator[Statement]:
+    def statement(ended: bool = True) -> Iterator[Statement]:
         bare = re.sub(r":\s+=", ":=", " ".join("".join(buffer).split()))
         buffer.clear()
         if bare:
-            yield Statement(bare, begin)
+            yield Statement(bare, begin, ended)
 
     while at < len(text):
         match = _SPECIAL.search(text, at)
@@ -312,7 +313,7 @@ def statements(text: str) -> Iterator[Statement]:
                 yield from statement()
     if depth:
         raise LatticeError(f"a brace that opens in line {begin} or later does not close")
-    yield from statement()
+    yield from statement(ended=False)
 
 
 def _find(text: str, what: str, at: int) -> int:
