@@ -17,7 +17,7 @@ optics at the BPMs: beta beating, dispersion, tunes, coupling. Compared with
   without priors, with the best of three cuts in hindsight, and the fitted ring corrected (of an
   orbit response).
 
-A line a case is written as it comes, with its study (lattice, kind, knobs); cases that FILE has
+A line a case is written at once, with its study (lattice, kind, knobs); cases that FILE has
 already are not measured again.
 `--keep FOLDER` keeps measurements and diagnoses (the package's own pickles), for the next run to
 start from. `--summary FILE` prints the table of such a file. `--sigmas 0 1.5 2` corrects with each

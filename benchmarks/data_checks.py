@@ -2,7 +2,7 @@
 
 Two tables for each ring, on first turns of the virtual machine. Data that are wrong everywhere: is
 it named, and nothing else, in how many seconds? Healthy data of sick and of real machines: is
-anything told? Among them are machines with all usual errors whose quadrupoles are so far off axis
+anything reported? Among them are machines with usual errors whose quadrupoles are so far off axis
 that the orbit of the first turn is 1, 3 or 6 mm rms (`python benchmarks/data_checks.py --off-axis
 RING ...`: these alone). RING is a lattice file, a built-in name, or a file of AT's `machine_data`.
 """
@@ -62,7 +62,7 @@ def reordered(data, order):
 
 
 def wrong(data, ring):
-    """Of each: name, the data, and the assumptions of which one has to be told (or the check)."""
+    """Of each: name, the data, and the assumptions of which one has to be named (or the check)."""
     count = len(data.monitors)
     places = np.arange(count)
     yield "x of wrong sign", scaled(data, [-1, 1]), {"x-reversed"}
@@ -119,7 +119,7 @@ def backwards(ring, data):
 
 
 def wrong_response(data, ring):
-    """The same for an orbit response; the other explanation of some is told beside."""
+    """The same for an orbit response; the other explanation of some is named, too."""
     for name, made, asked in (
         ("x of wrong sign", "x-reversed", "x-reversed"),
         ("y of wrong sign", "y-reversed", "y-reversed"),
@@ -144,7 +144,7 @@ def wrong_response(data, ring):
 
 
 def named(checkup, expected):
-    """Whether what was expected is told, and nothing else is wrong."""
+    """Whether what was expected is reported, and nothing else is wrong."""
     bad = [check for check in checkup.checks if check.status == "wrong"]
     if isinstance(expected, str):
         return [check.name for check in bad] == [expected]
@@ -187,7 +187,7 @@ def healthy(ring, seed):
     yield "correctors set", [fault(ring, rng)], {"kicks": 2e-5}
     yield "energies of their own", [fault(ring, rng)], {"launch_sigma": (1e-4, 2e-5) * 2 + (1e-3,)}
     usual = {"background": {"all": None}}
-    yield "small errors everywhere", [], usual
+    yield "distributed errors", [], usual
     yield "and a fault", [fault(ring, rng)], usual
     yield "and correctors set", [], {**usual, "kicks": 2e-5}
     yield "and one shot", [], {**usual, "shots": 1}
@@ -308,7 +308,7 @@ def main(rings):
             print(
                 f"\nnamed {right} of {len(cases)}; {np.median(seconds):.2f} s, {max(seconds):.2f}"
             )
-        print("\n| healthy | cases | told |\n|---|---|---|")
+        print("\n| healthy | cases | reported |\n|---|---|---|")
         told, count = {}, {}
         steers = any(e.kind == "hcorrector" for e in ring.elements)
         for seed in (*OFF_AXIS, *([] if alone else SEEDS)):

@@ -1,4 +1,4 @@
-"""What first turns say of one displaced sextupole among the usual errors: oracle and diagnosis.
+"""One displaced sextupole among the usual errors, by first turns: oracle and diagnosis.
 
 SOLEIL's lattice as accelerator-toolbox ships it; six shots of 1 mm, noise 20 micrometres, every
 usual error of the catalogue, and one sextupole, drawn by the seed, that is displaced. The oracle is

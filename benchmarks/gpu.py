@@ -1,4 +1,4 @@
-"""Networks on a graphics card: the CPU's values, and speed beside a plain torch loop and Xsuite.
+"""Networks on a graphics card: the CPU's values, and speed over a plain torch loop and Xsuite.
 
     python benchmarks/gpu.py [--out FOLDER] [--without-xsuite]
 
@@ -77,7 +77,7 @@ def everything(network, design):
     far = still[:5].clone()
     far[3, 0] = 0.5
     lost = network(far, on_lost="inf").detach().cpu().numpy()
-    found["readings beside a lost beam"] = np.where(np.isfinite(lost), lost, 1e3)
+    found["readings next to a lost beam"] = np.where(np.isfinite(lost), lost, 1e3)
     try:
         network.track(far, 3)
     except BeamLostError as error:

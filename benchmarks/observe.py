@@ -4,7 +4,7 @@ Turns of two modes with coupling and noise at all monitors, as many as asked for
 processor seconds that the spectra take (`observe.spectra.lines`), that the folder takes to be
 written and read, and the rms of the amplitudes' deviations over their errors. Least of three runs.
 
-22 November 2026, one thread of a busy machine; writing and reading (`--files`) at another hour:
+One thread of a busy machine; writing and reading (`--files`) in another run:
 
     turns monitors shots   spectra   write    read    rms of deviations over errors
      1000      246     4      0.25     2.1     3.9    0.99
@@ -16,8 +16,8 @@ written and read, and the rms of the amplitudes' deviations over their errors. L
 
 All grow as turns x monitors x shots. `--scans` asks every hypothesis once on the built-in ring,
 with the threshold's simulation: four kicks, and the response of 330 correctors at 246 monitors, of
-which kicks are seen by the orbit that they make in the sextupoles. Least of two runs, 22 November
-2026, on a machine with three times as much to do as it has processors:
+which kicks are seen by the orbit that they make in the sextupoles. Least of two runs on
+a machine with three times as much to do as it has processors:
 
     scan of        hypotheses  readings   seconds
     turns                8224      7880      0.36
@@ -27,7 +27,7 @@ which kicks are seen by the orbit that they make in the sextupoles. Least of two
 No signature is written out: turns cost as the modes at the monitors, whatever the shots; of a
 response the squares are summed up reading by reading, so that it grows as hypotheses x readings.
 
-`--pulls LATTICE` says how far amounts from closed orbits are off, in their stated errors.
+`--pulls LATTICE` prints how far amounts from closed orbits are off, in their stated errors.
 """
 
 import argparse

@@ -1,10 +1,10 @@
 """Pairs that come otherwise: `TMLATTICE_DATA=... python benchmarks/pair_variants.py [--both]`.
 
 The second day of a measured pair is changed as in `variants.py` (a unit wrong, monitors dead, less
-of everything), or with `--both` both days are. Told are what stopped the diagnosis, the seconds,
-which of the pair's changes were found, lost and named beside, and the largest change of an amount
-in its stated errors. Where it stops and names what to assume, it goes on with that.
-`--variant NAME` (any number of them) takes some of them; `--null` the pair without a change.
+of everything), or with `--both` both days are. It prints what stopped the diagnosis, the
+seconds, which of the pair's changes were found and lost and what else was named, and the largest
+change of an amount in its stated errors. Where it names what to assume, it goes on with
+that. `--variant NAME` (any number of them) takes some of them; `--null` the pair without a change.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def tried(ring, before, after, assumed=()):
 
 
 def told(found, usual):
-    """A line of findings, beside those of the untouched pair."""
+    """A line of findings, compared with those of the untouched pair."""
     own = {(f.effect, str(f.element)): (f.amount, f.amount_sigma) for f in found.findings}
     lost = [name for name in usual if name not in own]
     others = [f"{effect} {where} " + ("" if sigma is None else f"{amount:+.2g} ± {sigma:.1g}")
@@ -64,7 +64,7 @@ def told(found, usual):
 
 
 def main():
-    """Each variant as it comes."""
+    """Each variant in turn."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--variant", action="append", choices=variants.VARIANTS)
     parser.add_argument("--both", action="store_true")

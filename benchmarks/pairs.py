@@ -10,7 +10,7 @@ noise, and the second's is drawn larger by that: two days differ by the noise of
 
 Each case is drawn by its number: three supplies by 0.1 to 0.6 %, less where that moves a tune by
 more than 0.03, and three single quadrupoles by 0.3 to 1 %, of either sign; or nothing (`--null`).
-Told are what was found of what was changed, what else was named, and by how many of their stated
+It prints what was found of what was changed, what else was named, and by how many of their stated
 errors the amounts are off. `--cases N` that many of each ring, `--first N` from another number on.
 """
 
@@ -48,7 +48,7 @@ SCATTER = 1e-4
 it as well as all of a supply do together."""
 STRANGE = 0.05
 """Share of the square of a column, or a monitor, that a multiple of its model leaves where it takes
-no part: what is exchanged, say, would have the change of another one."""
+no part: what is swapped, for example, would have the change of another one."""
 KICK = 2e-5
 """rad; of AT's steps, small enough for orbits in proportion to them."""
 
@@ -61,7 +61,7 @@ class DistributedErrors(NamedTuple):
 
 
 def drawn(ring, rng, null):
-    """Changes: (what it is told of, amount, {magnet: relative change})."""
+    """Changes: (its name, amount, {magnet: relative change})."""
     own = magnets(ring, ("quadrupole",), powered=True)
     kinds, members = supplied_alike(ring)
     several = [i for i in range(len(kinds)) if members[:, i].sum() > 1]
@@ -97,7 +97,7 @@ def drawn(ring, rng, null):
 
 
 def causes_of(changes):
-    """What `drawn` says, piece by piece."""
+    """The changes of `drawn`, piece by piece."""
     return [
         Cause("quadrupole_gradient", piece.name, amount)
         for _, amount, _, own, of in changes
@@ -159,7 +159,7 @@ def stranger(read, told, axis):
 
 def simulated(ring, known, measured, changes=()):
     """AT's response with the monitors, the correctors and the RF step of a measurement, and what
-    kicks astray add to it."""
+    stray kicks add to it."""
     rf, causes = measured.rf, [*known.causes, *changes]
     made = simulate_response(
         ring, causes, correctors=list(measured.correctors), kick=KICK, noise=0.0, progress=False,
@@ -239,7 +239,7 @@ def judged(ring, result, changes):
 
 
 def weighed(name, case, ring, result, changes, seconds):
-    """How many were found, were there, and are none; and pulls. It is told, too."""
+    """How many were found, were there, and are none; and pulls. It prints them, too."""
     found, missed, wrong, pulls = judged(ring, result, changes)
     told = ", ".join(f"{what} {100 * amount:+.2f} %" for what, amount in missed)
     others = ", ".join(f"{effect} {where} {amount:+.2g} ± {error:.1g}"
@@ -256,7 +256,7 @@ def rms(pulls):
 
 
 def cases(name, files, data, place, options):
-    """Each as it comes; and the counts."""
+    """Each in turn; and the counts."""
     lattice, folder, _ = imported(name, files, data, place, "last")
     ring, measured = tmlattice.load_ring(lattice), read_measurement(folder)
     known, measured, before = first_day(ring, measured)

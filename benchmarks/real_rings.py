@@ -1,24 +1,22 @@
 """Measured responses of real rings: `TMLATTICE_DATA=... python benchmarks/real_rings.py [NAME]`.
 
 Each file of `$TMLATTICE_DATA/real_rings` is imported to a temporary folder and diagnosed, with
-default options, one after another; PETRA III's folder is diagnosed as it is. Told are the rms of
-held-out correctors, in plane (with a position jump of their own), in the other plane (with a roll
-of their own where that was weighed) and of the RF's orbit, in micrometres: of the lattice and of
-the result; beside them what the experts' own LOCO fit leaves of all the data that it was fitted to
-(its last model, in the file). Then the steps, kept and refused. The lattice of a LOCO file is the
-model before its fit; `--iteration last` takes the fitted one; `--seed N` another split, `--seeds N`
-that many of them; `--families` seeks no single faults among small errors, which takes most of the
-time;
-`--missing` weighs what the result still lacks, and tells a table of that; `--pictures FOLDER` makes
-a picture a ring: what is left before and after, and the gradients. `--into FOLDER` writes a file of
-each ring and seed as it comes; what stands there already, of the same options and code, is told and
-not measured again, so that a long study can be stopped, and goes on. `--table` prints the table of
-what FOLDER has, of whatever code: `python benchmarks/tables.py --store real_rings python
-benchmarks/real_rings.py --into FOLDER --table` makes it that of the page.
+default options, one after another; PETRA III's folder is diagnosed as it is. It prints the rms
+residuals of held-out correctors, in plane (with a position jump of their own), in the other plane
+(with their own roll where that was weighed) and of the RF's orbit, in micrometres, of the lattice
+and of the result; and that of the experts' own LOCO fit (its last model, in the file), of all the
+data that it was fitted to. Then the steps, accepted and rejected.
 
-Of several seeds each is told as it comes, and at the end the median and the worst, and by how much
-what was found scatters between them, in units of its stated errors: 0.5 is right where errors are
-those of the readings, of which two seeds share four fifths; 1 where they share none.
+The lattice of a LOCO file is the model before its fit; `--iteration last` takes the fitted one.
+`--seed N` is another split, `--seeds N` that many of them: at the end their median, the worst, and
+the scatter of the results between them in units of their stated errors (0.5 is expected, as two
+seeds share four fifths of the readings). `--families` seeks no single faults among distributed
+errors, which takes most of the time; `--missing` adds a table of effects that the result lacks;
+`--pictures FOLDER` draws the residual before and after, and the gradients, of each ring. `--into
+FOLDER` writes a file of each ring and seed; those of the same options and code are not measured
+again, so that a long study can be stopped. `--table` prints the table of FOLDER, of whatever code:
+`python benchmarks/tables.py --store real_rings python benchmarks/real_rings.py --into FOLDER
+--table` makes it that of the page.
 """
 
 import argparse
@@ -51,7 +49,7 @@ SCATTER = ("quadrupole_gradient", "bend_gradient", "vertical_focusing", "energy_
            "energy_spread", "skew_gradient")  # fmt: skip
 """Effects whose amounts are held against one another between seeds; and shared gradients."""
 FEWEST = 3
-"""Seeds that must have told a number."""
+"""Seeds that must have a number."""
 
 
 def sources(data):
@@ -87,7 +85,7 @@ def experts(path):
 
 
 def imported(name, files, data, place, iteration):
-    """Lattice and folder of a ring, and what its import said of its conventions."""
+    """Lattice and folder of a ring, and the messages of its import about conventions."""
     if not files:
         folder = data / "petra3_orbit_response"
         return folder / "p3_low_beta.mat", folder, []
@@ -104,7 +102,7 @@ def imported(name, files, data, place, iteration):
 
 
 def stands(path, made_with):
-    """What a file of an earlier run says; None where there is none, or one of other options."""
+    """What a file of an earlier run has; None where there is none, or one of other options."""
     if path is None:
         return None
     try:

@@ -3,7 +3,7 @@
 The rings that accelerator-toolbox ships, and those of TMLATTICE_DATA where they are there. Each is
 loaded from its file; its optics and its first turn are held against AT's own of the same file; both
 engines simulate turns and an orbit response; one weak quadrupole is diagnosed, and its ring's tunes
-are predicted by fine-tuning. The table says what differed, and in how many seconds.
+are predicted by fine-tuning. The table has what differed, and the seconds.
 
 `docs/rings.md` shows such a table; `tests/test_rings.py` asks the same of two small rings.
 """
@@ -38,7 +38,7 @@ AMPLITUDE = 1e-4
 
 @dataclass(frozen=True)
 class Case:
-    """One ring: where its file is, and what has to be said about it."""
+    """One ring: where its file is, and what has to be known about it."""
 
     name: str
     path: Path
@@ -96,7 +96,7 @@ def of_the_file(case, launch):
 
 
 def study(case: Case) -> dict:
-    """What the ring says, and the seconds of each question."""
+    """The answers of the ring, and the seconds of each question."""
     row: dict = {"ring": case.name}
     clock = time.perf_counter()
 

@@ -1,17 +1,17 @@
 """How many of several faults are named: `python benchmarks/several_faults.py LATTICE`.
 
 Faults of kinds that eight first turns see well are drawn on a ring without small errors, AT as the
-machine. Told are those named with their effect and element, all findings, and processor seconds.
-22 November 2026, the ring of the tests, seeds 10 to 13, default options:
+machine. It prints those named with their effect and element, all findings, and processor seconds.
+The ring of the tests, seeds 10 to 13, default options:
 
     faults  named as they are   findings   seconds a case
          4           14 of 16         17               10
          6           21 of 24         24               19
          8           21 of 32         25               22
 
-What is missed is told as what does the same there (a quadrupole's offset as two correctors' kicks),
-but for one case of eight, told as one fault and large small errors. Where three faults alone were
-asked for before small errors everywhere, 4 of 16 and 8 of 24 were named.
+What is missed is named as what does the same there (a quadrupole's offset as two kicks), but for one
+case of eight, named as one fault and large distributed errors. Where three faults alone were
+sought before distributed errors, 4 of 16 and 8 of 24 were named.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""Machines with small errors everywhere and no fault, default options: how often is one found?
+"""Machines with distributed errors and no fault, default options: how often is one found?
 
 `python benchmarks/small_errors.py LATTICE [--cases 100] [--scale 1] [--seed 0] [--shots 6]`
 
-Each case is a machine of its own, with the catalogue's usual errors times the scale. Told are the
-false alarms, the verdicts, how the learnt sizes lie beside those that were drawn, whether the
-held-out readings are left as expected, and the seconds of a case.
+Each case is a machine of its own, with the catalogue's usual errors times the scale. It prints
+the false alarms, the verdicts, the ratios of the learnt sizes to the drawn ones, whether the
+held-out readings have the expected residual, and the seconds of a case.
 """
 
 import argparse

@@ -4,7 +4,7 @@ Processor time is user + system of the process and its children, s: of the first
 caches (the package's and numba's), and the least of the later calls. The last column names the
 heavy packages that were loaded.
 
-22 November 2026, `python benchmarks/start.py`, two cores, half of them busy; first / later; goal:
+`python benchmarks/start.py`, two cores, half of them busy; first / later; goal:
 
     --help              0.08 / 0.08   0.15
     info petra3         2.09 / 0.96   2.5    none of the heavy packages in the later calls

@@ -2,8 +2,8 @@
 
 RING is a lattice file, a built-in name, or a file of AT's `machine_data`. The machine has errors of
 gradients, gains, kicks and rolls, the same ones on both days, and AT tracks it; its changes are
-drawn as those of measured rings are (`pairs.py`). Told are what was found of them, what else was
-named, and by how many of their stated errors the amounts are off. `--cases N` that many of each
+drawn as those of measured rings are (`pairs.py`). It prints what was found of them, what else
+was named, and by how many of their stated errors the amounts are off. `--cases N` that many of each
 ring, `--few` with one supply and one magnet, `--null` with no change.
 """
 

@@ -2,9 +2,9 @@
 
 A measured ring is changed in a way whose outcome is known: fewer correctors, a monitor dead, the
 lattice without names, a unit wrong. Each variant is diagnosed with default options as any other
-ring; where the diagnosis stops and names what to assume, it goes on with that. Told are what
+ring; where the diagnosis stops and names what to assume, it goes on with that. It prints what
 stopped it, the seconds, the held-out rms in plane, in the other and of the RF's orbit, micrometres,
-over the untouched ring's in brackets, and what it said that it did not say of the untouched ring.
+over the untouched ring's in brackets, and the messages that the untouched ring has not.
 A traceback is an error of the program, and ends in the table as one.
 
 `--variant NAME` (any number of them) takes some of them; `--seed N` another draw and split; a ring
@@ -381,7 +381,7 @@ def _strengths(case: Case, change: Callable[[str, float], float]) -> Case:
 
 
 def gradients_far(case: Case, rng: Rng) -> Case:
-    """All gradients 1 % strong, and 1 % of scatter: a design that nobody has fitted."""
+    """All gradients 1 % strong, and 1 % of scatter: a design that was never fitted."""
     return _strengths(case, lambda name, k1: k1 * (1.01 + 0.01 * rng.normal()))
 
 

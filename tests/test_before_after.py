@@ -27,7 +27,7 @@ FEW = ["family_gradient", "quadrupole_gradient", "corrector_calibration", "monit
 
 
 def machine(ring, changes=(), seed=1, drift=0.0):
-    """Of a ring with small errors everywhere; monitors and correctors drift from day to day."""
+    """Of a ring with distributed errors; monitors and correctors drift from day to day."""
     rng = np.random.default_rng(7)
     static = [
         Cause("quadrupole_gradient", f"{name}::{i}", 3e-3 * rng.standard_normal())

@@ -125,7 +125,7 @@ SICK = {
     "another energy": ([Cause("energy_offset", None, 5e-3)], {}),
     "several": ([FAULT, Cause("monitor_swap", "end_3", 1.0), Cause("dipole_roll", "bend::9", 5e-3)],
                 {}),
-    "small errors everywhere": ([], {"background": {"all": None}}),
+    "distributed errors": ([], {"background": {"all": None}}),
     "small errors, one shot": ([], {"background": {"all": None}, "shots": 1}),
     "three turns": ([FAULT], {"turns": 3}),
     "energies of their own": ([FAULT], {"launch_sigma": (1e-4, 2e-5, 1e-4, 2e-5, 1e-3)}),

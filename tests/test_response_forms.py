@@ -137,7 +137,7 @@ NOISE = 1e-6
 
 
 def machine(ring, seed=5, **options):
-    """Of a ring with small errors everywhere."""
+    """Of a ring with distributed errors."""
     rng = np.random.default_rng(seed)
     powered = [e.name for e in ring.elements if e.kind == "quadrupole" and e.k1]
     errors = [Cause("quadrupole_gradient", name, 5e-3 * rng.standard_normal()) for name in powered]

@@ -81,7 +81,7 @@ def module(path):
 
 
 TEXTS = {
-    "tmlattice/**/*.py": module,
+    "tmlattice/**/*.py": module, "benchmarks/*.py": module,
     "README.md": page, "CHANGELOG.md": page, "CONTRIBUTING.md": page, "docs/**/*.md": page,
     "notebooks/*.ipynb": notebook,
 }  # fmt: skip
