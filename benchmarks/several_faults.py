@@ -9,7 +9,7 @@ The ring of the tests, seeds 10 to 13, default options:
          6           21 of 24         24               19
          8           21 of 32         25               22
 
-What is missed is named as what does the same there (a quadrupole's offset as two kicks), but for one
+Missed ones are named as what does the same there (a quadrupole's offset as two kicks), but for one
 case of eight, named as one fault and large distributed errors. Where three faults alone were
 sought before distributed errors, 4 of 16 and 8 of 24 were named.
 """
