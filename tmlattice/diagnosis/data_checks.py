@@ -53,7 +53,6 @@ from tmlattice.observe.compared import (
     ANOTHER,
     Compared,
     OfColumns,
-    OfResponse,
     compared,
     names_of_others,
 )
@@ -526,7 +525,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
     if sizes:
         return [*checks, *errors, *(wrong("size", sentence) for sentence in sizes)]
     found = [check for check in errors if check.status == "wrong"]
-    if isinstance(checked, OfResponse) and not found:
+    if not found:
         order = [wrong("order", sentence) for sentence in checked.other_order()]
         if order:
             return [*checks, *order]

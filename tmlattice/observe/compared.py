@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from tmlattice.arrays import Array, ComplexArray, Flags
+from tmlattice.arrays import TINY, Array, ComplexArray, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import modelled
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.inference.judgement import GROSS, MISSTATED
+from tmlattice.inference.judgement import FEW, GROSS, MISSTATED
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, TuneReading, TurnByTurn
 from tmlattice.measurement.assume import assume, read_of
@@ -60,6 +60,9 @@ MOST = 0.1
 """Share of them that may be unlike each: in a design far off some are alike by chance, not all."""
 LABELS = 2
 """Names that a diagnosis finds swapped by itself, at most."""
+LATE, TURNED = (0, 1, -1, 2, -2, 3, -3), 0.3
+"""Turns by which BPMs may count otherwise; rad, to which the phases of their lines are those of the
+design, where usual errors leave 0.1."""
 MOVED = 0.75
 """Quantile of the readings of a column that are those of the plane that is moved."""
 SEEN = 1e-3
@@ -100,6 +103,10 @@ class Compared(Search):
     def tunes(self) -> Sequence[str]:
         """The measured tunes, if there are any; a sentence."""
         return ()
+
+    def other_order(self) -> list[str]:
+        """Sentences about single names, or counts of turns, that are in another order."""
+        return []
 
     @abstractmethod
     def misfit(self, names: Names = ()) -> Array:
@@ -201,6 +208,9 @@ def names_of_others(
     for planes, where in (([0, 1], ""), ([0], " in x"), ([1], " in y")):
         a, b = (np.nan_to_num(v[..., planes].reshape(len(v), -1)) for v in (read, made))
         there = np.isfinite(read[..., planes]).reshape(a.shape)
+        square = (b**2).sum(axis=1)
+        if np.median(square**2 / np.maximum((b**4).sum(axis=1), TINY)) < FEW:
+            continue  # few numbers are alike by chance
         size = np.sqrt((a**2).sum(axis=1)[:, None] * (there @ (b**2).T))
         alike = a @ b.T / np.where(size > 0, size, 1.0)
         kept = np.flatnonzero(there.any(axis=1))
@@ -209,12 +219,10 @@ def names_of_others(
         then, now = alike[here, best], np.diag(alike)
         moved = np.flatnonzero((then > ALIKE) & (now < then - APART))
         if len(moved) > LABELS and np.quantile(then, MOST) > ALIKE:
-            break
-    else:
-        return "", moved[:0]
-    pairs = [f"{names[kept[i]]} has what {names[kept[best[i]]]} should have" for i in moved]
-    return (f"{len(moved)} {what}s have the names of others{where}: {first_of(pairs, 3)}; give "
-            f"each {what} its own name"), kept[moved]  # fmt: skip
+            pairs = [f"{names[kept[i]]} has what {names[kept[best[i]]]} should have" for i in moved]
+            text = f"{len(moved)} {what}s have the names of others{where}: {first_of(pairs, 3)}"
+            return f"{text}; give each {what} its own name", kept[moved]
+    return "", np.array([], dtype=np.intp)
 
 
 def ratio(read: Array, made: Array, similar: float = SIMILAR) -> float:
@@ -296,7 +304,7 @@ class OfResponse(OfColumns):
                 "unit (m) or size, or the kicks' (rad)", *super().sizes()]  # fmt: skip
 
     def other_order(self) -> list[str]:
-        """Sentences about names of BPMs, and of correctors, that stand in another order."""
+        """See `Compared`: names of BPMs, and of correctors."""
         read, made, _ = self.pairs(replace(self.data, rf=None))
         read = np.where(_outliers(read), np.nan, read)
         data = self.data
@@ -407,22 +415,52 @@ class OfLines(Compared):
     def misfit(self, names: Names = ()) -> Array:
         """See `Compared`; [shot * mode]. The lines are found once, but with planes exchanged, as
         each is sought in its own plane."""
+        try:
+            a, b = self._lines_of(names)
+        except MeasurementError:
+            return np.full(1, np.nan)
+        inner, size = np.abs((b.conj() * a).sum(axis=(2, 3))) ** 2, self._size(a) * self._size(b)
+        left = 1 - inner / np.where(size > 0, size, 1.0)
+        return np.where(size > 0, 2 * left, np.nan).ravel()
+
+    def _lines_of(self, names: Names) -> tuple[ComplexArray, ComplexArray]:
+        """Lines with assumptions corrected, as read and as the design makes them, 0 where missing,
+        [shot, mode, monitor, plane]."""
         problem, change = self.problem, self._changed(names)
         if "planes-swapped" in names:
-            try:
-                problem, change = self._lines(self.assumed(names)), self._changed(())
-            except MeasurementError:
-                return np.full(1, np.nan)
+            problem, change = self._lines(self.assumed(names)), self._changed(())
         both = np.where(problem.used[:, :LINES], problem.values[:, :LINES], np.nan)
         own = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
         read = np.moveaxis(own[..., 0] + 1j * own[..., 1], -1, 1)[:, :, change, [0, 1]]
         if "turns-backwards" in names:
             read = read.conj()
         made = np.stack([np.moveaxis(b.shown.modes, -1, 0) for b in problem.view(()).beams])
-        a, b = (np.where(np.isfinite(read), values, 0.0) for values in (read, made))
-        inner, size = np.abs((b.conj() * a).sum(axis=(2, 3))) ** 2, self._size(a) * self._size(b)
-        left = 1 - inner / np.where(size > 0, size, 1.0)
-        return np.where(size > 0, 2 * left, np.nan).ravel()
+        there = np.isfinite(read)
+        return np.where(there, read, 0.0), np.where(there, made, 0.0)
+
+    def other_order(self) -> list[str]:
+        """See `Compared`: BPMs that count turns otherwise; their lines are turned by the tunes."""
+        read, made = (own[0] for own in self._lines_of(()))
+        phase = np.angle((read * made.conj()).sum(axis=2))  # [mode, monitor]
+        used = np.flatnonzero((read != 0).any(axis=2).all(axis=0))
+        tunes = 2 * np.pi * self.problem.values[0, -2:, None, None]
+        apart = phase[:, used, None] - phase[:, None, used]  # of each from each
+        near = np.array([
+            (np.abs((apart - late * tunes + np.pi) % (2 * np.pi) - np.pi) < TURNED).all(axis=0)
+            for late in LATE
+        ])  # fmt: skip
+        if not len(used):
+            return []
+        first = int(near[0].sum(axis=0).argmax())
+        alike, which = near[:, :, first].any(axis=0), near[:, :, first].argmax(axis=0)
+        moved = np.flatnonzero(which)
+        if len(moved) <= LABELS or alike.mean() < 1 - MOST:
+            return []
+        names = [f"{self.monitors[used[i]]} ({LATE[which[i]]:+d})" for i in moved]
+        return [
+            f"{len(moved)} BPMs count turns otherwise than {self.monitors[used[first]]}: "
+            f"{first_of(names, 3)}; give what was read on one turn the same number"
+        ]
 
     @staticmethod
     def _size(lines: ComplexArray) -> Array:
