@@ -79,6 +79,15 @@ def test_bpms_that_count_turns_otherwise(small_ring, sound, which, late):
     assert f"({late:+d})" in sentence or f"({-late:+d})" in sentence
 
 
+def test_a_turn_that_is_off_at_every_bpm_is_rejected(small_ring, sound):
+    readings = sound["turn_by_turn"].readings.copy()
+    readings[:, readings.shape[1] // 2] += 5e-3
+    data = replace(sound["turn_by_turn"], readings=readings)
+    found = [check.sentence for check in check_data(small_ring, data).reported]
+    assert any("the noise from the fit are rejected" in sentence for sentence in found)
+    assert not any("residual noise" in sentence for sentence in found)
+
+
 def test_turns_that_are_numbered_backwards(small_ring, sound):
     data = turns(sound["turn_by_turn"], lambda values: values[:, ::-1])
     assert "numbered backwards" in wrong_in(small_ring, data)

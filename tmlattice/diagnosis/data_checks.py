@@ -522,13 +522,12 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
         return [*checks, fine(GLOBAL, text)]
     typical = float(np.nanmedian(left))
     sizes = checked.sizes() if isinstance(checked, OfColumns) else []
-    if sizes:
-        return [*checks, *errors, *(wrong("size", sentence) for sentence in sizes)]
+    more = [wrong("size", sentence) for sentence in sizes]
     found = [check for check in errors if check.status == "wrong"]
     if not found:
         order = [wrong("order", sentence) for sentence in checked.other_order()]
         if order:
-            return [*checks, *order]
+            return [*checks, *more, *order]
     if isinstance(data, OrbitResponse) and typical > (CORRECTED if found else ANOTHER):
         guess = _far(ring, data)
         if guess is not None and guess.left < BETTER * typical:
@@ -541,15 +540,15 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
             )
             # a wrong unit shows with any lattice
             units = [own for own in found if all(_UNIT in name for name in own.assume)]
-            return [*checks, *units, far]
+            return [*checks, *units, *more, far]
     text = f"{search.of} {search.shown(typical)}"
-    if typical > ANOTHER:  # no wrong sign, unit or order explains that
+    if typical > ANOTHER and not more:  # no wrong sign, unit or order explains that
         return [*checks, wrong(
             "lattice",
             f"the data are not those of '{ring.name}': {text}; name the lattice of this machine, "
             "and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
-    return [*checks, *errors, fine("lattice", text)]
+    return [*checks, *errors, *more, fine("lattice", text)]
 
 
 def _far(ring: Ring, data: OrbitResponse) -> Guess | None:

@@ -293,9 +293,8 @@ class OfResponse(OfColumns):
         found = []
         for p, plane in enumerate("xy"):
             own = [own == plane for own in self.data.planes]
-            columns = read[own][..., [p]], made[own][..., [p]]
-            scale, sure = (ratio(*columns, alike) for alike in (SIMILAR, ALIKE))
-            double = abs(abs(np.log(abs(sure))) - np.log(DOUBLE)) < NEAR
+            scale = ratio(read[own][..., [p]], made[own][..., [p]], ALIKE)
+            double = abs(abs(np.log(abs(scale))) - np.log(DOUBLE)) < NEAR
             if double or scale < 1 / MISSTATED or scale > MISSTATED:
                 found.append(f"{scale:.3g} times the design's in {plane}")
         if not found:
