@@ -586,7 +586,7 @@ def test_differences_of_rows_are_not_their_readings(small_ring, healthy, steps, 
     found = reported(check_data(small_ring, turns), "note")
     assert "1 of 6 shots (or the other shots are differences from this one)" in found[0].sentence
     found = reported(check_data(small_ring, response), "note")
-    text = f"1 of {len(steps.correctors)} columns are 0 or repeat another to the last digit"
+    text = f"rejected: 1 of {len(steps.correctors)} columns, 0 or the same as another"
     assert found[0].sentence.startswith(text)
 
 

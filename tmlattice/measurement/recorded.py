@@ -161,8 +161,9 @@ def _each_shot_once(data: Any) -> tuple[Any, list[str]]:
     if not twice or len(kept) < 2:
         return data, []
     return data.select(shots=[shot for shot in data.shots if shot not in twice]), [
-        f"{len(twice)} of {len(read)} shots repeat another to the last digit, and are left "
-        f"out: {first_of([str(shot) for shot in twice], SHOWN)}; record each shot once"
+        f"{len(twice)} of {len(read)} shots {'repeat' if len(twice) > 1 else 'repeats'} another to "
+        f"the last digit, left out: {first_of([str(shot) for shot in twice], SHOWN)}; record each "
+        "shot once"
     ]
 
 
@@ -175,8 +176,8 @@ def _each_column_once(data: OrbitResponse) -> tuple[OrbitResponse, list[str]]:
         return data, []
     kept = [name for name in data.correctors if name not in bad]
     return data.select(correctors=kept), [
-        f"{len(bad)} of {len(columns)} columns are 0 or repeat another to the last digit, and are "
-        f"rejected: {first_of(bad, SHOWN)}; give the orbit change by each corrector"
+        f"rejected: {len(bad)} of {len(columns)} columns, 0 or the same as another to the last "
+        f"digit, of {first_of(bad, SHOWN)}; give the orbit change by each corrector"
     ]
 
 
