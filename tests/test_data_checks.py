@@ -1,5 +1,6 @@
 """The data checks: what is wrong everywhere is named, and healthy data of sick machines are not."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,15 +52,23 @@ def shifted(values, by):
     return np.roll(values, by, axis=-2)
 
 
+def one_plane(values, others, plane):
+    return np.where(np.arange(2) == plane, others, values)
+
+
 WRONG = {
     "x-reversed": lambda m: {"readings": m.readings * [-1, 1]},
     "readings-reversed": lambda m: {"readings": -m.readings},
     "planes-swapped": lambda m: {"readings": m.readings[..., ::-1]},
     "readings-in-mm": lambda m: {"readings": 1e3 * m.readings, "noise": 1e3 * m.noise},
     "readings-in-um": lambda m: {"readings": 1e6 * m.readings},
+    "readings-in-cm": lambda m: {"readings": 1e2 * m.readings},
+    "readings-in-inches": lambda m: {"readings": m.readings / 0.0254},
     "readings-in-nm": lambda m: {"readings": 1e9 * m.readings},
     "monitors-shifted=1": lambda m: {"readings": shifted(m.readings, 1)},
     "monitors-shifted=-2": lambda m: {"readings": shifted(m.readings, -2)},
+    "x-shifted=-1": lambda m: {"readings": one_plane(m.readings, shifted(m.readings, -1), 0)},
+    "y-shifted=1": lambda m: {"readings": one_plane(m.readings, shifted(m.readings, 1), 1)},
     "monitors-backwards": lambda m: {"readings": m.readings[:, :, ::-1]},
     "launches-reversed": lambda m: {"launches": -m.launches},
     "slopes-reversed": lambda m: {"launches": m.launches * [1, -1, 1, -1, 1]},
@@ -172,7 +181,7 @@ def test_a_beam_lost_in_a_ring_far_from_its_design_is_not_in_another_order(seed)
 
 
 @pytest.mark.parametrize("size", [2e-5, 1e-3])
-@pytest.mark.parametrize("ends", [[16] * 6, [10, 12, 14, 16, 16, 16], [12, 14, 16], [16]])
+@pytest.mark.parametrize("ends", [[16] * 6, [26] * 6, [10, 12, 14, 16, 16, 16], [12, 14, 16], [16]])
 def test_readings_behind_a_loss_that_are_noise(small_ring, size, ends):
     """In all shots, or in some, at one place or at several."""
     data = simulate(small_ring, background={"all": None}, shots=6, seed=1).measurement()
@@ -185,7 +194,7 @@ def test_readings_behind_a_loss_that_are_noise(small_ring, size, ends):
     assert check.name == "lost beam"
     assert abs(first - ends[0]) <= (8 if len(ends) == 1 else 4)  # sections have eight readings
     assert check.status == "wrong" or len(ends) == 1
-    assert ("in any shot" in check.sentence) == (ends == [16] * 6)
+    assert ("in any shot" in check.sentence) == (ends == ends[:1] * 6)
 
 
 def test_a_reading_that_no_beam_gives(small_ring, healthy):
@@ -195,7 +204,7 @@ def test_a_reading_that_no_beam_gives(small_ring, healthy):
     (check,) = reported(found, "note")
     assert reported(found) == []
     assert check.name == "recording"
-    assert "3 m, which no beam reads" in check.sentence
+    assert "1 reading is 3 m, which no beam reads, and is rejected, of" in check.sentence
     assert healthy.monitors[5] in check.sentence
     readings[2, 0, 5, 1] = 1e300
     with pytest.raises(MeasurementError, match="a reading is 1e\\+300 m"):
@@ -552,6 +561,35 @@ def test_readings_of_twice_the_size_contradict_the_launches(small_ring, healthy)
     assert "being 2 times these" in check.sentence
 
 
+def test_a_unit_that_is_not_known_leaves_launches_of_another_size(small_ring, healthy):
+    data = replace(healthy, readings=1e4 * healthy.readings)
+    units, size = reported(check_data(small_ring, data))
+    assert units.assume == ("readings-in-um",)
+    ratios = [float(own) for own in re.findall(r"([.\d]+) times these in", size.sentence)]
+    assert ratios == pytest.approx([0.01, 0.01], rel=0.1)
+
+
+def test_launches_that_are_not_there_are_no_unit(small_ring, healthy):
+    (check,) = reported(check_data(small_ring, replace(healthy, launches=0 * healthy.launches)))
+    assert check.name == "launches"
+
+
+@pytest.mark.parametrize("of", [np.mean, lambda rows, axis: rows[0]], ids=["mean", "first"])
+def test_differences_of_rows_are_not_their_readings(small_ring, healthy, steps, of):
+    turns = replace(healthy, readings=healthy.readings - of(healthy.readings, axis=0))
+    response = replace(steps, response=steps.response - of(steps.response, axis=0))
+    if of is np.mean:
+        for data in (turns, response):
+            with pytest.raises(MeasurementError, match=r"are differences from their mean"):
+                diagnose(small_ring, data)
+        return
+    found = reported(check_data(small_ring, turns), "note")
+    assert "1 of 6 shots (or the other shots are differences from this one)" in found[0].sentence
+    found = reported(check_data(small_ring, response), "note")
+    text = f"rejected: 1 of {len(steps.correctors)} columns, 0 or the same as another"
+    assert found[0].sentence.startswith(text)
+
+
 def test_planes_in_different_units(small_ring, healthy):
     data = replace(healthy, readings=healthy.readings * [1e3, 1])
     (check,) = reported(check_data(small_ring, data))
@@ -575,6 +613,53 @@ def test_blocks_of_bpms_that_are_exchanged(small_ring, healthy, steps):
     (check,) = reported(check_data(small_ring, replace(steps, response=steps.response[:, order])))
     assert check.sentence.startswith("12 BPMs have the names of others")
     assert f"{steps.monitors[10]} has what {steps.monitors[18]} should have" in check.sentence
+
+
+@pytest.mark.parametrize(("plane", "factor"), [(0, 2.0), (1, 2.0), (1, 0.5)])
+def test_one_plane_of_another_size(small_ring, plane, factor):
+    """First turns of usual errors contradict the launches; a response contradicts the design."""
+    turns = simulate(small_ring, background={"all": None}, shots=6, seed=3).measurement()
+    times = np.where(np.arange(2) == plane, factor, 1.0)
+    (check,) = reported(check_data(small_ring, replace(turns, readings=times * turns.readings)))
+    ratio, where = check.sentence.partition("being ")[2].split(" times these in ")
+    assert (check.name, where[0]) == ("launches", "xy"[plane])
+    assert float(ratio) == pytest.approx(factor, rel=0.2)
+    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
+    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
+    assert reported(check_data(ring, steps)) == []
+    for data in (
+        replace(steps, response=times * steps.response),
+        replace(steps, kicks=steps.kicks / times[["xy".index(p) for p in steps.planes]]),
+    ):
+        (check,) = reported(check_data(ring, data))
+        assert f"times the design's in {'xy'[plane]}: " in check.sentence
+        assert f"in {'yx'[plane]}" not in check.sentence
+
+
+def test_columns_that_repeat_another_are_left_out(small_ring, steps):
+    response = steps.response.copy()
+    response[5] = response[3]
+    (check,) = reported(check_data(small_ring, replace(steps, response=response)), "note")
+    assert f"{steps.correctors[3]}, {steps.correctors[5]}" in check.sentence
+
+
+def test_the_sign_of_a_plane_with_one_corrector(small_ring, steps):
+    (check,) = reported(check_data(small_ring, replace(steps, response=steps.response * [-1, 1])))
+    assert re.search(r"are -(0.9|1)\S* times the design's in x: ", check.sentence)
+
+
+def test_correctors_of_both_planes_in_another_order():
+    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
+    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
+    (check,) = reported(check_data(ring, replace(steps, response=steps.response[::-1])))
+    assert f"{len(steps.correctors)} correctors have the names of others" in check.sentence
+
+
+def test_one_corrector_of_a_plane_shows_no_order_of_bpms(small_ring):
+    """The design is far off: by 8 % in one family."""
+    causes = [Cause("family_gradient", "QF", 0.08)]
+    data = simulate_response(small_ring, causes, progress=False, engine="ocelot").measured
+    assert "order" not in [check.name for check in reported(check_data(small_ring, data))]
 
 
 def test_correctors_in_another_order(small_ring, steps):
@@ -609,6 +694,8 @@ def test_rounded_readings_have_a_larger_noise(small_ring, machine):
     assert "rounded to 100 µm" in reported(found, "note")[0].sentence
     (finding,) = diagnose(small_ring, data).findings
     assert finding.element == "QD::5"
+    found = check_data(small_ring, replace(machine, readings=np.round(machine.readings, 3)))
+    assert "no beam reads" not in str(found.checks)
 
 
 def test_bpms_in_no_order_are_no_known_order(small_ring, healthy):

@@ -1,5 +1,6 @@
 """What is wrong everywhere in turns, orbits, dispersion and tunes is told; small errors are not."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,25 @@ def test_turns_of_a_monitor_without_signal_are_left_out(small_ring, sound):
     count = 2 * (readings.shape[1] - readings.shape[1] // 2 - 5)
     assert found["recording"].startswith(f"{count} readings are the same as those before")
     assert data.monitors[3] in found["recording"]
+
+
+@pytest.mark.parametrize("which", [slice(1, None, 2), slice(16, None)], ids=["odd", "half"])
+@pytest.mark.parametrize("late", [1, -2])
+def test_bpms_that_count_turns_otherwise(small_ring, sound, which, late):
+    readings = sound["turn_by_turn"].readings.copy()
+    readings[:, :, which] = np.roll(readings[:, :, which], -late, axis=1)
+    sentence = wrong_in(small_ring, replace(sound["turn_by_turn"], readings=readings))
+    assert re.match(r"1[6-9] BPMs count turns otherwise", sentence)
+    assert f"({late:+d})" in sentence or f"({-late:+d})" in sentence
+
+
+def test_a_turn_that_is_off_at_every_bpm_is_rejected(small_ring, sound):
+    readings = sound["turn_by_turn"].readings.copy()
+    readings[:, readings.shape[1] // 2] += 5e-3
+    data = replace(sound["turn_by_turn"], readings=readings)
+    found = [check.sentence for check in check_data(small_ring, data).reported]
+    assert any("the noise from the fit are rejected" in sentence for sentence in found)
+    assert not any("residual noise" in sentence for sentence in found)
 
 
 def test_turns_that_are_numbered_backwards(small_ring, sound):

@@ -53,7 +53,6 @@ from tmlattice.observe.compared import (
     ANOTHER,
     Compared,
     OfColumns,
-    OfResponse,
     compared,
     names_of_others,
 )
@@ -319,7 +318,10 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     if all(check.status != "wrong" for check in checks):
         checks += _order(checked, passes, found)
     if any(check.status == "wrong" for check in checks):
-        return checks  # noise and launches have no meaning before that is corrected
+        units = any(_UNIT in name for check in errors for name in check.assume)
+        size = _launches(checked) if units else fine("launches", "")
+        # else noise and launches have no meaning before that is corrected
+        return [*checks, *([size] if size.status == "wrong" else ())]
     return [
         *checks,
         _launches(checked),
@@ -368,7 +370,7 @@ def _no_beam(ring: Ring, checked: OfTurns, passes: Passes, found: SectionFits) -
     lost = [own for own in each if len(own) and own[0] >= NOTHING_FROM]
     which = f"at least {len(lost)} of {len(each)} shots"
     if len(each) > 1 and len(together) and not any(own[0] < together[0] for own in lost):
-        lost, which = [together], "any shot"
+        lost, which = [together] * len(each), "any shot"
     if not lost:
         return []
     sections, behind = sum(len(own) for own in lost), np.sort([own[0] for own in lost])
@@ -411,16 +413,18 @@ def _launches(checked: OfTurns) -> Check:
     good = misfit < SPOILT * max(square, float(np.median(sections)))
     unlike, beyond = changes[:, good].max(axis=2)
     usual, most = float(np.median(unlike)) if good.any() else 0.0, SIGNIFICANT**2
-    scaled = usual > most and max(ratio, 1 / ratio) > FACTOR
-    if good.sum() > FEW and (beyond.max() > most or scaled):
-        alone = unlike > max(most, MISSTATED**2 * usual)
+    scaled = (usual > most) & (np.maximum(ratio, 1 / ratio) > FACTOR)
+    alone = unlike > max(most, MISSTATED**2 * usual)
+    contradict = (beyond > most).any() and (usual > most or alone.any())
+    if good.sum() > FEW and (contradict or scaled.any()):
         which, size = "of every shot", usual
-        if usual < most and alone.any():
+        if usual < most:
             ids = ", ".join(str(data.shots[i]) for i in np.flatnonzero(good)[alone])
             which, size = f"of shot {ids}", float(unlike[alone].min())
-        times = ""
-        if scaled:
-            times = f", being {ratio:.2g} times these (is that the unit or size of the readings?)"
+        times = " and ".join(f"{ratio[p]:.2g} times these in {'xy'[p]}"
+                             for p in np.flatnonzero(scaled))  # fmt: skip
+        if times:
+            times = f", being {times} (is that the unit or size of the readings?)"
         return wrong(
             "launches",
             f"the fitted launches {which} differ from the stated ones by {np.sqrt(size):.0f} of "
@@ -517,9 +521,10 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
         text = "one orbit is the sum of all errors: it shows neither signs nor the order of BPMs"
         return [*checks, fine(GLOBAL, text)]
     typical = float(np.nanmedian(left))
-    more = _rf_step(checked) if isinstance(checked, OfColumns) else []
+    sizes = checked.sizes() if isinstance(checked, OfColumns) else []
+    more = [wrong("size", sentence) for sentence in sizes]
     found = [check for check in errors if check.status == "wrong"]
-    if isinstance(checked, OfResponse) and not found:
+    if not found:
         order = [wrong("order", sentence) for sentence in checked.other_order()]
         if order:
             return [*checks, *more, *order]
@@ -544,17 +549,6 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
             "and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
     return [*checks, *errors, *more, fine("lattice", text)]
-
-
-def _rf_step(checked: OfColumns) -> list[Check]:
-    scale = checked.rf_scale()
-    if not max(abs(scale), 1 / abs(scale)) > MISSTATED:
-        return []
-    text = (
-        f"the RF's orbit is {scale:.3g} times the design's for its step: correct its unit "
-        "(m) or the step's (Hz), or leave it out"
-    )
-    return [wrong("RF step", text)]
 
 
 def _far(ring: Ring, data: OrbitResponse) -> Guess | None:

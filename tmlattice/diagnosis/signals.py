@@ -269,6 +269,7 @@ def _no_signal(ring: Ring, lost: LostBeam[Measurement]) -> str:
     return (
         f"no signal: beam lost {where}"
         + (f" in {which}" if number > 1 else "")
+        + (" (or the other shots are differences from this one)" if ends[0] < 0 else "")
         + "; the BPMs read a constant from there on, and these readings are rejected"
     )
 

@@ -154,11 +154,17 @@ def _exchanged(data: Any) -> Any:
     return _with(with_read(data, lambda values: values[..., ::-1]), noise=noise)
 
 
-def _reordered(data: Any, order: Callable[[Sequence[str]], Order]) -> Any:
-    """The readings of the monitor i are those that stand at order[i]."""
+def _reordered(
+    data: Any, order: Callable[[Sequence[str]], Order], planes: tuple[bool, bool] = (True, True)
+) -> Any:
+    """The readings of the monitor i in these planes are those that stand at order[i]."""
     at = order(data.monitors)
-    noise = None if data.noise is None else data.noise[at]
-    return _with(with_read(data, lambda values: values[..., at, :]), noise=noise)
+
+    def change(values: Array) -> Array:
+        return np.where(planes, values[..., at, :], values)
+
+    noise = None if data.noise is None else change(data.noise)
+    return _with(with_read(data, change), noise=noise)
 
 
 def _shift(monitors: Sequence[str], by: int) -> Order:
@@ -293,6 +299,10 @@ def _shifts() -> Iterator[_Row]:
         count = f"{abs(by)} place{'s' * (abs(by) > 1)} {'down' if by > 0 else 'up'}stream"
         words = f"the names of the BPMs are shifted: what was read stands {count} of its BPM"
         yield f"monitors-shifted={by}", _READ, words, NAMES, _reordered, partial(_shift, by=by)
+        for plane, of in (("x", (True, False)), ("y", (False, True))):
+            if abs(by) == 1:
+                yield (f"{plane}-shifted={by}", _READ, f"in {plane} {words}", NAMES, _reordered,
+                       partial(_shift, by=by), of)  # fmt: skip
 
 
 def _folds() -> Iterator[_Row]:
@@ -315,6 +325,9 @@ _TABLE: tuple[_Row, ...] = (
     ("readings-in-mm", _ORBITS, "the readings are in mm", UNIT.format("them", "m"), _unit, 1e-3),
     ("readings-in-um", _ORBITS, "the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
     ("readings-in-nm", _ORBITS, "the readings are in nm", UNIT.format("them", "m"), _unit, 1e-9),
+    ("readings-in-cm", _ORBITS, "the readings are in cm", UNIT.format("them", "m"), _unit, 1e-2),
+    ("readings-in-inches", _ORBITS, "the readings are in inches", UNIT.format("them", "m"), _unit,
+     0.0254),
     ("readings-in-km", _ORBITS, "the readings are a thousand times too small",
      UNIT.format("them", "m"), _unit, 1e3),
     ("readings-in-Mm", _CHANGES, "the readings are a million times too small",

@@ -12,11 +12,11 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.measurement.assume import in_beam_order, with_read
+from tmlattice.measurement.assume import in_beam_order, read_of, with_read
 from tmlattice.measurement.lost_beam import beam_lost, exact
 from tmlattice.measurement.monitors import LARGEST_READING
 from tmlattice.measurement.orbit_response import OrbitResponse
-from tmlattice.measurement.shots import TurnByTurn
+from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
 from tmlattice.measurement.trajectory import Measurement
 
 Data = TypeVar("Data")
@@ -24,7 +24,7 @@ Data = TypeVar("Data")
 FEWEST = 8
 """Readings of a shot, from which another one of noise is not the same to the last digit."""
 OFTEN = 5
-"""Readings at exactly the largest value for each at another value of the upper half, from which
+"""Readings at exactly the largest value for each at another value above a fifth of it, from which
 that is the end of a range: at the peaks of an oscillation there are at most 2.5."""
 TURNS = 16
 """Successive turns with exactly one reading, from which a BPM has no signal in them."""
@@ -35,6 +35,9 @@ FEW = 0.25
 BPMs without a signal: above, it is the orbit."""
 SENSIBLE = LARGEST_READING / 10
 """m; typical reading below which the readings are in metres, and larger ones are none."""
+NO_MEAN = 1e-4
+"""Mean of the rows at a typical BPM, over a typical reading, below which they were subtracted from
+one another: the orbit, noise and launches of shots leave 1e-2, those of 100 shots 1e-3."""
 FINE = 3.0
 """Step of rounded readings over their noise, up to which the noise covers it: it adds a third."""
 EXACT, DIGITS = 1e-5, 0.01
@@ -52,22 +55,28 @@ def recorded(data: Data, ring_monitors: Sequence[str]) -> tuple[Data, list[str]]
         ring_monitors: names, in beam order.
 
     Raises:
-        MeasurementError: turns that are not in metres; their lines would not show it.
+        MeasurementError: turns that are not in metres, whose lines would not show it; differences
+            from the mean.
     """
     own: Any = data
     if not hasattr(own, "monitors") or exact(own) or not ring_monitors:
         return data, []
     own = in_beam_order(own, ring_monitors)
     said: list[str] = []
-    if getattr(own, "READ", "") == "readings":
+    if isinstance(own, OrbitResponse):
+        own, said = _each_column_once(own)
+    elif getattr(own, "READ", "") == "readings":
         own, said = _each_shot_once(own)
+    if said == [] and isinstance(own, Measurement | ClosedOrbit | OrbitResponse):
+        _no_differences(read_of(own))
 
     def without(bad: Flags, what: str, correction: str) -> None:
         nonlocal own
         if bad.any():
             names = [own.monitors[m] for m in np.flatnonzero(bad.any(axis=(0, 2)))]
-            said.append(f"{bad.sum()} readings are {what}, and are rejected, of "
-                        f"{first_of(names, SHOWN)}; {correction}")  # fmt: skip
+            number, be = ("1 reading", "is") if bad.sum() == 1 else (f"{bad.sum()} readings", "are")
+            said.append(f"{number} {be} {what}, and {be} rejected, of {first_of(names, SHOWN)}; "
+                        f"{correction}")  # fmt: skip
             left = np.where(bad, np.nan, _rows(own))
 
             def changed(values: Array) -> Array:
@@ -152,9 +161,35 @@ def _each_shot_once(data: Any) -> tuple[Any, list[str]]:
     if not twice or len(kept) < 2:
         return data, []
     return data.select(shots=[shot for shot in data.shots if shot not in twice]), [
-        f"{len(twice)} of {len(read)} shots repeat another to the last digit, and are left "
-        f"out: {first_of([str(shot) for shot in twice], SHOWN)}; record each shot once"
+        f"{len(twice)} of {len(read)} shots {'repeat' if len(twice) > 1 else 'repeats'} another to "
+        f"the last digit, left out: {first_of([str(shot) for shot in twice], SHOWN)}; record each "
+        "shot once"
     ]
+
+
+def _each_column_once(data: OrbitResponse) -> tuple[OrbitResponse, list[str]]:
+    """Without columns that are those of another corrector, or 0."""
+    columns = [np.nan_to_num(own).tobytes() for own in data.response]
+    bad = [name for name, own, read in zip(data.correctors, columns, data.response, strict=True)
+           if columns.count(own) > 1 or not np.nan_to_num(read).any()]  # fmt: skip
+    if not bad or len(bad) == len(columns):
+        return data, []
+    kept = [name for name in data.correctors if name not in bad]
+    return data.select(correctors=kept), [
+        f"rejected: {len(bad)} of {len(columns)} columns, 0 or the same as another to the last "
+        f"digit, of {first_of(bad, SHOWN)}; give the orbit change by each corrector"
+    ]
+
+
+def _no_differences(rows: Array) -> None:
+    """Raise an error if the mean over all rows [row, .., monitor, 2] was subtracted from them."""
+    if np.isfinite(rows).any(axis=0).all() and len(rows) > 2:
+        size, mean = (np.sqrt(np.nanmean(v**2)) for v in (rows, np.nanmean(rows, axis=0)))
+        if mean < NO_MEAN * size:
+            raise MeasurementError(
+                "the readings of every BPM average to 0: they are differences from their mean; "
+                "give the readings themselves"
+            )
 
 
 def _again(readings: Array) -> Flags:
@@ -198,7 +233,7 @@ def _ends(readings: Array) -> tuple[Flags, Flags]:
         for side in (1, -1):
             signed = np.where(none[..., plane], np.nan, side * values[..., plane])
             own, counts = np.unique(signed[signed > 0], return_counts=True)
-            upper = counts[:-1][own[:-1] > own[-1:] / 2]
+            upper = counts[:-1][own[:-1] > own[-1:] / OFTEN]
             if len(own) > 1 and counts[-1] >= OFTEN * upper.max(initial=1):
                 (ends if len(upper) else none)[..., plane] |= signed == own[-1]
     return ends, none

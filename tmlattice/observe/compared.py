@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from tmlattice.arrays import Array, ComplexArray, Flags
+from tmlattice.arrays import TINY, Array, ComplexArray, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.effects import modelled
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.inference.judgement import GROSS
+from tmlattice.inference.judgement import FEW, GROSS, MISSTATED
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion, OrbitResponse, TuneReading, TurnByTurn
 from tmlattice.measurement.assume import assume, read_of
@@ -51,6 +51,8 @@ SCALES = {f"{what}-{by}": factor for what in ("kicks", "rf")
 NEAR, SIMILAR = 0.15, 0.8
 """Or: ratio of the typical column to the design's, tolerance of its logarithm, and smallest
 correlation with the design."""
+DOUBLE = 2.0
+"""Ratio, or its inverse, that is known of one plane."""
 ALIKE, APART = 0.95, 0.2
 """Correlation of what was read at a BPM, or by a corrector, with the design's of another one, and
 by how much more than with its own, from which it has the name of that one."""
@@ -58,6 +60,9 @@ MOST = 0.1
 """Share of them that may be unlike each: in a design far off some are alike by chance, not all."""
 LABELS = 2
 """Names that a diagnosis finds swapped by itself, at most."""
+LATE, TURNED = (0, 1, -1, 2, -2, 3, -3), 0.3
+"""Turns by which BPMs may count otherwise; rad, to which the phases of their lines are those of the
+design, where usual errors leave 0.1."""
 MOVED = 0.75
 """Quantile of the readings of a column that are those of the plane that is moved."""
 SEEN = 1e-3
@@ -98,6 +103,10 @@ class Compared(Search):
     def tunes(self) -> Sequence[str]:
         """The measured tunes, if there are any; a sentence."""
         return ()
+
+    def other_order(self) -> list[str]:
+        """Sentences about single names, or counts of turns, that are in another order."""
+        return []
 
     @abstractmethod
     def misfit(self, names: Names = ()) -> Array:
@@ -155,6 +164,14 @@ class OfColumns(Compared):
         scale = self.rf_scale() if name.startswith("rf-") else self.scale()
         return name in SCALES and abs(np.log(scale / SCALES[name])) < NEAR
 
+    def sizes(self) -> list[str]:
+        """Sentences about columns of another size than the design's, which no assumption has."""
+        scale = self.rf_scale()
+        if not max(abs(scale), 1 / abs(scale)) > MISSTATED:
+            return []
+        return [f"the RF's orbit is {scale:.3g} times the design's for its step: correct its unit "
+                "(m) or the step's (Hz), or leave it out"]  # fmt: skip
+
     def misfit(self, names: Names = ()) -> Array:
         """See `Compared`: |measured - design|^2 over the mean of both squares, beyond the noise."""
         read, made, noise = (np.asarray(own) for own in self.pairs(self.assumed(names)))
@@ -177,35 +194,40 @@ def _outliers(read: Array) -> Flags:
 
 
 def names_of_others(
-    what: str, names: Sequence[str], read: Array, made: Array, same: Any = True
+    what: str, names: Sequence[str], read: Array, made: Array
 ) -> tuple[str, NDArray[np.intp]]:
-    """Return a sentence about names that stand in another order, and which these are: what was read
-    [name, ...] is what the design makes of others. Empty if there are none.
+    """Return a sentence about names that stand in another order, in both planes or in one, and
+    which these are: what was read [name, .., plane] is what the design makes of others. Empty if
+    there are none.
 
     Args:
         what: a BPM, or a corrector.
         names: of them.
         read, made: as read and as the design makes it, NaN where missing.
-        same: which may be swapped, [name, name].
     """
-    a, b = (np.nan_to_num(own.reshape(len(own), -1)) for own in (read, made))
-    there = np.isfinite(read).reshape(a.shape)
-    size = np.sqrt((a**2).sum(axis=1)[:, None] * (there @ (b**2).T))
-    alike = np.where(same, a @ b.T / np.where(size > 0, size, 1.0), -1.0)
-    kept = np.flatnonzero(there.any(axis=1))
-    alike = alike[np.ix_(kept, kept)]
-    here, best = linear_sum_assignment(-alike)
-    then, now = alike[here, best], np.diag(alike)
-    moved = np.flatnonzero((then > ALIKE) & (now < then - APART))
-    if len(moved) <= LABELS or np.quantile(then, MOST) < ALIKE:
-        return "", moved[:0]
-    pairs = [f"{names[kept[i]]} has what {names[kept[best[i]]]} should have" for i in moved]
-    return (f"{len(moved)} {what}s have the names of others: {first_of(pairs, 3)}; give each "
-            f"{what} its own name"), kept[moved]  # fmt: skip
+    for planes, where in (([0, 1], ""), ([0], " in x"), ([1], " in y")):
+        a, b = (np.nan_to_num(v[..., planes].reshape(len(v), -1)) for v in (read, made))
+        there = np.isfinite(read[..., planes]).reshape(a.shape)
+        square = (b**2).sum(axis=1)
+        if np.median(square**2 / np.maximum((b**4).sum(axis=1), TINY)) < FEW:
+            continue  # few numbers are alike by chance
+        size = np.sqrt((a**2).sum(axis=1)[:, None] * (there @ (b**2).T))
+        alike = a @ b.T / np.where(size > 0, size, 1.0)
+        kept = np.flatnonzero(there.any(axis=1))
+        alike = alike[np.ix_(kept, kept)]
+        here, best = linear_sum_assignment(-alike)
+        then, now = alike[here, best], np.diag(alike)
+        moved = np.flatnonzero((then > ALIKE) & (now < then - APART))
+        if len(moved) > LABELS and np.quantile(then, MOST) > ALIKE:
+            pairs = [f"{names[kept[i]]} has what {names[kept[best[i]]]} should have" for i in moved]
+            text = f"{len(moved)} {what}s have the names of others{where}: {first_of(pairs, 3)}"
+            return f"{text}; give each {what} its own name", kept[moved]
+    return "", np.array([], dtype=np.intp)
 
 
-def ratio(read: Array, made: Array) -> float:
-    """Ratio of the typical column [column, monitor, 2] to the design's; NaN if unrelated."""
+def ratio(read: Array, made: Array, similar: float = SIMILAR) -> float:
+    """Ratio of the typical column [column, monitor, plane] to the design's; NaN if their
+    correlation is smaller than that of similar ones."""
     there = np.isfinite(read)
     a, b = (np.where(there, own, 0.0) for own in (read, made))
     both, own, design = ((u * v).sum(axis=(1, 2)) for u, v in ((a, b), (a, a), (b, b)))
@@ -213,7 +235,7 @@ def ratio(read: Array, made: Array) -> float:
     if not seen.any():
         return float("nan")
     alike = float(np.median(both[seen] / np.sqrt(own[seen] * design[seen])))
-    return float(np.median(both[seen] / design[seen])) if abs(alike) > SIMILAR else float("nan")
+    return float(np.median(both[seen] / design[seen])) if abs(alike) > similar else float("nan")
 
 
 @dataclass(frozen=True)
@@ -265,16 +287,31 @@ class OfResponse(OfColumns):
         read, made, _ = self.pairs(self.data)
         return ratio(read[-1:], made[-1:])
 
+    def sizes(self) -> list[str]:
+        """See `OfColumns`; of each plane of the correctors too."""
+        read, made, _ = self.pairs(replace(self.data, rf=None))
+        found = []
+        for p, plane in enumerate("xy"):
+            own = [own == plane for own in self.data.planes]
+            scale = ratio(read[own][..., [p]], made[own][..., [p]], ALIKE)
+            double = abs(abs(np.log(abs(scale))) - np.log(DOUBLE)) < NEAR
+            if double or scale < 1 / MISSTATED or scale > MISSTATED:
+                found.append(f"{scale:.3g} times the design's in {plane}")
+        if not found:
+            return super().sizes()
+        return [f"the orbit changes by the correctors are {' and '.join(found)}: correct their "
+                "unit (m) or size, or the kicks' (rad)", *super().sizes()]  # fmt: skip
+
     def other_order(self) -> list[str]:
-        """Sentences about names of BPMs, and of correctors, that stand in another order."""
+        """See `Compared`: names of BPMs, and of correctors."""
         read, made, _ = self.pairs(replace(self.data, rf=None))
         read = np.where(_outliers(read), np.nan, read)
-        planes, data = np.array(self.data.planes), self.data
+        data = self.data
         found = [
             names_of_others(
                 "BPM", data.monitors, *(np.moveaxis(own, 1, 0) for own in (read, made))
             ),
-            names_of_others("corrector", data.correctors, read, made, planes[:, None] == planes),
+            names_of_others("corrector", data.correctors, read, made),
         ]
         text = "; or ".join(own for own, _ in found if own)
         return [text] if text else []
@@ -377,36 +414,67 @@ class OfLines(Compared):
     def misfit(self, names: Names = ()) -> Array:
         """See `Compared`; [shot * mode]. The lines are found once, but with planes exchanged, as
         each is sought in its own plane."""
-        problem, change = self.problem, self._changed(names)
-        if "planes-swapped" in names:
-            try:
-                problem, change = self._lines(self.assumed(names)), self._changed(())
-            except MeasurementError:
-                return np.full(1, np.nan)
-        both = np.where(problem.used[:, :LINES], problem.values[:, :LINES], np.nan)
-        own = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
-        read = np.moveaxis(own[..., 0] + 1j * own[..., 1], -1, 1)[:, :, change]
-        if "turns-backwards" in names:
-            read = read.conj()
-        made = np.stack([np.moveaxis(b.shown.modes, -1, 0) for b in problem.view(()).beams])
-        a, b = (np.where(np.isfinite(read), values, 0.0) for values in (read, made))
+        try:
+            a, b = self._lines_of(names)
+        except MeasurementError:
+            return np.full(1, np.nan)
         inner, size = np.abs((b.conj() * a).sum(axis=(2, 3))) ** 2, self._size(a) * self._size(b)
         left = 1 - inner / np.where(size > 0, size, 1.0)
         return np.where(size > 0, 2 * left, np.nan).ravel()
+
+    def _lines_of(self, names: Names) -> tuple[ComplexArray, ComplexArray]:
+        """Lines with assumptions corrected, as read and as the design makes them, 0 where missing,
+        [shot, mode, monitor, plane]."""
+        problem, change = self.problem, self._changed(names)
+        if "planes-swapped" in names:
+            problem, change = self._lines(self.assumed(names)), self._changed(())
+        both = np.where(problem.used[:, :LINES], problem.values[:, :LINES], np.nan)
+        own = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
+        read = np.moveaxis(own[..., 0] + 1j * own[..., 1], -1, 1)[:, :, change, [0, 1]]
+        if "turns-backwards" in names:
+            read = read.conj()
+        made = np.stack([np.moveaxis(b.shown.modes, -1, 0) for b in problem.view(()).beams])
+        there = np.isfinite(read)
+        return np.where(there, read, 0.0), np.where(there, made, 0.0)
+
+    def other_order(self) -> list[str]:
+        """See `Compared`: BPMs that count turns otherwise; their lines are turned by the tunes."""
+        read, made = (own[0] for own in self._lines_of(()))
+        phase = np.angle((read * made.conj()).sum(axis=2))  # [mode, monitor]
+        used = np.flatnonzero((read != 0).any(axis=2).all(axis=0))
+        tunes = 2 * np.pi * self.problem.values[0, -2:, None, None]
+        apart = phase[:, used, None] - phase[:, None, used]  # of each from each
+        near = np.array([
+            (np.abs((apart - late * tunes + np.pi) % (2 * np.pi) - np.pi) < TURNED).all(axis=0)
+            for late in LATE
+        ])  # fmt: skip
+        if not len(used):
+            return []
+        first = int(near[0].sum(axis=0).argmax())
+        alike, which = near[:, :, first].any(axis=0), near[:, :, first].argmax(axis=0)
+        moved = np.flatnonzero(which)
+        if len(moved) <= LABELS or alike.mean() < 1 - MOST:
+            return []
+        names = [f"{self.monitors[used[i]]} ({LATE[which[i]]:+d})" for i in moved]
+        return [
+            f"{len(moved)} BPMs count turns otherwise than {self.monitors[used[first]]}: "
+            f"{first_of(names, 3)}; give what was read on one turn the same number"
+        ]
 
     @staticmethod
     def _size(lines: ComplexArray) -> Array:
         return np.asarray((np.abs(lines) ** 2).sum(axis=(2, 3)))
 
     def _changed(self, names: Names) -> NDArray[np.intp]:
-        """Which of the ring's monitors each of them reads with assumptions corrected."""
+        """Which of the ring's monitors each of them reads with assumptions corrected, [monitor,
+        plane]."""
         count = len(self.data.monitors)
         each = np.broadcast_to(np.arange(count)[:, None], (1, FEWEST, count, 2)).astype(float)
         places = replace(self.data, readings=each, noise=None, settings=(), shots=(0,))
         order = {name: i for i, name in enumerate(self.monitors)}
         at = np.array([order[self.ring[name].name] for name in self.data.monitors])
-        found = np.arange(len(self.monitors))
-        found[at] = at[assume(places, names, self.monitors).readings[0, 0, :, 0].astype(int)]
+        found = np.tile(np.arange(len(self.monitors))[:, None], 2)
+        found[at] = at[assume(places, names, self.monitors).readings[0, 0].astype(int)]
         return found
 
 

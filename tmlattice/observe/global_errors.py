@@ -66,9 +66,9 @@ Names = tuple[str, ...]
 GAIN, CERTAIN = 12.0, 15.0
 """Log evidence above which a global error is reported, and above which it is certain: no healthy
 measurement of `benchmarks/data_checks.py` gains as much."""
-LEFT, TOO_WELL = 4.0, 1e-3
+LEFT, TOO_WELL = 4.0, 0.1
 """Ratio of what each of two corrections leaves to what both do, at least; and chi-square of
-launches below which they are no evidence: readings next to zero fit any."""
+launches below which they are no evidence of a unit: readings next to zero fit any."""
 ROUNDS = 20
 """Reweighted least squares."""
 ALIKE = 0.95
@@ -447,20 +447,22 @@ class OfTurns(Search):
         there = np.isfinite(read)
         return np.where(there, read - mean_pass(read, there), np.nan), made - made.mean(axis=0)
 
-    def launches(self, square: float, tolerance: float) -> tuple[Array, Array, Array, float]:
+    def launches(self, square: float, tolerance: float) -> tuple[Array, Array, Array, Array]:
         """Mean squares of fitted less stated launches by plane, [shot, 2]; the same less their
         median, and less what a fault before the first monitors makes, [2, shot, 2]; the misfit of
-        the sections that determine them, [shot]; and the ratio of the fitted to the stated ones,
-        NaN where they are not proportional."""
+        the sections that determine them, [shot]; and the ratio of the changes of the fitted from
+        shot to shot to those of the stated ones, [2], NaN where they are not proportional."""
         passes, found = self.found(self.data)
         first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
         _, each, changes, _ = self._launch(self.data, passes, found, square, False, tolerance)
         fitted, stated = found.start[first, 0], self.data.launches[passes.shot[first], :4]
-        size = np.maximum(np.abs(stated).max(axis=0), TINY)
-        a, b = (np.nan_to_num(own / size).ravel() for own in (fitted, stated))
-        inner, square_a, square_b = a @ b, a @ a, b @ b
-        alike = inner**2 > ALIKE**2 * square_a * square_b > 0
-        return each, changes, found.misfit[first, 0], inner / square_b if alike else np.nan
+        size = np.maximum(np.ptp(stated, axis=0), TINY)
+        a, b = ((own - np.mean(own, axis=0)) / size for own in (fitted, stated))
+        a, b = (np.nan_to_num(own).reshape(-1, 2, 2) for own in (a, b))
+        inner, square_a, square_b = ((u * v).sum(axis=(0, 2)) for u, v in ((a, b), (a, a), (b, b)))
+        alike = (inner**2 > ALIKE**2 * square_a * square_b) & (inner != 0)
+        ratio = np.where(alike, inner, np.nan) / np.maximum(square_b, TINY)
+        return each, changes, found.misfit[first, 0], ratio
 
     def _launch(
         self,
@@ -590,7 +592,8 @@ class OfTurns(Search):
             if LEFT * own.left < min(alone.get((name,), np.inf) for name in own.names)
         ]
         return [own for own in found if own.worth > GAIN
-                and not (own.of.endswith("launches") and own.after < TOO_WELL)]  # fmt: skip
+                and not (own.of.endswith("launches") and own.after < TOO_WELL
+                         and any("-in-" in name for name in own.names))]  # fmt: skip
 
     def corrected(self, names: Names) -> Self:
         """Return the search with assumptions corrected in the data."""

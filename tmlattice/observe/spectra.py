@@ -556,7 +556,8 @@ def _shot(
     planes = np.tile([0, 1], len(signals) // 2)[usable]
     fit = betatron_lines(data, there, planes, near)
     off = np.abs(fit.residual) / _robust(fit.residual, there)[:, None]
-    outlier = off > OUTLIER * np.maximum(1.0, np.median(off, axis=0))  # not of all monitors
+    usual = np.median(off, axis=0)  # of all monitors it is the beam, but in a few turns
+    outlier = off > OUTLIER * np.clip(usual, 1.0, max(OUTLIER * np.median(usual), 1.0))
     if outlier.any() and outlier.mean() < 0.05:
         warn(f"readings more than {OUTLIER:g} times the noise from the fit are rejected")
         there = there & ~outlier
