@@ -215,7 +215,7 @@ def test_what_good_lists_leave_out_is_left_out_and_told(simulated, brought):
         (lambda d: {"LocoMeasData_DeltaRF": -d["DeltaRF"]}, "--assume rf-reversed"),
         (lambda d: {"LocoMeasData_M": d["M"] * 1e-3}, "--assume kicks-in-mrad"),
         (lambda d: {"LocoMeasData_M": d["M"] * 1e3 / 2e2, "LocoMeasData_Eta": d["Eta"]},
-         "the data are not those of"),
+         "5 times the design's in x"),
         (lambda d: {"LocoMeasData_M": d["M"] / 2}, "--assume kicks-halved"),
         (lambda d: {"LocoMeasData_M": d["M"] / 0.1}, "not the response per mrad"),
         (lambda d: {"LocoMeasData_M": d["M"] / 1e-4}, "not the response per rad"),
@@ -538,7 +538,7 @@ def test_hdf5_files_of_the_esrf(simulated, esrf):
         (("eta.h5", "names.json", "ring.mat"), "holds no 'matrix'"),
         (("names.json",), "no measurement that is known"),
         (("ring.mat",), "no measurement that is known"),
-        (("orm.h5", "names.json", "nothing.mat"), "no file"),
+        (("orm.h5", "names.json", "nothing.mat"), "No such file"),
     ],
 )
 def test_parts_that_are_missing_are_named(esrf, parts, told):

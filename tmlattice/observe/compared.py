@@ -53,6 +53,9 @@ NEAR, SIMILAR = 0.15, 0.8
 correlation with the design."""
 DOUBLE = 2.0
 """Ratio, or its inverse, that is known of one plane."""
+SAME = 0.99
+"""Correlation with the design from which another size is none of the optics: a tune next to an
+integer that changes all orbits by DOUBLE shifts their phases so far that less is left."""
 ALIKE, APART = 0.95, 0.2
 """Correlation of what was read at a BPM, or by a corrector, with the design's of another one, and
 by how much more than with its own, from which it has the name of that one."""
@@ -293,7 +296,7 @@ class OfResponse(OfColumns):
         found = []
         for p, plane in enumerate("xy"):
             own = [own == plane for own in self.data.planes]
-            scale = ratio(read[own][..., [p]], made[own][..., [p]], ALIKE)
+            scale = ratio(read[own][..., [p]], made[own][..., [p]], SAME)
             double = abs(abs(np.log(abs(scale))) - np.log(DOUBLE)) < NEAR
             if double or scale < 1 / MISSTATED or scale > MISSTATED:
                 found.append(f"{scale:.3g} times the design's in {plane}")
