@@ -194,9 +194,9 @@ AGREEMENT = (
     ("ring", "ring", "{}"), ("length", "m", "{:.1f}"), ("energy", "GeV", "{:.3g}"),
     ("magnets", "magnets", "{}"), ("monitors", "BPMs", "{}"),
     ("correctors", "correctors", "{}"),
-    ("tunes", "tunes", "{0[0]:.4f} / {0[1]:.4f}"), ("tunes_at", "less AT's", "{:.0e}"),
+    ("tunes", "tunes", "{0[0]:.4f} / {0[1]:.4f}"), ("tunes_at", "tunes, from AT's", "{:.0e}"),
     ("chromaticity", "chromaticity", "{0[0]:+.2f} / {0[1]:+.2f}"),
-    ("turn_file", "first turn, AT's", "{:.0e}"), ("turn_engines", "engines, 1 turn", "{:.0e}"),
+    ("turn_file", "first turn, from AT's", "{:.0e}"), ("turn_engines", "engines, 1 turn", "{:.0e}"),
     ("turns_engines", "5 turns", "{:.0e}"), ("response", "response", "{:.0e}"),
 )  # fmt: skip
 WORK = (

@@ -160,11 +160,11 @@ def of_turns(rows):
     that the maps describe."""
     rows = [{"particles": 1} | row for row in rows]
     amplitudes = sorted({row["amplitude"] for row in rows})
-    yield ["ring", "particles", "quadrupole", *(f"{1e3 * own:g} mm" for own in amplitudes)]
+    yield ["ring", "particles", "quadrupole error", *(f"{1e3 * own:g} mm" for own in amplitudes)]
     kinds = ("ring", "particles", "fault")
     for case in dict.fromkeys(tuple(row[key] for key in kinds) for row in rows):
         name, particles, fault = case
-        named = f"{100 * fault:g} %: named" if fault else "right: false alarms"
+        named = f"{100 * fault:g} %: named" if fault else "none: false alarms"
         line = [name, f"{particles:,}", named]
         for amplitude in amplitudes:
             own = [r for r in rows if tuple(r[key] for key in kinds) == case]

@@ -48,7 +48,7 @@ def test_figure_says_the_rms_before_and_behind_in_micrometres(weak):
     data, before = weak.trajectories.data, before_findings(weak)
     left = 1e6 * (data.readings - design_readings(weak))[0, :, 1]
     wanted = [f"{np.sqrt(np.mean(left[at] ** 2)):.1f}" for at in (before, ~before)]
-    assert f"rms of the design {wanted[0]} before the finding, {wanted[1]} behind" in text
+    assert f"rms in µm: design {wanted[0]} before the finding, {wanted[1]} behind" in text
     plt.close(figure)
 
 

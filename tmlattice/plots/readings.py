@@ -108,7 +108,7 @@ def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
         residual.set_ylabel(f"residual {name} [mm]")
         after = f"; with the findings {texts[1]}" if len(texts) > 1 else ""
         residual.annotate(
-            f"rms of the {names[0]} {texts[0]}{after}; noise {1e3 * sigma:.1f} µm (grey: 2 rms)",
+            f"rms in µm: {names[0]} {texts[0]}{after}; noise {1e3 * sigma:.1f} (grey: 2 rms)",
             (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
         )  # fmt: skip
         low, high = residual.get_ylim()
@@ -119,9 +119,9 @@ def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
     grid[0].legend(
         loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize="small", frameon=False
     )
-    title = f"Shot {shot + 1} of the {len(readings)} of the fit"
+    title = f"Shot {shot + 1} of {len(readings)} in the fit"
     if before is not None:
-        title += f"; the {names[0]}'s launch from the {int(before.sum())} BPMs before"
+        title += f"; {names[0]}: launch fitted to the {int(before.sum())} BPMs before the finding"
     grid[0].set_title(title, loc="left", fontsize="medium")
     mark(figure.axes[-1], diagnosis)
     return figure
