@@ -220,15 +220,17 @@ class LayerChain:
         x = np.zeros(self.dimension) if start is None else np.array(start, dtype=float)
         free = np.asarray(free, dtype=np.intp)
         rows = np.arange(len(free))
-        for _ in range(30):
+        found = False
+        for _ in range(31):
             path, total = self.tangents(x)
             miss = (path[-1] - x)[rows] - turn
             if not (np.isfinite(miss).all() and np.isfinite(total[-1]).all()):
                 break
+            if found:
+                return path, total
             change = closing(total[-1], free, rows) @ miss
             x = x + change
-            if np.abs(change).max() < max(tolerance, 1e-12 * np.abs(x[free]).max()):
-                return self.tangents(x)
+            found = bool(np.abs(change).max() < max(tolerance, 1e-12 * np.abs(x[free]).max()))
         raise UnstableRingError(NO_ORBIT)
 
 
