@@ -44,7 +44,7 @@ from tmlattice.measurement import (
     TuneReading,
     TurnByTurn,
 )
-from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, read_of
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, is_unit, read_of
 from tmlattice.measurement.kinds import STORED
 from tmlattice.measurement.lost_beam import beam_lost, exact
 from tmlattice.measurement.monitors import Names
@@ -93,8 +93,6 @@ UNSPOILT = {"shots": "no shot is unlike the others", "outliers": "no reading is 
 GLOBAL = "signs, units and order"
 MOST_ERRORS = 4
 """Global errors of one measurement at most."""
-_UNIT = "-in-"
-"""In the names of assumptions about a unit."""
 
 
 @by_name
@@ -318,10 +316,10 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     if all(check.status != "wrong" for check in checks):
         checks += _order(checked, passes, found)
     if any(check.status == "wrong" for check in checks):
-        units = any(_UNIT in name for check in errors for name in check.assume)
-        size = _launches(checked) if units else fine("launches", "")
-        # else noise and launches have no meaning before that is corrected
-        return [*checks, *([size] if size.status == "wrong" else ())]
+        # noise and launches have no meaning before that is corrected, but the unit of the latter
+        units = any(is_unit(name) for check in errors for name in check.assume)
+        launches = [_launches(checked)] if units else []
+        return [*checks, *(own for own in launches if own.status == "wrong")]
     return [
         *checks,
         _launches(checked),
@@ -539,7 +537,7 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
                 "of the data are not checked",
             )
             # a wrong unit shows with any lattice
-            units = [own for own in found if all(_UNIT in name for name in own.assume)]
+            units = [own for own in found if all(map(is_unit, own.assume))]
             return [*checks, *units, *more, far]
     text = f"{search.of} {search.shown(typical)}"
     if typical > ANOTHER and not more:  # no wrong sign, unit or order explains that

@@ -121,6 +121,11 @@ def _of_unit(size: Array, of: Array, factor: Array | float) -> Array:
     return size * factor if same else size
 
 
+def is_unit(name: str) -> bool:
+    """Whether an assumption is about a unit."""
+    return "-in-" in name
+
+
 def read_of(data: Any) -> Array:
     """What the monitors read, m, [..., monitor, 2]: readings, orbits, or orbit changes."""
     if isinstance(data, OrbitResponse):

@@ -29,7 +29,7 @@ from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
-from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order
+from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, is_unit
 from tmlattice.observe.sections import (
     DIVERGED_SIGMA,
     FARTHEST,
@@ -593,7 +593,7 @@ class OfTurns(Search):
         ]
         return [own for own in found if own.worth > GAIN
                 and not (own.of.endswith("launches") and own.after < TOO_WELL
-                         and any("-in-" in name for name in own.names))]  # fmt: skip
+                         and any(map(is_unit, own.names)))]  # fmt: skip
 
     def corrected(self, names: Names) -> Self:
         """Return the search with assumptions corrected in the data."""
@@ -625,7 +625,7 @@ def _same_part(one: str, other: str) -> bool:
     """Whether two assumptions exclude each other: both about the order of the monitors, about the
     settings, or about the unit of one quantity."""
     (a, *_), (b, *_) = one.split("-"), other.split("-")
-    units = "-in-" in one and "-in-" in other
+    units = is_unit(one) and is_unit(other)
     return one == other or (a == b and (units or a in ("monitors", "settings")))
 
 
