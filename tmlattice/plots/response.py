@@ -98,26 +98,25 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
 
 
 def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
-    """Draw the residual of each fitted corrector in its own plane before and after, in one
+    """Draw the residual of each fitted corrector in its own plane before and after, each in its own
     scale."""
     figure = plt.figure(figsize=(11, 4.2), layout="constrained") if figure is None else figure
     view = result.response
     plane = np.array([int(p == "y") for p in view.measured.planes])
     shown = [k for k in np.argsort(plane, kind="stable") if not view.held[k]]
     axes = figure.subplots(1, 2, sharey=True)
-    limit = 0.0
     models = {result.starting_model: view.design, "result": view.model}
     for ax, (name, model) in zip(axes, models.items(), strict=True):
         left = 1e6 * (view.data - model)[shown][:, view.good]
         left = left[np.arange(len(shown)), :, plane[shown]]
-        limit = limit or float(np.nanpercentile(abs(left), 98))
+        limit = float(np.nanpercentile(abs(left), 98))
         image = ax.imshow(left.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit)
         rms = float(np.sqrt(np.nanmean(left**2)))
         ax.set_title(f"{name}: {rms:.3g} µm rms", loc="left", fontsize="medium")
         ax.set_xlabel("corrector: horizontal, then vertical")
         ax.locator_params(integer=True)
+        figure.colorbar(image, ax=ax, label="measured less model [µm]")
     axes[0].set_ylabel("BPM, along the ring")
-    figure.colorbar(image, ax=axes, label="measured less model [µm]")
     return figure
 
 

@@ -239,11 +239,11 @@ def inconsistency_texts(result: Diagnosis) -> list[str]:
 
 
 def left_sentence(result: Diagnosis) -> str:
-    """The share of the remaining residual that eight patterns explain."""
+    """The share of the remaining residual in its eight strongest singular vectors."""
     x, y = result.unexplained["patterns"]["low_rank"]
     return (
-        f"Eight patterns explain {100 * x:.0f} % of the remaining residual of fitted readings in x "
-        f"and {100 * y:.0f} % in y."
+        "The eight strongest orbit patterns (singular vectors) make up "
+        f"{100 * x:.0f} % of the remaining mean square residual in x and {100 * y:.0f} % in y."
     )
 
 

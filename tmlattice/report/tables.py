@@ -110,13 +110,17 @@ MOST = 8
 
 def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Head and rows of the stored beam on energy: (quantity, design, estimated). The closed orbit
-    is listed where it was measured or is changed. Empty without errors of the ring."""
+    is listed where it was measured or a finding changes it: distributed errors do not determine it.
+    Empty without errors of the ring."""
     effects = (find(cause.effect) for cause in diagnosis.causes)
     if not any(isinstance(own, RingEffect) and not own.acts_on_settings for own in effects):
         return []
     beams = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
-    moved = beams.found is not None and max(beams.found.orbit_rms) > SETTLED.orbit_rms[0]
-    orbit = moved or "closed_orbit" in diagnosis.assessment.measured
+    named = {(found.effect, found.element) for found in diagnosis.findings}
+    alone = [c for c in diagnosis.causes if (c.effect, c.element) in named]
+    moved = beam_with(diagnosis.ring, alone).found
+    orbit = moved is not None and max(moved.orbit_rms) > SETTLED.orbit_rms[0]
+    orbit |= "closed_orbit" in diagnosis.assessment.measured
 
     def pair(values: Sequence[float] | None, factor: float, digits: int) -> str:
         if values is None:
