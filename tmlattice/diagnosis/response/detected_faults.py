@@ -46,7 +46,7 @@ from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.missing_effects import HELPS
-from tmlattice.diagnosis.response.rounds import LEARN, log_evidence, settle
+from tmlattice.diagnosis.response.rounds import LEARN, evidence_of, settle
 from tmlattice.diagnosis.response.state import Candidate, State, allow, begin, bend, jump
 from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.stepwise import ROUGH, StepwiseFit, fit_chi2
@@ -128,7 +128,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # diverged
             continue
-        found.append((log_evidence(state, state.good), state))
+        found.append((evidence_of(state, state.good).log, state))
         log.info("distributed errors: evidence %.1f", found[-1][0])
         if all(own.ratio**2 < MISSING for own in fit_chi2(state)[:2]):
             break
@@ -471,11 +471,11 @@ class _Search:
         """The state with the most probable further cause, if it is detected; else None."""
         # the distributed errors have outliers already, so the evidence need not grow with a fault;
         # a second optimum, where all readings are far less probable, is none
-        least = log_evidence(self.state, self.state.good) - self.judgement.log_odds
+        least = evidence_of(self.state, self.state.good).log - self.judgement.log_odds
         tried: list[tuple[float, State]] = []
         for cause, _, information in self.leaders():
             state = self.put(self.state, cause, information)
-            found = -np.inf if state is None else log_evidence(state, state.good)
+            found = -np.inf if state is None else evidence_of(state, state.good).log
             if state is not None and found > least:
                 tried.append((found + self.problem.prior(cause), state))
         for _, state in sorted(tried, key=lambda one: -one[0]):
@@ -529,7 +529,7 @@ class _Search:
         if other is None:
             return state
         prior = self.problem.prior
-        gained = log_evidence(other, state.good) - log_evidence(state, state.good)
+        gained = evidence_of(other, state.good).log - evidence_of(state, state.good).log
         gained += prior(other.apart[-1].cause) - prior(one.cause)
         return other if gained > 0 else state
 

@@ -79,9 +79,10 @@ def one_round(
         for name, at in there.where.items():
             moved[at] = values[name] - there.start[at]
         left = state.data.pick(then.at.left, block)
-        messages = gathered(there, state.data.plane_of(block), weighed(state, block, left))
-        messages += there.normal.matrix @ moved
-        aim, before = _aim(there, found, bold * there.trust, messages), aim
+        score = gathered(there, state.data.plane_of(block), weighed(state, block, left))
+        score += there.normal.matrix @ moved
+        score += there.normal.matrix @ there.start + there.start / (bold * there.trust) ** 2
+        aim, before = found.solved(score), aim
         further = aim - before
         if further @ there.normal.matrix @ further < CORRECTS * after:
             break  # linear enough
@@ -101,12 +102,6 @@ def bounded_step(there: Linear, bold: float) -> Posterior:
     return found
 
 
-def _aim(there: Linear, found: Posterior, trust: Array, vector: Array) -> Array:
-    """The values by another score, with the same start, priors and step bounds."""
-    whole = vector + there.normal.matrix @ there.start + there.start / trust**2
-    return found.solved(whole)
-
-
 def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
     """Twice the negative log prior density of a variable, up to a constant; its priors add up."""
     if not groups:  # the ring has no such numbers
@@ -114,8 +109,9 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
     each, shared = np.zeros(len(values)), []
     for group in groups:
         spread = group.basis[rows] * group.scale
-        own = spread.any(axis=1)
-        if _of_each(spread) and not each[own].any():
+        there, own = spread != 0, spread.any(axis=1)
+        single = (there.sum(axis=0) <= 1).all() and (there.sum(axis=1) <= 1).all()
+        if single and not each[own].any():
             each += np.abs(spread).sum(axis=1)
         else:
             shared.append(spread)
@@ -129,12 +125,6 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
     asked = np.concatenate([rest, np.zeros(few.shape[1])])
     amounts = np.linalg.lstsq(np.concatenate([few, np.eye(few.shape[1])]), asked, rcond=None)[0]
     return float(np.sum((rest - few @ amounts) ** 2) + amounts @ amounts)
-
-
-def _of_each(spread: Array) -> bool:
-    """Whether a group has one parameter for each of its numbers."""
-    there = spread != 0
-    return bool((there.sum(axis=0) <= 1).all() and (there.sum(axis=1) <= 1).all())
 
 
 def settle(
@@ -219,19 +209,12 @@ def linear_evidence(
 
 
 class Evidence(NamedTuple):
-    """The evidence of a state.
+    """The evidence of a state."""
 
-    Attributes:
-        log: log evidence of both blocks.
-        state: with the weights of the evidence.
-        in_plane: `linear` of it; None: nothing is fitted in-plane.
-        found: its solution.
-    """
-
-    log: float
-    state: State
-    in_plane: Linear | None
-    found: Posterior | None
+    log: float  # of both blocks
+    state: State  # with the weights of the evidence
+    in_plane: Linear | None  # `linear` of it; None: nothing is fitted in-plane
+    found: Posterior | None  # its solution
 
 
 def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evidence:
@@ -256,8 +239,3 @@ def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evide
             if block == 0:
                 in_plane, found = there, last
     return Evidence(total, state, in_plane, found)
-
-
-def log_evidence(state: State, good: Flags, shares: Array | None = None) -> float:
-    """Return the log evidence of `evidence_of`."""
-    return evidence_of(state, good, shares).log

@@ -33,7 +33,6 @@ from tmlattice.diagnosis.response.rounds import (
     Evidence,
     evidence_of,
     linear_evidence,
-    log_evidence,
     settle,
 )
 from tmlattice.diagnosis.response.state import (
@@ -292,9 +291,8 @@ def taken_back(state: State) -> State:
     trial = settle(replace(state, good=good), look_at_monitors=False)
     sound = good_monitors(trial) & good_monitors(trial, 1)
     back = together & sound
-    lost = log_evidence(state, state.good, state.independent) - log_evidence(
-        trial, state.good, state.independent
-    )
+    before, after = (evidence_of(own, state.good, state.independent).log for own in (state, trial))
+    lost = before - after
     orbits = state.data.pick(state.data.orbits)[state.fitted]
     readings = int(np.isfinite(orbits[:, back]).sum())
     # each regained reading may cost a standard error

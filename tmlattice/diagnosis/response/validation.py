@@ -269,114 +269,76 @@ def remainder(state: State) -> tuple[Block, ...]:
     return tuple(block for block in _blocks(state) if block.freedom >= 1)
 
 
+class _Fit(NamedTuple):
+    """The fit of a block, and a root of the covariance by unknown prior scales."""
+
+    there: Linear
+    found: Posterior
+    sizes: Array
+
+
 def _blocks(state: State) -> Iterator[Block]:
-    fitted, half = ~state.split.held[:-1], state.split.half[-1]
-    last = len(state.data.plane) - 1
+    held, rf = state.split.held[:-1], state.split.held.size - 1
     for block in (0, 1):
-        there, found, more = _solved(state, block)
-        name = BLOCKS[block]
-        own = _Sum(state, block)
-        for c in np.flatnonzero(fitted).tolist():
-            own.add(c, state.good)
-        yield Block(f"fitted, {name}", own.chi2, own.readings - _numbers(found))
-        held = _Sum(state, block, there, found, more)
-        for c in np.flatnonzero(state.split.held[:-1]).tolist():
-            held.add(c, state.good, free=True)
-        yield Block(f"held-out, {name}", held.chi2, held.readings)
+        fit, numbers = None, 0.0
+        if state.of_block(block):
+            there = linear(state, block)
+            fit = _Fit(there, there.posterior, of_sizes(state, block, there))
+            # effective number of parameters: 1 for each by the data, 0 for each by its prior
+            numbers = float(len(fit.found.prior) - np.trace(fit.found.covariance))
+        chi2, readings = _chi2(state, block, np.flatnonzero(~held), state.good)
+        yield Block(f"fitted, {BLOCKS[block]}", chi2, readings - numbers)
+        columns = np.flatnonzero(held)
+        own = _chi2(state, block, columns, state.good, fit, free=True)
+        yield Block(f"held-out, {BLOCKS[block]}", *own)
         if block == 0:
-            for which, monitors in (("fitted", half), ("held-out", ~half)):
-                fit = (there, found, more) if which == "held-out" else ()
-                rf = _Sum(state, block, *fit)
-                rf.add(last, state.good & monitors)
-                yield Block(f"{which}, {BLOCKS[2]}", rf.chi2, rf.readings)
+            half = state.split.half[-1]
+            for which, monitors, by in (("fitted", half, None), ("held-out", ~half, fit)):
+                own = _chi2(state, block, np.array([rf]), state.good & monitors, by)
+                yield Block(f"{which}, {BLOCKS[2]}", *own)
 
 
-def _solved(state: State, block: int) -> tuple[Linear | None, Posterior | None, Array | None]:
-    """The fit of a block, and roots of the covariance by unknown prior scales."""
-    if not state.of_block(block):
-        return None, None, None
-    there = linear(state, block)
-    found = there.posterior
-    return there, found, of_sizes(state, block, there)
-
-
-def _numbers(found: Posterior | None) -> float:
-    """Effective number of parameters: 1 for each by the data, 0 for each by its prior."""
-    if found is None:
-        return 0.0
-    return float(len(found.prior) - np.trace(found.covariance))
-
-
-class _Sum:
-    """Chi-square of readings, column by column, in the covariance of their noise and, of held-out
-    ones, of the fit's posterior (by Woodbury's identity).
-
-    Args:
-        state, block: of the readings.
-        there, found, more: the fit, see `_solved`; None: their noise alone.
-    """
-
-    def __init__(
-        self,
-        state: State,
-        block: int,
-        there: Linear | None = None,
-        found: Posterior | None = None,
-        more: Array | None = None,
-    ) -> None:
-        self.state, self.block = state, block
-        self.there, self.found, self.more = there, found, more
-        data = state.data
-        self.left = data.pick(state.at.left, block)
-        # outliers count in the fit, and here, as if their noise were larger
-        with np.errstate(divide="ignore"):
-            self.noise = data.noise_of(block) / np.sqrt(state.share[block])
-        self.square, self.readings = 0.0, 0
-        size = 0 if found is None or more is None else len(found.prior) + more.shape[1]
-        self.vector, self.matrix = np.zeros(size), np.eye(size)
-
-    def add(self, column: int, monitors: Flags, free: bool = False) -> None:
-        """The readings of a column at some BPMs; with its kick free or fixed."""
-        read = np.flatnonzero(
-            monitors & np.isfinite(self.left[column]) & np.isfinite(self.noise[column])
-        )
+def _chi2(
+    state: State,
+    block: int,
+    columns: Indices,
+    monitors: Flags,
+    fit: _Fit | None = None,
+    free: bool = False,
+) -> tuple[float, int]:
+    """Chi-square of the readings of some columns at some BPMs, and their number, in the covariance
+    of their noise and of the fit's posterior (by Woodbury's identity); with kicks free or fixed."""
+    data, square, count = state.data, 0.0, 0
+    left, kicks = data.pick(state.at.left, block), data.pick(state.at.seen(state.at.beam), block)
+    # outliers count in the fit, and here, as if their noise were larger
+    with np.errstate(divide="ignore"):
+        noise = data.noise_of(block) / np.sqrt(state.share[block])
+    size = 0 if fit is None else len(fit.found.prior) + fit.sizes.shape[1]
+    vector, matrix = np.zeros(size), np.eye(size)
+    for column in columns.tolist():
+        plane = int(data.plane_of(block)[column])
+        read = np.flatnonzero(monitors & np.isfinite(left[column]) & np.isfinite(noise[column]))
         if not len(read):
-            return
-        sigma = self.noise[column, read]
-        rows = np.column_stack([self.left[column, read], *self._slopes(column, read)])
-        rows /= sigma[:, None]
-        if self.state.jitter is not None:
-            orbits = self.state.jitter[self._plane(column)][:, read].T / sigma[:, None]
+            continue
+        sigma = noise[column, read]
+        slopes: list[Array] = []  # roots of the posterior covariance, m, [reading, number]
+        if fit is not None:
+            by = fit.there.of_column(column, read, plane)
+            spread = np.asarray((by @ fit.found.spread).T)
+            inside = solve_triangular(fit.found.factor, spread, lower=True).T
+            slopes = [inside, by @ fit.sizes]
+        rows = np.column_stack([left[column, read], *slopes]) / sigma[:, None]
+        if state.jitter is not None:
+            orbits = state.jitter[plane][:, read].T / sigma[:, None]
             lower = np.linalg.cholesky(np.eye(len(read)) + orbits @ orbits.T)
             rows = solve_triangular(lower, rows, lower=True)
-        if free:
-            kick = self.state.at.seen(self.state.at.beam)
-            slope = self.state.data.pick(kick, self.block)[column, read] / sigma
-            if self.block == 0 and slope.any():
-                slope /= np.linalg.norm(slope)
-                rows -= np.outer(slope, slope @ rows)
-                self.readings -= 1
-        left, slopes = rows[:, 0], rows[:, 1:]
-        self.square += float(left @ left)
-        self.readings += len(read)
-        self.vector += slopes.T @ left
-        self.matrix += slopes.T @ slopes
-
-    def _plane(self, column: int) -> int:
-        """The plane of the block's readings of a column."""
-        return int(self.state.data.plane_of(self.block)[column])
-
-    def _slopes(self, column: int, read: Indices) -> list[Array]:
-        """Roots of the posterior covariance of the readings, m, [reading, number]."""
-        if self.there is None or self.found is None or self.more is None:
-            return []
-        rows = self.there.of_column(column, read, self._plane(column))
-        spread = np.asarray((rows @ self.found.spread).T)
-        return [solve_triangular(self.found.factor, spread, lower=True).T, rows @ self.more]
-
-    @property
-    def chi2(self) -> float:
-        """The sum over all readings."""
-        if not len(self.vector):
-            return self.square
-        return self.square - float(self.vector @ np.linalg.solve(self.matrix, self.vector))
+        kick = kicks[column, read] / sigma
+        if free and block == 0 and kick.any():
+            kick /= np.linalg.norm(kick)
+            rows -= np.outer(kick, kick @ rows)
+            count -= 1
+        square += float(rows[:, 0] @ rows[:, 0])
+        count += len(read)
+        vector += rows[:, 1:].T @ rows[:, 0]
+        matrix += rows[:, 1:].T @ rows[:, 1:]
+    return square - float(vector @ np.linalg.solve(matrix, vector)), count
