@@ -101,7 +101,6 @@ def next_measurement(
 
 
 def _names(pair: tuple[Alternative, Alternative]) -> tuple[str, str]:
-    """Two explanations, as texts."""
     first, second = (" ".join(word for word in one.hypothesis if word) for one in pair)
     return first, second
 
@@ -192,16 +191,8 @@ def next_kind(
     options: PartOptions,
     fixed: tuple[Cause, ...],
 ) -> NextMeasurement | None:
-    """Recommend the next measurement; None where nothing is ambiguous or no kind separates it by
-    `LEAST`.
-
-    Args:
-        ring: the design.
-        explanation: of what was measured.
-        taken: kinds that were measured.
-        options: of the diagnosis.
-        fixed: causes that are known.
-    """
+    """Recommend a kind of measurement that was not taken; None where nothing is ambiguous or no
+    kind separates it by `LEAST`. `fixed` are known causes."""
     pair = leading(ring, explanation, options.judgement.mass)
     if pair is None:
         return None

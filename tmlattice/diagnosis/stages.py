@@ -165,12 +165,9 @@ def held_out(
     for stage in stages:
         pairs, among = [], []
         for judge in judges:
-            seen = [
-                c
-                for c in (*fixed, *stage.static, *stage.causes)
-                if judge.sees((c.effect, c.element))
-            ]
-            there = replace(judge, fixed=tuple(seen))
+            causes = (*fixed, *stage.static, *stage.causes)
+            seen = tuple(c for c in causes if judge.sees((c.effect, c.element)))
+            there = replace(judge, fixed=seen)
             scored = there.owner() % 2 == 1
             gives = fit_nuisances(there.without(scored), (), there.first)
             pairs.append((there, there.at((), gives.nuisances)))
