@@ -15,6 +15,7 @@ magnet in the place of a BPM.
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from tmlattice.arrays import Array
 from tmlattice.beam.rf import speed_of
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
+from tmlattice.diagnosis.response.first_guess import BETTER, elsewhere
 from tmlattice.diagnosis.signals import HALF, Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
 from tmlattice.errors import (
@@ -250,11 +251,8 @@ def _global(searched: AnySearch) -> tuple[list[Check], AnySearch]:
 
 
 def _sentence(searched: Search, verdict: Verdict) -> Check:
-    words = " and ".join(ASSUMPTIONS[n].words for n in verdict.names)
-    others = "; ".join(
-        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}"
-        for own in verdict.alike
-    )
+    words = _words(verdict.names)
+    others = "; ".join(f"or {_words(own)}: {_options(own)}" for own in verdict.alike)
     corrections = ", ".join(dict.fromkeys(ASSUMPTIONS[n].correction for n in verdict.names))
     before, after = (searched.shown(own) for own in (verdict.before, verdict.after))
     sure = verdict.worth > CERTAIN or isinstance(searched, Compared)
@@ -266,6 +264,10 @@ def _sentence(searched: Search, verdict: Verdict) -> Check:
     chi2 = (verdict.before, verdict.after) if isinstance(searched, OfTurns) else (None, None)
     make = wrong if sure else note
     return make(GLOBAL, text, before=chi2[0], after=chi2[1], assume=verdict.names)
+
+
+def _words(names: Iterable[str]) -> str:
+    return " and ".join(ASSUMPTIONS[name].words for name in names)
 
 
 def _options(names: Iterable[str]) -> str:
@@ -502,7 +504,9 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
         if order:
             return [*checks, *more, *order]
     if isinstance(data, OrbitResponse) and typical > (CORRECTED if found else ANOTHER):
-        guess = _far(ring, data)
+        guess = None
+        with suppress(TmlatticeError):  # reported elsewhere
+            guess = elsewhere(response_data(ring, data))
         if guess is not None and guess.left < BETTER * typical:
             far = note(
                 "lattice",
@@ -522,14 +526,6 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
             "and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
     return [*checks, *errors, *more, fine("lattice", text)]
-
-
-def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
-    """The first guess of the optics, if the design is far from the data."""
-    try:
-        return elsewhere(response_data(ring, data))
-    except TmlatticeError:  # reported elsewhere
-        return None
 
 
 MEANT = "did you mean"
