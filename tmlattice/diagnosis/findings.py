@@ -143,7 +143,10 @@ def with_consequences(
     effects = consequences(ring, faults_of(findings, causes))
     actions = [finding.recommended_action for finding in findings]
     return tuple(
-        replace(finding, consequences=action and effects.get((action.effect, action.element)))
+        replace(
+            finding,
+            consequences=None if action is None else effects.get((action.effect, action.element)),
+        )
         for finding, action in zip(findings, actions, strict=True)
     )
 
