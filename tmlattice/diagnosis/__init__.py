@@ -188,23 +188,21 @@ def _diagnosed(ring: Ring, measurement: Any, options: dict[str, Any]) -> Diagnos
                 f"the measurement is {of} and the reference {in_words(before)}: give a reference "
                 "of the same kind"
             )
-    if isinstance(measurement, OrbitResponse) and options.get("reference") is not None:
+    before = options.pop("reference", None)
+    if isinstance(measurement, OrbitResponse) and before is None:
+        from tmlattice.diagnosis.response.procedure import diagnose_response
+
+        return diagnose_response(ring, measurement, **options)
+    if isinstance(measurement, OrbitResponse):
         from tmlattice.diagnosis.response.before_after import diagnose_change
 
-        before = options.pop("reference")
         if options.pop("missing", False):
             raise MeasurementError("the option 'missing' has no meaning with a reference")
         return diagnose_change(ring, before, measurement, **options)
-    if isinstance(measurement, OrbitResponse):
-        from tmlattice.diagnosis.response.procedure import diagnose_response
-
-        options.pop("reference", None)
-        return diagnose_response(ring, measurement, **options)
     from tmlattice.diagnosis.procedure import diagnose_together
 
     if not isinstance(measurement, Mapping):
         measurement = {kind_of(measurement): measurement}
-    before = options.pop("reference", None)
     if before is not None and not isinstance(before, Mapping):
         before = {kind_of(before): before}
     return diagnose_together(ring, measurement, reference=before, **options)
@@ -218,12 +216,8 @@ def _alone(measured: Any) -> Any:
 
 
 def devices_of(ring: Ring, measured: Iterable[Any]) -> dict[str, str]:
-    """Names of the control system by names of the lattice.
-
-    Args:
-        ring: whose names they are; others are ignored.
-        measured: of any kinds; the first that has a name for an element gives it.
-    """
+    """Names of the control system by names of the lattice, of the first measurement that has one
+    for an element; others are ignored."""
     names = {element.name.casefold(): element.name for element in ring.elements}
     found: dict[str, str] = {}
     for one in measured:
@@ -234,12 +228,7 @@ def devices_of(ring: Ring, measured: Iterable[Any]) -> dict[str, str]:
 
 
 def with_devices(found: Diagnosis, devices: Mapping[str, str]) -> Diagnosis:
-    """The diagnosis with the names of the control system.
-
-    Args:
-        found: the diagnosis.
-        devices: of `devices_of`.
-    """
+    """The diagnosis with the names of the control system, of `devices_of`."""
     if not devices:
         return found
 

@@ -204,35 +204,24 @@ def chance_text(p_value: float) -> str:
     return "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
 
 
-def _where(own: Assessment) -> str:
-    spans = "; ".join(f"{one['s_from']:.1f} m to {one['s_to']:.1f} m" for one in own.places)
-    return f" It is largest at s = {spans}." if spans else ""
-
-
-def _blocks(own: Assessment) -> str:
-    worst = sorted(own.significant, key=lambda block: -block.ratio)
-    return ", ".join(f"{block.name} {block.ratio:.2g}" for block in worst)
-
-
 def _noise(own: Assessment) -> str:
-    weak = ""
-    if own.noise_estimated:
-        weak = " The noise is estimated from the same readings, which weakens this test."
-    return f"The remaining residual is noise ({chance_text(own.p_value)}).{weak}"
+    weak = " The noise is estimated from the same readings, which weakens this test."
+    text = f"The remaining residual is noise ({chance_text(own.p_value)})."
+    return text + (weak if own.noise_estimated else "")
 
 
-def _above(own: Assessment) -> str:
+def _more(own: Assessment, the: str, than: str) -> str:
+    worst = sorted(own.significant, key=lambda block: -block.ratio)
+    blocks = ", ".join(f"{block.name} {block.ratio:.2g}" for block in worst)
+    spans = "; ".join(f"{one['s_from']:.1f} m to {one['s_to']:.1f} m" for one in own.places)
     return (
-        f"The remaining residual is larger than the noise ({chance_text(own.p_value)}; rms over "
-        f"expected rms: {_blocks(own)}).{_where(own)}"
+        f"{the} remaining residual is larger than {than} ({chance_text(own.p_value)}; rms over "
+        f"expected rms: {blocks})." + (f" It is largest at s = {spans}." if spans else "")
     )
 
 
 def _missing(own: Assessment) -> str:
-    text = (
-        f"An effect is missing from the model: the remaining residual is larger than expected "
-        f"({chance_text(own.p_value)}; rms over expected rms: {_blocks(own)}).{_where(own)}"
-    )
+    text = f"An effect is missing from the model: {_more(own, 'the', 'expected')}"
     if own.rejected:
         text += f" It can be one of the rejected families: {'; '.join(own.rejected)}."
     return text
@@ -262,11 +251,11 @@ def _falls(own: Assessment) -> str:
     gap = own.held_out
     assert gap is not None
     before, after = gap.misfits[gap.baseline].rms, gap.misfits[-1].rms
-    return f"from {micrometres(before)} to {micrometres(after)}"
-
-
-def _everywhere(own: Assessment) -> bool:
-    return own.verdict == "distributed" and own.small_errors and not own.families
+    return (
+        f"The rms residual of {_held(own)} falls from {micrometres(before)} to "
+        f"{micrometres(after)}; the share of the gap that is explained is not determined by these "
+        "readings."
+    )
 
 
 def _asks(own: Assessment) -> bool:
@@ -275,62 +264,75 @@ def _asks(own: Assessment) -> bool:
 
 _LEAVES_MORE = tuple(f"remainder_{name}" for name in _UNEXPLAINED)
 
+Text = Callable[[Assessment], str]
+
+
+def _verdict(
+    requires: str,
+    holds: Callable[[Assessment], bool],
+    noise: tuple[str, Text],
+    more: tuple[str, Text],
+) -> tuple[Statement, Statement]:
+    """The sentences, each with its name, where the remainder is noise or unknown, and where it is
+    more."""
+    return (
+        Statement(
+            "verdict",
+            noise[0],
+            f"{requires}; the remainder is noise or cannot be tested",
+            lambda own: holds(own) and own.remainder not in _UNEXPLAINED,
+            noise[1],
+            _LEAVES_MORE,
+        ),
+        Statement(
+            "verdict",
+            more[0],
+            f"{requires}; the remainder is larger than the noise",
+            lambda own: holds(own) and own.remainder in _UNEXPLAINED,
+            more[1],
+            ("remainder_noise",),
+        ),
+    )
+
+
+def _state(
+    topic: str, state: str, requires: str, text: Text, excludes: tuple[str, ...] = ()
+) -> Statement:
+    """The sentence about one state of the remainder, or of the gap."""
+    return Statement(
+        topic,
+        f"{topic}_{state}",
+        requires,
+        lambda own: getattr(own, topic) == state,
+        text,
+        excludes,
+    )
+
+
 STATEMENTS = (
-    Statement(
-        "verdict", "no_change",
-        "verdict none; the findings are changes since a reference; the remainder is noise or "
-        "cannot be tested",
-        lambda own: own.verdict == "none" and own.change
-        and own.remainder not in _UNEXPLAINED,
-        lambda own: "Nothing changed since the reference beyond the usual drifts of BPMs, "
-        "correctors and magnets.",
-        _LEAVES_MORE,
+    *_verdict(
+        "verdict none; the findings are changes since a reference",
+        lambda own: own.verdict == "none" and own.change,
+        ("no_change", lambda own: "Nothing changed since the reference beyond the usual drifts of "
+         "BPMs, correctors and magnets."),
+        ("change_not_located", lambda own: "No change since the reference is localised, but drifts "
+         "do not explain all readings within their noise."),
     ),
-    Statement(
-        "verdict", "change_not_located",
-        "verdict none; the findings are changes since a reference; the remainder is larger than "
-        "the noise",
-        lambda own: own.verdict == "none" and own.change and own.remainder in _UNEXPLAINED,
-        lambda own: "No change since the reference is localised, but drifts do not explain all "
-        "readings within their noise.",
-        ("remainder_noise",),
+    *_verdict(
+        "verdict none, no reference",
+        lambda own: own.verdict == "none" and not own.change,
+        ("no_error", lambda own: f"No error is detected: the {own.model} explains the readings "
+         "within their noise."),
+        ("not_located", lambda own: f"No error is localised, but the {own.model} does not explain "
+         "all readings within their noise."),
     ),
-    Statement(
-        "verdict", "no_error",
-        "verdict none, no reference; the remainder is noise or cannot be tested",
-        lambda own: own.verdict == "none" and not own.change
-        and own.remainder not in _UNEXPLAINED,
-        lambda own: f"No error is detected: the {own.model} explains the readings within "
-        "their noise.",
-        _LEAVES_MORE,
-    ),
-    Statement(
-        "verdict", "not_located",
-        "verdict none, no reference; the remainder is larger than the noise",
-        lambda own: own.verdict == "none" and not own.change and own.remainder in _UNEXPLAINED,
-        lambda own: f"No error is localised, but the {own.model} does not explain all readings "
-        "within their noise.",
-        ("remainder_noise",),
-    ),
-    Statement(
-        "verdict", "small_errors_explain",
-        "verdict distributed; distributed errors are in the model; the remainder is noise or "
-        "cannot be "
-        "tested",
-        lambda own: _everywhere(own) and own.remainder not in _UNEXPLAINED,
-        lambda own: "Distributed errors explain the readings; no single fault is "
-        "detected among them.",
-        _LEAVES_MORE,
-    ),
-    Statement(
-        "verdict", "small_errors_explain_part",
-        "verdict distributed; distributed errors are in the model; the remainder is larger than "
-        "the "
-        "noise",
-        lambda own: _everywhere(own) and own.remainder in _UNEXPLAINED,
-        lambda own: "Distributed errors explain a part of the readings; no single "
-        "fault is detected among them.",
-        ("remainder_noise",),
+    *_verdict(
+        "verdict distributed; distributed errors are in the model",
+        lambda own: own.verdict == "distributed" and own.small_errors and not own.families,
+        ("small_errors_explain", lambda own: "Distributed errors explain the readings; no single "
+         "fault is detected among them."),
+        ("small_errors_explain_part", lambda own: "Distributed errors explain a part of the "
+         "readings; no single fault is detected among them."),
     ),
     Statement(
         "verdict", "no_sparse_solution",
@@ -340,72 +342,64 @@ STATEMENTS = (
         "errors explains them.",
         ("gap_explained",),
     ),
-    Statement(
-        "remainder", "remainder_noise", "p-value over all blocks of readings at the false-alarm "
+    _state(
+        "remainder", "noise", "p-value over all blocks of readings at the false-alarm "
         "level or above",
-        lambda own: own.remainder == "noise", _noise,
+        _noise,
         _LEAVES_MORE,
     ),
-    Statement(
-        "remainder", "remainder_above_noise",
+    _state(
+        "remainder", "above_noise",
         f"p-value below the false-alarm level, chi² per degree of freedom {MISSING} at most, the "
         "noise is stated",
-        lambda own: own.remainder == "above_noise", _above,
+        lambda own: _more(own, "The", "the noise"),
     ),
-    Statement(
-        "remainder", "remainder_effect_missing",
+    _state(
+        "remainder", "effect_missing",
         f"p-value below the false-alarm level in a block whose chi² per degree of freedom is above "
         f"{MISSING}",
-        lambda own: own.remainder == "effect_missing", _missing,
+        _missing,
     ),
-    Statement(
-        "remainder", "remainder_unknown",
+    _state(
+        "remainder", "unknown",
         f"p-value below the false-alarm level, chi² per degree of freedom {MISSING} at most, the "
         "noise is estimated from the same readings; or no reading was compared",
-        lambda own: own.remainder == "unknown",
         lambda own: "Whether the remaining residual is noise is unknown: the noise is estimated "
         "from the same readings.",
     ),
-    Statement(
-        "gap", "gap_not_held_out", "no reading was held out",
-        lambda own: own.gap == "not_held_out",
+    _state(
+        "gap", "not_held_out", "no reading was held out",
         lambda own: "No reading was held out: the reduction of the gap is not validated.",
     ),
-    Statement(
-        "gap", "gap_none",
+    _state(
+        "gap", "none",
         "held-out readings before the correction are not significantly above the noise",
-        lambda own: own.gap == "none",
         lambda own: f"{_held(own).capitalize()} show no gap beyond the noise.",
     ),
-    Statement(
-        "gap", "gap_explained", "a gap on held-out readings, five standard errors or more; the "
+    _state(
+        "gap", "explained", "a gap on held-out readings, five standard errors or more; the "
         "share that is explained is determined",
-        lambda own: own.gap == "explained", _closed,
+        _closed,
     ),
-    Statement(
-        "gap", "gap_share_unknown", "a gap on held-out readings that is significant in chi²; its "
+    _state(
+        "gap", "share_unknown", "a gap on held-out readings that is significant in chi²; its "
         "size is determined to less than five standard errors",
-        lambda own: own.gap == "share_unknown",
-        lambda own: f"The rms residual of {_held(own)} falls {_falls(own)}; the share of the "
-        "gap that is explained is not determined by these readings.",
+        _falls,
     ),
-    Statement(
-        "gap", "gap_nothing_fitted", "a gap on held-out readings; nothing was put into the model",
-        lambda own: own.gap == "nothing_fitted",
+    _state(
+        "gap", "nothing_fitted", "a gap on held-out readings; nothing was put into the model",
         lambda own: f"Nothing was put into the model, so the gap of {_held(own)} stays.",
         ("no_error", "small_errors_explain"),
     ),
-    Statement(
-        "gap", "gap_no_amount", "a gap on held-out readings; the findings have no effect of the "
+    _state(
+        "gap", "no_amount", "a gap on held-out readings; the findings have no effect of the "
         "catalogue, and no amount",
-        lambda own: own.gap == "no_amount",
         lambda own: "A finding without an effect of the catalogue has no amount, so the gap of "
         "held-out readings stays.",
         ("no_error", "small_errors_explain"),
     ),
-    Statement(
-        "gap", "gap_beam_lost", "the beam of held-out readings is lost in one of the models",
-        lambda own: own.gap == "beam_lost",
+    _state(
+        "gap", "beam_lost", "the beam of held-out readings is lost in one of the models",
         lambda own: "The beam of held-out shots is lost in one of the models, so they do not "
         "validate the result.",
     ),

@@ -87,30 +87,28 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
         return {}
     there = assembly(ring)
     design = _optics(there, {})
-    found = _relative(design, _optics(there, _changed(ring, ring, causes)))
+    found = _optics(there, _changed(ring, ring, causes))
     each: dict[Hypothesis, Consequences] = {}
     for cause in felt:
         others = [c for c in causes if c is not cause]
         corrected, by_hand = compensated(ring, [cause])
         changed = _changed(ring, corrected, others if by_hand else causes)
-        each[cause.effect, cause.element] = Consequences(
-            None if design is None else _pair(design.tunes),
-            found,
-            _relative(design, _optics(there, changed)),
-        )
+        each[cause.effect, cause.element] = _compared(design, found, _optics(there, changed))
     return each
 
 
-def beam_with(ring: Ring, causes: Sequence[Cause]) -> Consequences:
-    """The effect of all causes together on the stored beam, without any correction.
+def _compared(
+    design: StoredOptics | None, found: StoredOptics | None, corrected: StoredOptics | None
+) -> Consequences:
+    tunes = None if design is None else _pair(design.tunes)
+    return Consequences(tunes, _relative(design, found), _relative(design, corrected))
 
-    Args:
-        ring: the design.
-        causes: those of monitors and of settings are ignored.
-    """
+
+def beam_with(ring: Ring, causes: Sequence[Cause]) -> Consequences:
+    """The effect of all causes together on the stored beam, without any correction; those of
+    monitors and of settings are ignored."""
     design, estimated = optics_with(ring, causes)
-    found = _relative(design, estimated)
-    return Consequences(None if design is None else _pair(design.tunes), found, None)
+    return _compared(design, estimated, None)
 
 
 def optics_with(ring: Ring, causes: Sequence[Cause]) -> tuple[StoredOptics | None, ...]:

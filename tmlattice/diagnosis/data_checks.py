@@ -15,6 +15,7 @@ magnet in the place of a BPM.
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from tmlattice.arrays import Array
 from tmlattice.beam.rf import speed_of
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
-from tmlattice.diagnosis.response.first_guess import BETTER, Guess, elsewhere
+from tmlattice.diagnosis.response.first_guess import BETTER, elsewhere
 from tmlattice.diagnosis.signals import HALF, Check, Checkup, fine, note, wrong
 from tmlattice.effects import Cause, expected_radiation
 from tmlattice.errors import (
@@ -171,42 +172,31 @@ def data_checks(
         MeasurementError: a check failed.
     """
 
-    def of(one: Measurement | OrbitResponse) -> Checkup:
-        return Checkup("", tuple(_whole(ring, one, radiation)), {})
-
-    own = of(data)
+    both = [
+        Checkup("", tuple(_whole(ring, one, radiation)), {})
+        for one in (data, reference) if one is not None
+    ]  # fmt: skip
+    notes = [[check.sentence for check in one.reported if check.name in _REPORTED] for one in both]
     if reference is None:
-        own.stop()
-        return [check.sentence for check in own.reported if check.name in _REPORTED]
-    other = of(reference)
-    wrong, as_wrong = (
-        {check.name for check in one.checks if check.status == "wrong"} for one in (own, other)
-    )
+        both[0].stop()
+        return notes[0]
+    wrong, as_wrong = ({c.name for c in one.checks if c.status == "wrong"} for one in both)
     alone = "{} alone (correct its file; --assume applies to both): "
-    own.stop("" if wrong <= as_wrong else alone.format("the second measurement"))
-    other.stop(alone.format("the reference"))
-    text, reported = (
-        [check.sentence for check in one.reported if check.name in _REPORTED]
-        for one in (own, other)
-    )
+    both[0].stop("" if wrong <= as_wrong else alone.format("the second measurement"))
+    both[1].stop(alone.format("the reference"))
+    text, reported = notes
     return text + [f"the reference: {sentence}" for sentence in reported if sentence not in text]
 
 
 def raise_if_wrong(ring: Ring, data: AnyMeasurement, problem: Any = None) -> None:
-    """Raise an error if a stored beam's data are wrong as a whole.
-
-    Args:
-        ring: the design.
-        data: measured.
-        problem: their lines, if these are turns and the lines are known.
+    """Raise an error if a stored beam's data are wrong as a whole; `problem` has the lines
+    of turns.
 
     Raises:
         MeasurementError: what is wrong, and its correction.
     """
-    names = [monitor.name for monitor in ring.monitors]
-    checks = [*_period(ring, data), *_of_compared(ring, in_beam_order(data, names), problem)]
-    if bad := [check.sentence for check in checks if check.status == "wrong"]:
-        raise MeasurementError("; ".join(bad))
+    ordered = in_beam_order(data, [monitor.name for monitor in ring.monitors])
+    Checkup("", (*_period(ring, data), *_of_compared(ring, ordered, problem)), {}).stop()
 
 
 Some = TypeVar("Some")
@@ -225,10 +215,10 @@ def _stated(ring: Ring, data: AnyMeasurement) -> Check:
         return fine("energy", "the data state no energy")
     if abs(data.energy / ring.energy - 1) > ENERGY:
         return note(
-            "energy",
-            f"the data state a beam energy of {data.energy:g} GeV, the lattice {ring.energy:g}: "
-            "name this machine's lattice, or its energy (`energy` in tmlattice.toml)",
-        )
+            "energy", f"the data state a beam energy of {data.energy:g} GeV, the lattice "
+            f"{ring.energy:g}: name this machine's lattice, or its energy (`energy` in "
+            "tmlattice.toml)",
+        )  # fmt: skip
     return fine("energy", f"{data.energy:g} GeV, as the lattice has it")
 
 
@@ -261,11 +251,8 @@ def _global(searched: AnySearch) -> tuple[list[Check], AnySearch]:
 
 
 def _sentence(searched: Search, verdict: Verdict) -> Check:
-    words = " and ".join(ASSUMPTIONS[n].words for n in verdict.names)
-    others = "; ".join(
-        f"or {' and '.join(ASSUMPTIONS[n].words for n in own)}: {_options(own)}"
-        for own in verdict.alike
-    )
+    words = _words(verdict.names)
+    others = "; ".join(f"or {_words(own)}: {_options(own)}" for own in verdict.alike)
     corrections = ", ".join(dict.fromkeys(ASSUMPTIONS[n].correction for n in verdict.names))
     before, after = (searched.shown(own) for own in (verdict.before, verdict.after))
     sure = verdict.worth > CERTAIN or isinstance(searched, Compared)
@@ -277,6 +264,10 @@ def _sentence(searched: Search, verdict: Verdict) -> Check:
     chi2 = (verdict.before, verdict.after) if isinstance(searched, OfTurns) else (None, None)
     make = wrong if sure else note
     return make(GLOBAL, text, before=chi2[0], after=chi2[1], assume=verdict.names)
+
+
+def _words(names: Iterable[str]) -> str:
+    return " and ".join(ASSUMPTIONS[name].words for name in names)
 
 
 def _options(names: Iterable[str]) -> str:
@@ -303,13 +294,8 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
     passes, found = checked.found(checked.data)
     if lost_too := _no_beam(ring, checked, passes, found):
         return [*checks, *errors, *lost_too]
-    lattice = _lattice(
-        ring,
-        checked,
-        passes,
-        found,
-        RESOLVED if any(check.status != "fine" for check in errors) else ALIEN,
-    )
+    corrected = any(check.status != "fine" for check in errors)
+    lattice = _lattice(ring, checked, passes, found, RESOLVED if corrected else ALIEN)
     if lattice.status == "wrong":  # no wrong sign, unit or order explains that
         return [*checks, lattice]
     checks += [*errors, lattice]
@@ -317,14 +303,10 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
         checks += _order(checked, passes, found)
     if any(check.status == "wrong" for check in checks):
         # noise and launches have no meaning before that is corrected, but the unit of the latter
-        units = any(is_unit(name) for check in errors for name in check.assume)
-        launches = [_launches(checked)] if units else []
-        return [*checks, *(own for own in launches if own.status == "wrong")]
-    return [
-        *checks,
-        _launches(checked),
-        _noise(checked, passes, found),
-    ]
+        if any(is_unit(name) for check in errors for name in check.assume):
+            checks += [own for own in [_launches(checked)] if own.status == "wrong"]
+        return checks
+    return [*checks, _launches(checked), _noise(checked, passes, found)]
 
 
 def _lattice(
@@ -454,42 +436,37 @@ def _noise(checked: OfTurns, passes: Passes, found: SectionFits) -> Check:
     typical = float(np.median(passes.sigma))
     if checked.data.noise is None:
         return fine("noise", f"none is stated; the residuals are {_micro(level * typical)}")
-    if level < 1 / MISSTATED:
-        return wrong(
-            "noise",
+    small = level < 1 / MISSTATED
+    random = None if small else noise_scatter(passes, found)
+    if small or (random is not None and random > MISSTATED):
+        text = (
             f"the stated noise of {_micro(typical)} is {1 / level:.1f} times the residuals "
             f"between neighbouring BPMs ({_micro(level * typical)}; chi-square per reading "
-            f"{level**2:.2g}): "
-            "state the noise of one reading, or go on with --assume noise-from-data",
-            before=level**2, after=1.0, assume=("noise-from-data",),
-        )  # fmt: skip
-    random = noise_scatter(passes, found)
-    if random is not None and random > MISSTATED:
+            f"{level**2:.2g})"
+        )
+        if random is not None:
+            text = (
+                f"the stated noise of {_micro(typical)} is too small: from shot to shot the "
+                f"readings scatter by {_micro(random * typical)} about the trajectories that their "
+                f"neighbours follow (chi-square per reading {level**2:.3g})"
+            )
         return wrong(
-            "noise",
-            f"the stated noise of {_micro(typical)} is too small: from shot to shot the readings "
-            f"scatter by {_micro(random * typical)} about the trajectories that their neighbours "
-            f"follow (chi-square per reading {level**2:.3g}): state the noise of one reading, or "
-            "go on with --assume noise-from-data",
-            before=level**2, after=1.0, assume=("noise-from-data",),
+            "noise", f"{text}: state the noise of one reading, or go on with --assume "
+            "noise-from-data", before=level**2, after=1.0, assume=("noise-from-data",),
         )  # fmt: skip
     text = f"{_micro(typical)} is stated, neighbouring BPMs show {_micro(level * typical)}"
     if level <= MISSTATED:
         return fine("noise", text)
     if random is None:
         return note(
-            "noise",
-            f"{text}: the noise is larger than stated, or distributed errors are as large; "
-            f"{len(checked.data.shots)} shots do not show which: take {PASSES} or more",
-        )
+            "noise", f"{text}: the noise is larger than stated, or distributed errors are as "
+            f"large; {len(checked.data.shots)} shots do not show which: take {PASSES} or more",
+        )  # fmt: skip
     return fine(
-        "noise",
-        f"{_micro(typical)} is stated, and the scatter from shot to shot is no larger; "
-        "neighbouring "
-        f"BPMs show {_micro(level * typical)}, the same or in proportion in all shots: "
-        "errors of the "
-        "machine",
-    )
+        "noise", f"{_micro(typical)} is stated, and the scatter from shot to shot is no larger; "
+        f"neighbouring BPMs show {_micro(level * typical)}, the same or in proportion in all "
+        "shots: errors of the machine",
+    )  # fmt: skip
 
 
 def _micro(metres: float) -> str:
@@ -527,7 +504,9 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
         if order:
             return [*checks, *more, *order]
     if isinstance(data, OrbitResponse) and typical > (CORRECTED if found else ANOTHER):
-        guess = _far(ring, data)
+        guess = None
+        with suppress(TmlatticeError):  # reported elsewhere
+            guess = elsewhere(response_data(ring, data))
         if guess is not None and guess.left < BETTER * typical:
             far = note(
                 "lattice",
@@ -547,14 +526,6 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
             "and check the names and the order of BPMs and correctors",
         )]  # fmt: skip
     return [*checks, *errors, *more, fine("lattice", text)]
-
-
-def _far(ring: Ring, data: OrbitResponse) -> Guess | None:
-    """The first guess of the optics, if the design is far from the data."""
-    try:
-        return elsewhere(response_data(ring, data))
-    except TmlatticeError:  # reported elsewhere
-        return None
 
 
 MEANT = "did you mean"
@@ -611,10 +582,4 @@ def _hint(find: Callable[[str], object], name: str) -> str:
 
 def _has(ring: Ring, monitors: Names, name: str) -> bool:
     """Whether the ring has an element of this name."""
-    if monitors.find(name) is not None:
-        return True
-    try:
-        ring.index(name)
-    except UnknownNameError:
-        return False
-    return True
+    return monitors.find(name) is not None or not _hint(ring.index, name)

@@ -10,7 +10,7 @@ from tmlattice.arrays import Array
 from tmlattice.diagnosis.consequences import consequences
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.recommended_actions import credible as credible_actions
-from tmlattice.diagnosis.recommended_actions import recommended_action, recommended_actions
+from tmlattice.diagnosis.recommended_actions import fewest, recommended_action, recommended_actions
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
 from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
@@ -19,7 +19,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import ITERATIONS, Outcome, fit
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
-from tmlattice.inference.search import Explanation, Identified
+from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Element, Ring
 
 
@@ -28,12 +28,7 @@ def credible(rivals: Sequence[Alternative], mass: float) -> tuple[list[Alternati
     evidence = np.array([rival.fit.log_evidence for rival in rivals])
     probability = np.exp(evidence - evidence.max())
     probability /= probability.sum()
-    return list(rivals[: size_of(probability, mass)]), probability
-
-
-def size_of(probability: Array, mass: float) -> int:
-    """The size of the credible set of this mass, by falling probability."""
-    return int(np.searchsorted(np.cumsum(probability), mass)) + 1
+    return list(rivals[: fewest(probability, mass)]), probability
 
 
 def finished(explanation: Explanation) -> Explanation:
@@ -49,10 +44,14 @@ def findings_of(
     ring: Ring, explanation: Explanation, dead: Sequence[tuple[int, float]], judgement: Judgement
 ) -> tuple[Finding, ...]:
     """Findings by falling statistic: named causes, unexplained kicks, rejected and dead BPMs."""
-    found = [
-        _named(ring, explanation, k, named, judgement.mass)
-        for k, named in enumerate(explanation.named)
-    ]
+    found, fitted = [], explanation.fit
+    sigmas = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0)).tolist()
+    for k, named in enumerate(explanation.named):
+        _, probability = credible(named.alternatives, judgement.mass)
+        causes = [fitted.causes[k], *(m.cause for m in named.alternatives[1:])]
+        found.append(
+            finding_of(ring, causes, probability, sigmas[k], named.detection, judgement.mass)
+        )
     for layer, detection in explanation.kicks.items():
         found.append(located(ring, ring.magnets[layer], detection))
     for m, detection in explanation.monitors.items():
@@ -79,14 +78,6 @@ def least_certain(found: Sequence[Finding], without: str) -> str:
     return max((own.verdict for own in found), key=VERDICTS.index) if found else without
 
 
-def _named(ring: Ring, explanation: Explanation, k: int, named: Identified, mass: float) -> Finding:
-    cause = explanation.fit.causes[k]
-    sigma = float(np.sqrt(max(explanation.fit.covariance[k, k], 0.0)))
-    probability = credible(named.alternatives, mass)[1]
-    causes = [cause, *(m.cause for m in named.alternatives[1:])]
-    return finding_of(ring, causes, probability, sigma, named.detection, mass)
-
-
 def finding_of(
     ring: Ring,
     causes: Sequence[Cause],
@@ -105,7 +96,7 @@ def finding_of(
         detection: how clearly it was seen.
         mass: of the credible set.
     """
-    cause, shown = causes[0], causes[: size_of(probability, mass)]
+    cause, shown = causes[0], causes[: fewest(probability, mass)]
     actions = recommended_actions(ring, causes, probability, sigma)
     positions = [s for m in shown for s in _positions(ring, (m.effect, m.element))]
     where, near = between(ring, positions) if positions else (None, ())
@@ -121,7 +112,15 @@ def finding_of(
         where=where,
         near=near,
         credible_set=tuple(
-            _member(ring, m, float(p)) for m, p in zip(shown, probability, strict=False)
+            Member(
+                m.effect,
+                m.element,
+                _middle(ring, m.element),
+                float(p),
+                m.amount,
+                recommended_action(ring, m),
+            )
+            for m, p in zip(shown, probability, strict=False)
         ),
         mass=float(probability[: len(shown)].sum()),
         recommended_actions=credible_actions(actions, mass),
@@ -138,36 +137,17 @@ def located(ring: Ring, element: Element, detection: Detection) -> Finding:
 def with_consequences(
     ring: Ring, findings: Sequence[Finding], causes: Sequence[Cause]
 ) -> tuple[Finding, ...]:
-    """The findings with their effects on the stored beam of the design's settings.
-
-    Args:
-        ring: the design.
-        findings: those that are accepted.
-        causes: theirs.
-    """
+    """The findings with their effects on the stored beam of the design's settings."""
     if not findings:
         return ()
     effects = consequences(ring, faults_of(findings, causes))
+    actions = [finding.recommended_action for finding in findings]
     return tuple(
         replace(
-            f,
-            consequences=effects.get((f.recommended_action.effect, f.recommended_action.element))
-            if f.recommended_action
-            else None,
+            finding,
+            consequences=None if action is None else effects.get((action.effect, action.element)),
         )
-        for f in findings
-    )
-
-
-def _member(ring: Ring, cause: Cause, probability: float) -> Member:
-    place = _middle(ring, cause.element)
-    return Member(
-        cause.effect,
-        cause.element,
-        place,
-        probability,
-        cause.amount,
-        recommended_action(ring, cause),
+        for finding, action in zip(findings, actions, strict=True)
     )
 
 

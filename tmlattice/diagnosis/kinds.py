@@ -35,7 +35,7 @@ from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import scatter
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.orbits import closed_orbits, dispersion
-from tmlattice.observe.response_data import HELD, response_data, split_columns
+from tmlattice.observe.response_data import HELD, ResponseData, response_data, split_columns
 from tmlattice.observe.response_problem import Response
 from tmlattice.observe.spectra import Lines
 from tmlattice.observe.stored import ModelCache, Stored
@@ -197,20 +197,25 @@ def _response(label: str, kind: str, measured: Any, options: PartOptions) -> Par
     measured = corrected_data(ring, measured, options.assume)
     messages = tuple(data_checks(ring, measured))
     data = response_data(ring, measured)
-    there = np.isfinite(data.orbits)
-    base = Predicted(data, Errors.none(data)).bend()
+    whole = _problem(data, options)
     if not options.holdout:
-        whole = Response(base=base, used=there, places=options.places, judgement=options.judgement)
         return Part(label, kind, whole, messages=messages)
     split = split_columns(data, min(options.holdout, HELD), np.random.default_rng(options.seed))
     held = np.append(split.held[:-1], False)[:, None]
     # half of a held-out corrector's BPMs is fitted, to determine its own kick
     fitted, judges = (
-        Response(base=base, used=there & which[:, :, None], places=options.places,
-                 judgement=options.judgement)
+        replace(whole, used=whole.used & which[:, :, None])
         for which in (~held | split.half, held & ~split.half)
-    )  # fmt: skip
+    )
     return Part(label, kind, fitted, judges, messages=messages)
+
+
+def _problem(data: ResponseData, options: PartOptions) -> Response:
+    """All readings of a response as a problem."""
+    return Response(
+        base=Predicted(data, Errors.none(data)).bend(), used=np.isfinite(data.orbits),
+        places=options.places, judgement=options.judgement,
+    )  # fmt: skip
 
 
 def _of_stored(
@@ -232,13 +237,8 @@ def _of_stored(
         if isinstance(problem, Stored):
             raise_if_wrong(options.ring, measured, problem)
         messages = problem.warnings if isinstance(problem, ManyTurns) else ()
-        return Part(
-            label,
-            kind,
-            problem,
-            held and make(options.ring, held, options.places),
-            messages=messages,
-        )
+        other = held and make(options.ring, held, options.places)
+        return Part(label, kind, problem, other, messages=messages)
 
     return made
 
@@ -301,12 +301,7 @@ def _propose_response(ring: Ring, options: PartOptions) -> Problem:
         monitors=names, response=np.broadcast_to(nothing, (count, *nothing.shape)).copy(),
         noise=nothing + NOISE,
     )  # fmt: skip
-    data = response_data(ring, response)
-    base = Predicted(data, Errors.none(data)).bend()
-    return Response(
-        base=base, used=np.isfinite(data.orbits), places=options.places,
-        judgement=options.judgement,
-    )  # fmt: skip
+    return _problem(response_data(ring, response), options)
 
 
 @dataclass(frozen=True)

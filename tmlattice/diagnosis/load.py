@@ -94,11 +94,27 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
     noise = gap["readings_noise"]
     causes = tuple(Cause(row["effect"], row["element"], row["amount"]) for row in d["errors"])
     hints = get_type_hints(cls, localns=RECORDS)
+    findings = []
+    for row in d["findings"]:
+        first = row["recommended_action"]
+        stated = [] if first is None else [first, *row["alternative_actions"]]
+        actions = [{**own, "kind": element_kind(ring, own["element"])} for own in stated]
+        findings.append({**row, "recommended_actions": actions})
+    heldout = None if not held else Gap(
+        decoded(tuple[Misfit, ...], held["steps"]),
+        np.zeros((0, 0, 0)),
+        gap["explained"],
+        decoded(tuple[float, float] | None, gap["explained_interval"]),
+        held["since"],
+        held["readings"],
+        held["lost"],
+    )  # fmt: skip
+    parts = [{**row, "monitors": [], "left": np.zeros((2, 0))} for row in d.get("measurements", ())]
     made: Diagnosis = cls(
-        findings=tuple(_finding(row, ring) for row in d["findings"]),
+        findings=decoded(tuple[Finding, ...], findings),
         fit_before=decoded(Misfit, gap["fit"]["before"]),
         fit_after=decoded(Misfit, gap["fit"]["after"]),
-        heldout=_gap(gap),
+        heldout=heldout,
         heldout_shots=tuple(held.get("shots", ())),
         noise=(decoded(float, noise["x"]), decoded(float, noise["y"])),
         noise_estimated=noise["estimated"],
@@ -108,7 +124,7 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
         errors=tuple(decoded(float, row["amount_sigma"]) for row in d["errors"]),
         view=StoredView(
             d["kind"],
-            tuple(_part(row) for row in d.get("measurements", ())),
+            decoded(tuple[PartView, ...], parts),
             tuple(d["assessment"]["measured"]),
             held.get("correctors"),
         ),
@@ -125,31 +141,3 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
 def _in_ring(cause: Cause) -> bool:
     effect = find(cause.effect)
     return isinstance(effect, RingEffect) and not (effect.calibrates or effect.acts_on_settings)
-
-
-def _finding(row: Mapping[str, Any], ring: Ring) -> Finding:
-    first = row["recommended_action"]
-    stated = [] if first is None else [first, *row["alternative_actions"]]
-    actions = [{**own, "kind": element_kind(ring, own["element"])} for own in stated]
-    found: Finding = decoded(Finding, {**row, "recommended_actions": actions})
-    return found
-
-
-def _part(row: Mapping[str, Any]) -> PartView:
-    part: PartView = decoded(PartView, {**row, "monitors": [], "left": np.zeros((2, 0))})
-    return part
-
-
-def _gap(gap: Mapping[str, Any]) -> Gap | None:
-    held = gap["heldout"]
-    if held is None:
-        return None
-    return Gap(
-        decoded(tuple[Misfit, ...], held["steps"]),
-        np.zeros((0, 0, 0)),
-        gap["explained"],
-        decoded(tuple[float, float] | None, gap["explained_interval"]),
-        held["since"],
-        held["readings"],
-        held["lost"],
-    )

@@ -75,14 +75,13 @@ def next_measurement(
         return None
     model = Model(ring, settings, data.turns, known)
     count = len(launches)
+    shape = (count, data.turns * len(model.at), 2)
     sigma = np.nanmedian(data.sigma.reshape(-1, 2), axis=0)
     prior = data.launch_sigma[data.active][:1]
     shots = Data(
-        readings=np.zeros((count, data.turns * len(model.at), 2)),
-        valid=np.broadcast_to(
-            data.valid[data.active].any(axis=0), (count, *data.valid.shape[1:])
-        ).copy(),
-        sigma=np.broadcast_to(sigma, (count, data.turns * len(model.at), 2)).copy(),
+        readings=np.zeros(shape),
+        valid=np.broadcast_to(data.valid[data.active].any(axis=0), shape).copy(),
+        sigma=np.broadcast_to(sigma, shape).copy(),
         launches=launches,
         launch_sigma=np.repeat(prior, count, axis=0),
         settings=tuple(settings),
@@ -102,7 +101,6 @@ def next_measurement(
 
 
 def _names(pair: tuple[Alternative, Alternative]) -> tuple[str, str]:
-    """Two explanations, as texts."""
     first, second = (" ".join(word for word in one.hypothesis if word) for one in pair)
     return first, second
 
@@ -156,10 +154,7 @@ def _candidates(
     if not launches:
         return np.zeros((0, 5)), []
     usual = launches[0]
-    for delta in (1e-3, -1e-3):
-        row = usual.copy()
-        row[4] += delta
-        launches.append(row)
+    launches += [usual + np.array([0, 0, 0, 0, delta]) for delta in (1e-3, -1e-3)]
     settings: list[Settings] = [{} for _ in launches]
     elements = {element.name: element for element in ring.elements}
     for rival in rivals:
@@ -196,16 +191,8 @@ def next_kind(
     options: PartOptions,
     fixed: tuple[Cause, ...],
 ) -> NextMeasurement | None:
-    """Recommend the next measurement; None where nothing is ambiguous or no kind separates it by
-    `LEAST`.
-
-    Args:
-        ring: the design.
-        explanation: of what was measured.
-        taken: kinds that were measured.
-        options: of the diagnosis.
-        fixed: causes that are known.
-    """
+    """Recommend a kind of measurement that was not taken; None where nothing is ambiguous or no
+    kind separates it by `LEAST`. `fixed` are known causes."""
     pair = leading(ring, explanation, options.judgement.mass)
     if pair is None:
         return None
@@ -235,17 +222,19 @@ def _among(problem: Problem, explanation: Explanation, first: Alternative) -> Pr
     if rows * len(among.known.hypotheses) > MAX_ELEMENTS:
         raise TmlatticeError("too many readings for the distributed errors")
     known = among.learnt(explanation.fit)
-    causes = [c for c in first.fit.causes if problem.sees((c.effect, c.element))]
+    causes = _seen(problem, first)
     return fit_distributed_errors(problem, known, problem.first, causes, learn=False).problem
+
+
+def _seen(problem: Problem, one: Alternative) -> list[Cause]:
+    """The causes of an explanation to which a problem is sensitive."""
+    return [c for c in one.fit.causes if problem.sees((c.effect, c.element))]
 
 
 def separation(problem: Problem, pair: tuple[Alternative, Alternative]) -> float:
     """The separation in standard deviations; 0 where one of the explanations has no stored beam."""
-    each = [
-        [c for c in one.fit.causes if problem.sees((c.effect, c.element))] for one in pair
-    ]  # fmt: skip
-    first = fit_nuisances(problem, each[0], problem.first)
-    second = problem.at(each[1], first.nuisances)
+    first = fit_nuisances(problem, _seen(problem, pair[0]), problem.first)
+    second = problem.at(_seen(problem, pair[1]), first.nuisances)
     if first.lost or second.lost:
         return 0.0
     return float(separations(problem, pair, (first, second))[0])

@@ -96,23 +96,19 @@ def prepare(
     problem = FirstTurns(
         model=model, data=rough, places=places, rare=rare(ring, chosen), judgement=judgement
     )
-    start = _on_its_way(fit(problem, (), problem.first, steps=ITERATIONS), ring)
+    start = _on_its_way(problem, problem.first, ring)
     data, estimated = _with_noise(data, start)
     data, floor = _above_the_floor(data)
     messages = (*messages, *floor)
     problem = replace(problem, data=data, white=None)
-    before = _on_its_way(fit(problem, (), start.nuisances, steps=ITERATIONS), ring)
+    before = _on_its_way(problem, start.nuisances, ring)
     hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data))
     return Prepared(problem, before, hypotheses, dead, estimated, messages)
 
 
 def batch(ring: Ring, measurement: Measurement, messages: list[str]) -> Measurement:
-    """Return the readings with a signal, of as many shots as fit into memory, evenly spaced.
-
-    Args:
-        ring: the design.
-        measurement: any number of shots.
-        messages: receives a message about omitted shots.
+    """Return the readings with a signal, of as many shots as fit into memory, evenly spaced;
+    `messages` receives one about omitted shots.
 
     Raises:
         MeasurementError: not one shot fits.
@@ -166,7 +162,9 @@ def _determined(ring: Ring, hypotheses: Sequence[Hypothesis], data: Data) -> lis
     return found
 
 
-def _on_its_way(start: Fit, ring: Ring) -> Fit:
+def _on_its_way(problem: FirstTurns, launches: Array, ring: Ring) -> Fit:
+    """The fit of the launches alone."""
+    start = fit(problem, (), launches, steps=ITERATIONS)
     if start.point.lost:
         raise BeamLostError(
             f"{start.point.lost} in the design of '{ring.name}': check the launches' units (m, "
@@ -259,13 +257,7 @@ def _rms(values: Array) -> float:
 
 
 def same_monitors(other: Data, data: Data, dropped: Flags) -> Data:
-    """Held-out readings of the BPMs that the fit kept.
-
-    Args:
-        other: of the held-out shots.
-        data: of the fit's.
-        dropped: readings that the search rejected, [shot, reading, 2].
-    """
+    """Held-out readings of the BPMs that the fit kept, which dropped [shot, reading, 2]."""
     lost = dropped[data.active].all(axis=0)
     never = np.asarray(lost | ~data.valid[data.active].any(axis=0))
     readings = min(len(never), other.valid.shape[1])

@@ -30,19 +30,17 @@ from tmlattice.diagnosis.prepare import noise_of
 from tmlattice.diagnosis.result import MOST, Diagnosis, Finding, NextMeasurement
 from tmlattice.diagnosis.selection import freedom, select, select_changes
 from tmlattice.diagnosis.stages import (
+    Stage,
     held_out,
     held_out_shots,
     misfit_of,
-    pairs_of,
     seen_by,
     stages_of,
-    too_large,
-    trajectory_view,
     views_of,
 )
 from tmlattice.diagnosis.support import correlations_of
 from tmlattice.diagnosis.suspects import suspects
-from tmlattice.diagnosis.views import JointView
+from tmlattice.diagnosis.views import JointView, TrajectoryView
 from tmlattice.effects import (
     Cause,
     Effect,
@@ -61,6 +59,7 @@ from tmlattice.inference.newton import Outcome
 from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
+from tmlattice.inference.validation import Misfit
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.first_turns import FirstTurns
@@ -212,7 +211,10 @@ def _report(
 ) -> Diagnosis:
     """The diagnosis; without its causes if they are refuted, for this reason."""
     judgement, given = options.judgement, (ring, parts, problem, found, small, options, made)
-    found = finished(_by_ring(ring, problem, found))
+    found = finished(found)
+    at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}  # by their place in the ring
+    aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}
+    found = replace(found, monitors=aside)
     result = found.fit
     problem = problem.near(result.causes)
     # what counts turns late reads nothing in the first ones
@@ -237,30 +239,48 @@ def _report(
     kept = problem.without(found.dropped)
     stages = stages_of(kept, found, small, causes)
     views = views_of(parts, kept, stages)
-    aside = {ring.monitors[m].name for m in found.monitors}
     since = 0 if small is None else max(len(stages) - 2, 0)
     turns = parts[0] if parts[0].hypotheses is not None and len(parts) == 1 else None
     rejected: tuple[dict[str, Any], ...] = ()
     if turns is None:
-        heldout = held_out(parts, problem.fixed, stages, aside, since)
+        heldout = held_out(
+            parts, problem.fixed, stages, {ring.monitors[m].name for m in aside}, since
+        )
         # errors of held-out readings do not include undetermined distributed errors
         compared = compared_of(fitted, heldout if small is None else None)
-        stated = (f"{part.label}: {one}" for part in parts for one in part.messages)
+        stated = tuple(f"{part.label}: {one}" for part in parts for one in part.messages)
         notes = list(outlier_messages(parts, problem, found))
     else:
         heldout = held_out_shots(turns, problem, found, small, stages, since)
         compared = compared_of(fitted, heldout)
-        stated = (one for one in turns.messages)
+        stated = turns.messages
         rejected = rejected_readings(turns, found)
         notes = about_rejected(rejected)
         if turns.estimated:
-            notes.append(noise_text(_noise(parts)))
+            both = zip(_noise(parts), "xy", strict=True)
+            levels = [f"{micrometres(own)} in {plane}" for own, plane in both if np.isfinite(own)]
+            notes.append(f"the noise was estimated from the data: {', '.join(levels)}")
         notes += about_launches(turns, findings)
     if causes and stages[-1].share < 1:
         return _report(*given, refuted="no beam is stored with them and the distributed errors")
     if causes and heldout is not None and heldout.refutes:
         return _report(*given, refuted="with them the gap of the held-out readings stays")
-    warnings = [*stated, *notes, *messages, *too_large(stages)]
+    warnings = [*stated, *notes, *messages]
+    if (share := stages[-1].share) < 1:
+        warnings.append(
+            "no beam is stored with all of the estimated distributed errors: the residuals are for "
+            f"{share:.4g} of the last step to them"
+        )
+    view: JointView | TrajectoryView = JointView(found, views)
+    if turns is not None:
+        (own,) = kept.parts
+        assert isinstance(own, FirstTurns)
+        before, after = (stages[i].point.view[0].view.readings for i in (0, -1))
+        view = TrajectoryView(found, own, before, after, found.dropped.reshape(own.valid.shape))
+
+    def misfit(stage: Stage) -> Misfit:  # without the reference
+        return misfit_of([*zip(kept.parts[: len(parts)], stage.point.view, strict=False)])
+
     corrected = apply(ring, causes)
     errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
     return Diagnosis(
@@ -271,8 +291,8 @@ def _report(
             else one
             for one in with_consequences(ring, findings, causes)
         ),
-        fit_before=misfit_of(pairs_of(parts, kept, stages[0 if small is None else 1])),
-        fit_after=misfit_of(pairs_of(parts, kept, stages[-1])),
+        fit_before=misfit(stages[0 if small is None else 1]),
+        fit_after=misfit(stages[-1]),
         heldout=heldout,
         heldout_shots=() if turns is None else turns.shots[1],
         compared=compared,
@@ -302,7 +322,7 @@ def _report(
         errors=tuple(errors.tolist()),
         priors={} if small is None else dict(small.sizes),
         prior_errors={} if small is None else dict(small.errors),
-        view=JointView(found, views) if turns is None else trajectory_view(kept, found, stages),
+        view=view,
     )
 
 
@@ -327,13 +347,6 @@ def _next(
     return None
 
 
-def _by_ring(ring: Ring, problem: CombinedProblem, found: Explanation) -> Explanation:
-    """Rejected BPMs, by their place in the ring."""
-    at = {monitor.name: i for i, monitor in enumerate(ring.monitors)}
-    aside = {at[ring[problem.monitors[m]].name]: seen for m, seen in found.monitors.items()}
-    return replace(found, monitors=aside)
-
-
 def _noise(parts: Sequence[Part]) -> tuple[float, float]:
     """rms noise of a reading, m, of the first measurement with BPMs."""
     for part in parts:
@@ -348,13 +361,8 @@ def _noise(parts: Sequence[Part]) -> tuple[float, float]:
 
 
 def with_silent(ring: Ring, part: Part, measured: Any) -> Part:
-    """The part, with a message about BPMs of its measurement without usable readings.
-
-    Args:
-        ring: with the monitors.
-        part: made of the measurement; dead BPMs become findings, and are not reported again.
-        measured: of any kind; one without monitors has no message.
-    """
+    """The part, with a message about BPMs of its measurement without usable readings; dead ones
+    become findings."""
     problem = part.problem
     owners = problem.owner()
     heard = {
@@ -402,13 +410,6 @@ def rejected_readings(part: Part, found: Explanation) -> tuple[dict[str, Any], .
             "plane": "xy"[plane],
         })  # fmt: skip
     return tuple(rows)
-
-
-def noise_text(noise: tuple[float, float]) -> str:
-    """A message that the noise of both planes, m, was estimated."""
-    both = zip(noise, "xy", strict=True)
-    levels = [f"{micrometres(own)} in {plane}" for own, plane in both if np.isfinite(own)]
-    return f"the noise was estimated from the data: {', '.join(levels)}"
 
 
 def about_launches(part: Part, findings: Sequence[Finding]) -> list[str]:

@@ -133,13 +133,14 @@ def recommended_actions(
     for cause, share in zip(causes, np.asarray(probability).tolist(), strict=True):
         lead = leading(ring, cause)
         key = (lead.effect, pieces_of(ring, lead.element))
-        own = ((cause.effect, share),)
-        if key in found:
-            known = found[key]
+        if (known := found.get(key)) is not None:
+            shares = dict(known.mechanisms)
+            thin = known.effect not in shares
+            # of the same effect, in other pieces, added up
+            shares[cause.effect] = shares.get(cause.effect, 0.0) + share
             known = replace(
-                known, probability=known.probability + share, mechanisms=_more(known, *own)
+                known, probability=known.probability + share, mechanisms=tuple(shares.items())
             )
-            thin = known.effect not in [effect for effect, _ in found[key].mechanisms]
             if thin and cause.effect == lead.effect and lead.element == known.element:
                 # its own fit is better than a converted thin one
                 known = replace(known, amount=lead.amount, strength=_strength(ring, lead))
@@ -150,29 +151,25 @@ def recommended_actions(
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
         found[key] = RecommendedAction(
             lead.effect, lead.element, key[1], element_kind(ring, lead.element), lead.amount,
-            error, share, own, _strength(ring, lead),
+            error, share, ((cause.effect, share),), _strength(ring, lead),
         )  # fmt: skip
     if not found:
         return ()
     first, *rest = found.values()
-    return (first, *sorted(rest, key=lambda recommended_action: -recommended_action.probability))
+    return (first, *sorted(rest, key=lambda action: -action.probability))
 
 
-def _more(known: RecommendedAction, mechanism: tuple[str, float]) -> tuple[tuple[str, float], ...]:
-    """Mechanisms with one more; those of the same effect (in other pieces) added up."""
-    shares = dict(known.mechanisms)
-    shares[mechanism[0]] = shares.get(mechanism[0], 0.0) + mechanism[1]
-    return tuple(shares.items())
+def fewest(probability: Sequence[float] | Array, mass: float) -> int:
+    """How many, by falling probability, reach the mass."""
+    return int(np.searchsorted(np.cumsum(probability), mass)) + 1
 
 
 def credible(
     recommended_actions: Sequence[RecommendedAction], mass: float
 ) -> tuple[RecommendedAction, ...]:
     """The fewest actions whose probabilities reach the mass, the first one first."""
-    order = sorted(
-        recommended_actions, key=lambda recommended_action: -recommended_action.probability
-    )
-    count = int(np.searchsorted(np.cumsum([r.probability for r in order]), mass)) + 1
+    order = sorted(recommended_actions, key=lambda action: -action.probability)
+    count = fewest([action.probability for action in order], mass)
     return (recommended_actions[0], *(r for r in order[:count] if r is not recommended_actions[0]))
 
 

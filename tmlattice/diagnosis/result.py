@@ -308,7 +308,7 @@ class Diagnosis(Speaks):
     )
 
     def _told(self) -> tuple[str, dict[str, str]]:
-        explained = None if self.heldout is None else self.heldout.explained
+        explained = self.heldout and self.heldout.explained
         rows = {"of": f"{self.kind} of {last_part(self.ring.name)}"}
         for number, finding in enumerate(self.findings[:MOST], 1):
             rows[f"finding {number}"] = finding.in_short
@@ -459,10 +459,7 @@ class Diagnosis(Speaks):
         Raises:
             KeyError: it is not among the causes.
         """
-        for cause, _, support in self.supported:
-            if (cause.effect, cause.element) == (effect, element):
-                return support
-        raise KeyError((effect, element))
+        return self._supported(effect, element)[2]
 
     def error(self, effect: str, element: str | None) -> tuple[float, float]:
         """Amount and standard error of a cause.
@@ -470,9 +467,13 @@ class Diagnosis(Speaks):
         Raises:
             KeyError: it is not among the causes.
         """
-        for cause, sigma in zip(self.causes, self.errors, strict=True):
-            if (cause.effect, cause.element) == (effect, element):
-                return cause.amount, sigma
+        cause, sigma, _ = self._supported(effect, element)
+        return cause.amount, sigma
+
+    def _supported(self, effect: str, element: str | None) -> tuple[Cause, float, Support]:
+        for own in self.supported:
+            if (own[0].effect, own[0].element) == (effect, element):
+                return own
         raise KeyError((effect, element))
 
     @property
@@ -519,7 +520,6 @@ class Diagnosis(Speaks):
                 "correctors": self.correctors_held_out,
                 "lost": gap.lost,
             }
-        interval = None if gap is None or gap.interval is None else list(gap.interval)
         return {
             "noise": float(np.sqrt(np.mean(np.square(self.noise)))),
             "readings_noise": {
@@ -529,10 +529,9 @@ class Diagnosis(Speaks):
             },
             "fit": both(self.fit_before, self.fit_after),
             "heldout": heldout,
-            "explained": None
-            if gap is None
-            else gap.explained,  # null without amounts in the model
-            "explained_interval": interval,
+            # null without amounts in the model
+            "explained": gap and gap.explained,
+            "explained_interval": gap and gap.interval and list(gap.interval),
         }
 
     def as_json(self) -> dict[str, Any]:

@@ -66,6 +66,11 @@ def wrong(name: str, sentence: str, **more: Any) -> Check:
     return Check(name, "wrong", sentence, **more)
 
 
+def noted(name: str, sentence: str, otherwise: str) -> Check:
+    """A check with a note; without a sentence it passed."""
+    return note(name, sentence) if sentence else fine(name, otherwise)
+
+
 @dataclass(frozen=True)
 class Checkup:
     """All checks of a measurement.
@@ -153,11 +158,10 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
     if not np.count_nonzero(values[there]):
         text = "every reading is zero: nothing was read; give the readings of a beam"
         return [wrong("frozen BPMs", text)]
-    checks: list[Check] = []
     pairs = values[there.all(axis=2)]
     if len(pairs) > 1 and pairs.any() and (pairs[:, 0] == pairs[:, 1]).all():
         text = "x and y are the same to the last digit: one is a copy; give what was read in both"
-        return [*checks, wrong("planes", text)]
+        return [wrong("planes", text)]
     if moved and there.any(axis=(0, 1)).all():
         x, y = (float(np.median(np.abs(values[..., p][there[..., p]]))) for p in (0, 1))
         if max(x, y) > LARGEST_READING and min(x, y) < SENSIBLE / 10:
@@ -165,19 +169,15 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
                 f"x and y are in different units: the typical reading is {x:.2g} m in x and {y:.2g}"
                 " m in y; give both in metres"
             )
-            return [*checks, wrong("planes", text)]
-    checks.append(planes(np.asarray(there.any(axis=(0, 1)))))
+            return [wrong("planes", text)]
+    checks = [planes(np.asarray(there.any(axis=(0, 1))))]
     silent = [
         n for n, own in zip(names, np.asarray(there.any(axis=(0, 2))), strict=True) if not own
     ]
+    text = f"no reading of {first_of(silent)}" if silent else ""
     if len(silent) > DEFAULT.silent * len(names):
         text = f"{len(silent)} of {len(names)} BPMs have no reading; they are ignored"
-        checks.append(note("silent BPMs", text))
-    elif silent:
-        text = f"no reading of {first_of(silent)}"
-        checks.append(note("silent BPMs", text))
-    else:
-        checks.append(fine("silent BPMs", f"each of {len(names)} BPMs has a reading"))
+    checks.append(noted("silent BPMs", text, f"each of {len(names)} BPMs has a reading"))
     many = there.sum(axis=0) > 2
     with np.errstate(invalid="ignore"):
         high = np.where(there, values, -np.inf).max(axis=0)
@@ -195,18 +195,12 @@ def monitors(ring: Ring, names: Sequence[str], values: Array, moved: bool = True
             "reading was copied over the others; give what was read each time"
         )
         checks.append(wrong("frozen BPMs", text))
-    elif frozen:
+    else:
         text = f"the same reading again and again: {first_of(frozen)}; leave the signal out"
-        checks.append(note("frozen BPMs", text))
-    else:
-        checks.append(fine("frozen BPMs", "no BPM is frozen"))
+        checks.append(noted("frozen BPMs", text if frozen else "", "no BPM is frozen"))
     copies = _copies(ring, names, values, stuck)
-    if copies:
-        text = f"the same readings, to the last digit, of {first_of(copies)}; one of them is a copy"
-        checks.append(note("copied BPMs", text))
-    else:
-        checks.append(fine("copied BPMs", "no two BPMs read the same"))
-    return checks
+    text = f"the same readings, to the last digit, of {first_of(copies)}; one of them is a copy"
+    return [*checks, noted("copied BPMs", text if copies else "", "no two BPMs read the same")]
 
 
 def _copies(ring: Ring, names: Sequence[str], values: Array, stuck: Flags) -> list[str]:
@@ -236,14 +230,15 @@ def first_turns(ring: Ring, data: Measurement, lost: LostBeam[Measurement]) -> l
         lost: where these begin.
     """
     there = np.asarray(np.isfinite(data.readings).any(axis=3))  # [shot, turn, monitor]
-    checks = [_turns(there)]
-    if checks[0].status == "wrong":
-        return checks
+    read = _turns(there)
+    if read.status == "wrong":
+        return [read]
     if len(lost.shots):
-        return [*checks, note("lost beam", _no_signal(ring, lost))]
+        return [read, note("lost beam", _no_signal(ring, lost))]
     count, turns = there.shape[2], there.shape[1]
     last = [np.flatnonzero(own.ravel()) for own in there]
     stops = [i for i, own in enumerate(last) if len(own) and own[-1] < turns * count - CUT]
+    text = ""
     if stops:
         shot = stops[0]
         others = f"; so have {len(stops) - 1} others" if len(stops) > 1 else ""
@@ -252,10 +247,7 @@ def first_turns(ring: Ring, data: Measurement, lost: LostBeam[Measurement]) -> l
             f"{others}: the beam was lost there, or the BPMs behind did not record; it is "
             "used up to there"
         )
-        checks.append(note("lost beam", text))
-    else:
-        checks.append(fine("lost beam", "every shot is read to its end"))
-    return checks
+    return [read, noted("lost beam", text, "every shot is read to its end")]
 
 
 def _no_signal(ring: Ring, lost: LostBeam[Measurement]) -> str:

@@ -12,7 +12,7 @@ from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
-from tmlattice.diagnosis.views import PartView, TrajectoryView, numbers_read
+from tmlattice.diagnosis.views import PartView, numbers_read
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import CombinedProblem
@@ -101,17 +101,6 @@ def _settled(
     return Stage(some, own, point, share)
 
 
-def too_large(stages: Sequence[Stage]) -> list[str]:
-    """The message that a part of the distributed errors is not in the last model, or empty."""
-    share = stages[-1].share
-    if share == 1:
-        return []
-    return [
-        f"no beam is stored with all of the estimated distributed errors: the residuals "
-        f"are for {share:.4g} of the last step to them"
-    ]
-
-
 def _left(problem: Problem, point: Point, among: Flags | None = None) -> tuple[Array, Array]:
     """Residuals in units of the noise, and the noise, of all or some readings of a problem."""
     there = problem.valid if among is None else problem.valid & among
@@ -156,13 +145,6 @@ def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = (
     return Misfit(rms, float(np.mean(every**2)) if len(every) else float("nan"))
 
 
-def pairs_of(
-    parts: Sequence[Part], problem: CombinedProblem, stage: Stage
-) -> list[tuple[Problem, Point]]:
-    """The misfit of the measurements without their reference."""
-    return [(problem.parts[i], stage.point.view[i]) for i in range(len(parts))]
-
-
 def held_out(
     parts: Sequence[Part],
     fixed: tuple[Cause, ...],
@@ -183,12 +165,9 @@ def held_out(
     for stage in stages:
         pairs, among = [], []
         for judge in judges:
-            seen = [
-                c
-                for c in (*fixed, *stage.static, *stage.causes)
-                if judge.sees((c.effect, c.element))
-            ]
-            there = replace(judge, fixed=tuple(seen))
+            causes = (*fixed, *stage.static, *stage.causes)
+            seen = tuple(c for c in causes if judge.sees((c.effect, c.element)))
+            there = replace(judge, fixed=seen)
             scored = there.owner() % 2 == 1
             gives = fit_nuisances(there.without(scored), (), there.first)
             pairs.append((there, there.at((), gives.nuisances)))
@@ -238,19 +217,12 @@ def held_out_shots(
 
 
 def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stage) -> Array | None:
-    """Return the covariance of the prediction of other shots.
+    """The covariance of the prediction of other shots, [shot * reading * 2] twice, m^2; None where
+    their beam is lost.
 
     Of the distributed errors their posterior covariance, and of the amounts of the causes: as in
-    universal kriging (Matheron 1969), whose drift launches and amounts are.
-
-    Args:
-        small: the distributed errors of the explanation.
-        explained: the fit of these shots.
-        other: of the other shots, with the distributed errors in its model.
-        stage: the model.
-
-    Returns:
-        [shot * reading * 2] twice, m^2; None where the beam of the other shots is lost.
+    universal kriging (Matheron 1969), whose drift launches and amounts are. `explained` is the fit
+    of the first shots; `other` has the distributed errors in its model.
     """
     among = small.problem
     point = other.at(stage.causes, other.data.launches)
@@ -272,17 +244,6 @@ def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stag
         )
         unknown += drift.T @ explained.covariance[np.ix_(for_each, for_each)] @ drift
     return np.asarray(unknown)
-
-
-def trajectory_view(
-    problem: CombinedProblem, found: Explanation, stages: Sequence[Stage]
-) -> TrajectoryView:
-    """The view of first turns, for plots."""
-    (own,) = problem.parts
-    assert isinstance(own, FirstTurns)
-    before, after = (stages[i].point.view[0].view.readings for i in (0, -1))
-    dropped = found.dropped.reshape(own.valid.shape)
-    return TrajectoryView(found, own, before, after, dropped)
 
 
 def seen_by(

@@ -44,22 +44,13 @@ class Support:
 
 
 def share_from_data(sigma: float, prior: float) -> float:
-    """Return 1 - posterior variance / prior variance, from 0 to 1.
-
-    Args:
-        sigma, prior: posterior and prior rms, in one unit.
-    """
+    """Return 1 - posterior variance / prior variance, from 0 to 1, of two rms in one unit."""
     return min(max(1 - (sigma / prior) ** 2, 0.0), 1.0) if prior > 0 else 0.0
 
 
 def share_of_fault(effect: str | None, sigma: float | None) -> float | None:
     """Return the share from the data of a fault, which before them may be as large as the largest
-    of its effect; None for an amount without an error.
-
-    Args:
-        effect: of the catalogue.
-        sigma: standard error, in the effect's unit.
-    """
+    of its effect; None for an amount without a standard error, in the effect's unit."""
     if effect is None or sigma is None:
         return None
     return share_from_data(sigma, find(effect).largest)
@@ -89,12 +80,8 @@ class Correlation:
 
 
 def correlations_of(amounts: Sequence[Hypothesis], covariance: Array) -> tuple[Correlation, ...]:
-    """The pairs with the strongest correlations, from `STRONG` on.
-
-    Args:
-        amounts: effect and element of each.
-        covariance: of their errors, [amount, amount].
-    """
+    """The pairs with the strongest correlations, from `STRONG` on, by the covariance of the errors,
+    [amount, amount]."""
     sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     known = np.flatnonzero(sigma > 0)
     matrix = covariance[np.ix_(known, known)] / sigma[known, None] / sigma[known]

@@ -67,13 +67,8 @@ Candidate = tuple[str | None, str, float]
 
 
 def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tuple[Suspect, ...]:
-    """Return the first suspects of each kind: of the search, then of the scan.
-
-    Args:
-        ring: the design.
-        explanation: that does not explain the data.
-        judgement: its thresholds.
-    """
+    """Return the first suspects of each kind, where the explanation does not explain the data: of
+    the search, then of the scan."""
     found: dict[tuple[SuspectKind, object], Suspect] = {}
     places = {element.name: element for element in ring.elements}
     threshold = explanation.scan.threshold(judgement.false_alarm)

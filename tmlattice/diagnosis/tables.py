@@ -60,7 +60,7 @@ class Tables(Mapping[str, Any]):
         return list(_TABLES)
 
 
-def _frame(rows: list[dict[str, Any]], columns: list[str]) -> Any:
+def _frame(rows: list[Any], columns: list[str]) -> Any:
     import pandas as pd
 
     return pd.DataFrame(rows, columns=columns)
@@ -91,24 +91,17 @@ def _findings(diagnosis: Diagnosis) -> Any:
 def _errors(diagnosis: Diagnosis) -> Any:
     places = {element.name: element.s for element in diagnosis.ring.elements}
     rows = [
-        {
-            "effect": cause.effect,
-            "element": cause.element,
-            "device": diagnosis.devices.get(cause.element or ""),
-            "s": places.get(cause.element or "", np.nan),
-            "amount": cause.amount,
-            "sigma": sigma,
-            "unit": find(cause.effect).unit,
-            "share_from_data": support.share_from_data,
-            "determined": support.determined,
-        }
+        (
+            cause.effect, cause.element, diagnosis.devices.get(cause.element or ""),
+            places.get(cause.element or "", np.nan), cause.amount, sigma, find(cause.effect).unit,
+            support.share_from_data, support.determined,
+        )
         for cause, sigma, support in diagnosis.supported
-    ]
-    columns = [
+    ]  # fmt: skip
+    return _frame(rows, [
         "effect", "element", "device", "s", "amount", "sigma", "unit", "share_from_data",
         "determined",
-    ]  # fmt: skip
-    return _frame(rows, columns)
+    ])  # fmt: skip
 
 
 def _of_kind(diagnosis: Diagnosis, which: str) -> Any:
@@ -159,9 +152,11 @@ def _optics(diagnosis: Diagnosis) -> Any:
 
 
 def _steps(diagnosis: Diagnosis) -> Any:
-    kept = [(step, True) for step in diagnosis.steps]
-    rows = [record_of(step) | {"kept": own} for step, own in
-            [*kept, *((step, False) for step in diagnosis.rejected_steps)]]  # fmt: skip
+    rows = [
+        record_of(step) | {"kept": kept}
+        for kept, steps in ((True, diagnosis.steps), (False, diagnosis.rejected_steps))
+        for step in steps
+    ]
     columns = [
         "effect", "parameters", "kept", "heldout_rms_in_plane", "heldout_rms_position",
         "heldout_rms_coupling", "heldout_rms_roll", "heldout_chi2_per_dof", "dispersion_rms",

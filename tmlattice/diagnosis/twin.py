@@ -221,16 +221,17 @@ def read_known(path: Path, ring: Ring) -> DistributedErrors:
 def _directions(path: Path, seen: Mapping[str, Any], errors: int) -> Array:
     """Orthonormal again after the rounding."""
     count = int(seen["directions"])
+    damaged = MeasurementError(f"{path}: its directions are damaged; write it anew")
     try:
         raw = binascii.a2b_base64(seen["float32"], strict_mode=True)
         rows = np.frombuffer(raw, dtype="<f4").astype(float).reshape(count, errors)
     except ValueError:
-        raise MeasurementError(f"{path}: its directions are damaged; write it anew") from None
+        raise damaged from None
     if len(seen["share"]) != count or not np.isfinite(rows).all() or count > errors:
-        raise MeasurementError(f"{path}: its directions are damaged; write it anew")
+        raise damaged
     gram = rows @ rows.T
     if np.abs(gram - np.eye(count)).max(initial=0.0) > ROUNDED:
-        raise MeasurementError(f"{path}: its directions are damaged; write it anew")
+        raise damaged
     return np.asarray(
         1.5 * rows - 0.5 * gram @ rows
     )  # Newton's step: the remaining error is its square

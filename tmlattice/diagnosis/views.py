@@ -38,12 +38,7 @@ class NumberRead:
 
 
 def numbers_read(own: Problem, before: Point, after: Point) -> tuple[NumberRead, ...]:
-    """The numbers of a problem of tunes; empty for any other.
-
-    Args:
-        own: the problem of one measurement.
-        before, after: of the design and of the result.
-    """
+    """The numbers of a problem of tunes by the design and by the result; empty for any other."""
     if not isinstance(own, TuneReadings):
         return ()
     read_numbers = []
