@@ -27,16 +27,12 @@ constructors would take a file's own use of them for these."""
 
 
 def at_element(fields: Mapping[str, Any], place: int, energy: float, messages: Counter[str]) -> Any:
-    """The element.
+    """Return the element; LatticeError: AT cannot make it.
 
     Args:
-        fields: of the structure.
         place: in the lattice, from 0, for errors.
         energy: of the ring, GeV.
         messages: what was done, counted; added to.
-
-    Raises:
-        LatticeError: AT cannot make it.
     """
     if not isinstance(fields, Mapping):
         raise LatticeError(f"element {place + 1} of the lattice is no structure; save it again")

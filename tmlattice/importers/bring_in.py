@@ -122,8 +122,14 @@ def bring_in(
     matlab = [(path, read_mat(path)) for path in known if path.suffix.lower() in MATLAB]
     hdf5 = [(path, read_hdf5(path)) for path in known if path.suffix.lower() in HDF5]
     try:
-        some = _framed(frames[0], options) if frames else None
-        brought = some or _bring(files, matlab, hdf5, options)
+        if frames and (written := of_document(as_frame(frames[0]))) is not None:
+            brought = Imported(
+                written, _ring(options), ("everything is as `to_dataframe` wrote it",)
+            )
+        elif frames:
+            brought = _table(frames[0], _ring(options), options)
+        else:
+            brought = _bring(files, matlab, hdf5, options)
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
         if isinstance(error, TmlatticeError):
             raise
@@ -299,15 +305,6 @@ def _table(source: Path | Any, ring: Ring | None, options: Options) -> Imported:
         return bring_table(name, columns, ring, options.stated)
     stated = with_unit(options.stated, options.unit, options.noise)
     return bring_readings(name, columns, ring, stated)
-
-
-def _framed(frame: Any, options: Options) -> Imported:
-    """As of `to_dataframe`, or as a table of a file."""
-    ring = _ring(options)
-    written = of_document(as_frame(frame))
-    if written is not None:
-        return Imported(written, ring, ("everything is as `to_dataframe` wrote it",))
-    return _table(frame, ring, options)
 
 
 def _turns(path: Path, ring: Ring | None, options: Options) -> Imported:

@@ -81,7 +81,13 @@ def read_columns(path: Path | Any) -> list[Column]:
     if suffix in HDF5:
         found = _hdf5(path)
     elif is_sdds(path):
-        found = _sdds(path)
+        try:
+            arrays = read_apart("sdds", path, "SDDS", MeasurementError)
+        except MeasurementError as error:
+            raise MeasurementError(
+                f"{error}; a turn-by-turn file is read by `tmlattice import --turns KIND`"
+            ) from error
+        found = _apart(path, arrays)
     else:
         found = _csv(path)
     if not found or not found[0].values:
@@ -236,17 +242,6 @@ def of_matlab(path: Path, content: Mapping[str, Any]) -> list[Column]:
             arrays[name] = np.asarray(value), ""
 
     take("", dict(content))
-    return _apart(path, arrays)
-
-
-def _sdds(path: Path) -> list[Column]:
-    """Columns and arrays."""
-    try:
-        arrays = read_apart("sdds", path, "SDDS", MeasurementError)
-    except MeasurementError as error:
-        raise MeasurementError(
-            f"{error}; a turn-by-turn file is read by `tmlattice import --turns KIND`"
-        ) from error
     return _apart(path, arrays)
 
 

@@ -61,13 +61,8 @@ class Plane:
 
 
 def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]:
-    """What the data confirm and what they contradict, given the ring's own response; a sentence
-    each.
-
-    Args:
-        ring: the design, with the measurement's names.
-        measured: the response.
-    """
+    """What the data confirm and what they contradict, given the design's response; a sentence each
+    (ring: the design, with the measurement's names)."""
     try:
         told = [check.sentence for check in check_data(ring, measured).reported]
         told += _per_kick(OfResponse(ring, replace(measured, rf=None)))
@@ -80,10 +75,15 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
         if abs(np.median(own.columns())) < MOST:
             continue
         told += _single(own)
-        if plane == "x":
-            agreed, not_so = _frequency(own, _plane(flat, measured, plane))
-            confirmed += agreed
-            told += not_so
+        if plane != "x":
+            continue
+        # with gains free: was the frequency or the momentum constant?
+        left, other = (1e6 * _left(fit) for fit in (own, _plane(flat, measured, plane)))
+        what = f"with gains free, {left:.3g} µm are left in x, and {other:.3g} at a fixed momentum"
+        if left < other / CLEARER:
+            confirmed.append(f"the data agree that the frequency stood still: {what}")
+        elif other < left / CLEARER:
+            told.append(f"the momentum stood still, and not the frequency: {what}")
     return confirmed, told
 
 
@@ -149,18 +149,6 @@ def _single(own: Plane) -> list[str]:
         if i < k and min(monitors[i, k], monitors[k, i]) > SURE
     ]
     return said
-
-
-def _frequency(fixed: Plane, momentum: Plane) -> tuple[list[str], list[str]]:
-    """Whether the frequency stood still, or the momentum did: which of them leaves less in x, with
-    a gain free for each monitor and each corrector."""
-    left, other = (1e6 * _left(own) for own in (fixed, momentum))
-    told = f"with gains free, {left:.3g} µm are left in x, and {other:.3g} at a fixed momentum"
-    if left < other / CLEARER:
-        return [f"the data agree that the frequency stood still: {told}"], []
-    if other < left / CLEARER:
-        return [], [f"the momentum stood still, and not the frequency: {told}"]
-    return [], []
 
 
 def _left(own: Plane) -> float:

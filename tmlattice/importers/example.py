@@ -62,7 +62,9 @@ def write_example(folder: Path, lattice: str, ring: Ring, measurement: Measureme
             for i, plane in enumerate("xy"):
                 file[plane] = readings[:, :, i]
                 file[plane].attrs["unit"] = "mm"
-        columns, response = calibrated_response(ring, [], _correctors(ring))
+        # one corrector in each plane where there are any
+        found = {e.kind: e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")}
+        columns, response = calibrated_response(ring, [], list(found.values()) or None)
         every = [monitor.name for monitor in ring.monitors]
         _write(
             place / "response.csv",
@@ -82,12 +84,6 @@ def write_example(folder: Path, lattice: str, ring: Ring, measurement: Measureme
             {"knob": "qd", "unit": "A", "present": 100.0, "curve": [[0, 0], [120, -0.6]]},
         )
         (place / "tmlattice.toml").write_text(text, encoding="utf-8")
-
-
-def _correctors(ring: Ring) -> list[str] | None:
-    """One in each plane where there are any."""
-    found = {e.kind: e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")}
-    return list(found.values()) or None
 
 
 def _text(value: float) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.importers.imported import Imported, device_names, numbers
-from tmlattice.importers.matlab_ring import Elements, Roles, planes_by, ring_of_elements
+from tmlattice.importers.matlab_ring import Elements, planes_by, ring_of_elements
 from tmlattice.input_files import MOST_DIGITS, json_of, short
 from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement import OrbitResponse
@@ -91,8 +91,6 @@ def bring_hdf5(
     Args:
         parts: paths and contents, of `read_hdf5`: the response, and where there are the dispersion
             and the noise.
-        mapping: of `read_mapping`.
-        lattice: the model.
 
     Raises:
         MeasurementError: no response, a name that the mapping lacks, or shapes that do not fit.
@@ -119,9 +117,7 @@ def bring_hdf5(
     rows = 2 * len(monitors)
     kicks = planes_by(mapping[name] for name in names)
     own = {mapping[name]: name.lower() for name in names}
-    placed = ring_of_elements(
-        lattice.fields, lattice.name, lattice.energy, Roles(monitors, kicks, own)
-    )
+    placed = ring_of_elements(lattice.fields, lattice.name, lattice.energy, monitors, kicks, own)
     steps = numbers(data.get("inputs_delta"), "inputs_delta", (len(names),))
     change, of_orbits = _orbits(data, steps, rows)
     noise, of_noise = _noise(parts, data, len(monitors))
@@ -153,6 +149,12 @@ def _with(parts: Sequence[tuple[Path, Mapping[str, Any]]], name: str) -> Mapping
     return next((content for _, content in parts if name in content), None)
 
 
+def _by_plane(data: Mapping[str, Any], name: str, monitors: int) -> Array:
+    """Two arrays of a file, of x and y, [monitor, 2]."""
+    planes = (numbers(data.get(f"{name}{p}"), f"{name}{p}", (monitors,)) for p in "xy")
+    return np.stack(list(planes), axis=1)
+
+
 def _orbits(data: Mapping[str, Any], steps: Array, rows: int) -> tuple[Array, str]:
     """Orbit changes, m, [row, column]."""
     shape = rows, len(steps)
@@ -173,9 +175,7 @@ def _noise(
     found = _with(parts, "Noise_BPMx")
     if found is None:
         return None, "no noise is given (Noise_BPMx)"
-    orbit = np.stack(
-        [numbers(found.get(f"Noise_BPM{p}"), f"Noise_BPM{p}", (monitors,)) for p in "xy"], axis=1
-    )
+    orbit = _by_plane(found, "Noise_BPM", monitors)
     shots = int(data.get("shots_per_orbit", 1))
     if not 1 <= shots <= MOST_SHOTS:
         raise MeasurementError(f"shots_per_orbit is {shots}; it should be from 1 to {MOST_SHOTS}")
@@ -192,10 +192,7 @@ def _rf(
     step = None if found is None else found.get("rf_full_step")
     if found is None or step is None or lattice.harmonic is None or lattice.frequency is None:
         return None, "no response to the RF's step is given (measured_eta_x with rf_full_step)"
-    orbit = np.stack(
-        [numbers(found.get(f"measured_eta_{p}"), f"measured_eta_{p}", (monitors,)) for p in "xy"],
-        axis=1,
-    )
+    orbit = _by_plane(found, "measured_eta_", monitors)
     return RfStep(lattice.frequency, lattice.harmonic, float(step), orbit), (
         "measured_eta is the orbit change, m, for rf_full_step, Hz, from one side to the other"
     )

@@ -51,12 +51,7 @@ class Imported:
 
 
 def numbers(value: Any, what: str, shape: Sequence[int] | None = None) -> Array:
-    """Something of a file as an array of numbers.
-
-    Args:
-        value: of the file.
-        what: its name, for the error.
-        shape: that it must have; None: any.
+    """Something of a file as an array of numbers, of a shape (None: any); `what` names it.
 
     Raises:
         MeasurementError: it holds no numbers, complex ones, or has another shape (dimensions of one
@@ -83,16 +78,8 @@ Shape = Mapping[str, Any]
 
 
 def check_fields(content: Any, shape: Shape, place: str) -> None:
-    """Whether the fields of a structure that are there have their types.
-
-    Args:
-        content: of the file.
-        shape: of it.
-        place: its name, for the error.
-
-    Raises:
-        MeasurementError: a field of another type, by its name.
-    """
+    """Whether the fields of a structure that are there have their types; MeasurementError: another
+    type, by the field's name in `place`."""
     if not isinstance(content, Mapping):
         raise MeasurementError(f"{place} should be a structure with {', '.join(shape)}")
     for name, kind in shape.items():
@@ -146,11 +133,8 @@ def counted(names: Sequence[str], most: int = 8) -> str:
 
 
 def device_names(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Names of the control system by names of the lattice; those that are the same are left out.
-
-    Args:
-        pairs: name in the lattice, name in the control system; several of one element are joined.
-    """
+    """Names of the control system by names of the lattice, of pairs (lattice, control system);
+    those that are the same are left out, several of one element are joined."""
     found: dict[str, list[str]] = {}
     for name, device in pairs:
         own = found.setdefault(name, [])
@@ -186,7 +170,6 @@ def write_imported(brought: Imported, folder: Path, force: bool = False) -> None
     """Write the measurement folder, with `lattice.json` where there is a ring, as a whole.
 
     Args:
-        brought: what to write.
         folder: made where it is not there.
         force: a measurement or lattice that is there already is replaced.
 

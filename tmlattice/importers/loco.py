@@ -30,7 +30,7 @@ from tmlattice.importers.imported import (
     numbers,
 )
 from tmlattice.importers.loco_forms import usual_form
-from tmlattice.importers.matlab_ring import Placed, Roles, planes_by, ring_of_elements
+from tmlattice.importers.matlab_ring import Placed, planes_by, ring_of_elements
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
 
@@ -59,7 +59,6 @@ def bring_loco(
 
     Args:
         content: its variables, of `read_mat`.
-        path: of the file, for names and errors.
         iteration: "first": the lattice with the parameters with which the fit began, the model
             before it; "last": the lattice as the file has it, which is as the fit left it.
         keep_bad: take monitors and correctors too that the good lists leave out.
@@ -94,7 +93,8 @@ def bring_loco(
         elements,
         path.name.split(".")[0],
         _energy(lattice, elements),
-        Roles(tuple(at_monitor.tolist()), kicks),
+        at_monitor.tolist(),
+        kicks,
     )
     good, of_lists = _good(monitors, correctors, reads, kickers, placed, keep_bad)
     measured = OrbitResponse(
@@ -104,13 +104,17 @@ def bring_loco(
         energy=placed.ring.energy,
         devices=_device_names(data, reads, kickers, placed),
     )
+    unkicked = sum(
+        int(np.count_nonzero(_steps(correctors, letter, len(kickers[plane])) == 0))
+        for plane, letter in LETTERS.items()
+    )
     return Imported(
         measured,
         replace(placed.ring, model=model),
         assumed=(*conventions(flags, measured), *of_form, *of_lists, of_lattice, *placed.messages),
         doubts=(
             *_computed(data, content.get("LocoModel"), good),
-            *_unkicked(correctors, kickers),
+            *([f"{unkicked} correctors have a step of 0 and are left out"] if unkicked else []),
         ),
     )
 
@@ -180,11 +184,8 @@ def _elements(
         tables = [_settings(step) for step in steps]
         agreed = [k for k, table in enumerate(tables) if _agree(elements, table)]
         if not agreed:
-            return (
-                elements,
-                f"{as_it_is}: its numbers are those of no iteration of the fit",
-                unknown,
-            )
+            of_none = f"{as_it_is}: its numbers are those of no iteration of the fit"
+            return elements, of_none, unknown
         if iteration == "last":
             return (
                 elements,
@@ -372,15 +373,6 @@ def _steps(correctors: Fields, letter: str, count: int) -> Array:
     if len(steps) != count:
         raise MeasurementError(f"{letter}CMKicks has {len(steps)} steps, not {count}")
     return steps
-
-
-def _unkicked(correctors: Fields, kickers: Mapping[str, Indices]) -> list[str]:
-    """Correctors without a step, which no response can be of."""
-    count = sum(
-        int(np.count_nonzero(_steps(correctors, letter, len(kickers[plane])) == 0))
-        for plane, letter in LETTERS.items()
-    )
-    return [f"{count} correctors have a step of 0 and are left out"] if count else []
 
 
 def _spread(

@@ -4,7 +4,7 @@ The usual form is that of `importers.loco`. What cannot be determined is left as
 reader rejects it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -32,12 +32,8 @@ USUAL_ENERGY = 3.0
 
 
 def usual_form(content: Fields, energy: float | None = None) -> tuple[dict[str, Any], list[str]]:
-    """The variables of a LOCO file in the usual form, and what was done; a sentence each.
-
-    Args:
-        content: the variables, of `read_mat`.
-        energy: GeV, that the user names.
-    """
+    """The variables of a LOCO file in the usual form, and what was done; a sentence each. `energy`:
+    GeV, that the user names."""
     said: list[str] = []
     new = dict(content)
     ring = new.get("RINGData")
@@ -137,7 +133,11 @@ def _rf(new: dict[str, Any], said: list[str]) -> None:
         frequencies = [harmonics[0] * turn]
         said.append(f"no frequency is given: {frequencies[0]:.9g} Hz, by harmonic and length")
     if harmonics and frequencies:
-        _frequency(data, frequencies, harmonics[0] * turn, said)
+        first = frequencies[0]
+        if abs(1e6 * first / (harmonics[0] * turn) - 1) < SAME_RF:
+            said.append(f"an RF of {first:g} Hz would be that of another ring: it is taken in MHz")
+            data["RF"] = 1e6 * first
+        data.setdefault("RF", first)
         ring.setdefault("CavityHarmNumber", harmonics[0])
     for cavity in cavities:
         if harmonics and frequencies:
@@ -156,16 +156,6 @@ def _is_cavity(element: Fields) -> bool:
     known = any(is_number(element.get(name)) for name in ("Frequency", "HarmNumber", "Voltage"))
     by_method = "Cavity" in str(element.get("PassMethod"))
     return known or by_method or element.get("Class") == "RFCavity"
-
-
-def _frequency(
-    data: dict[str, Any], given: Sequence[float], expected: float, said: list[str]
-) -> None:
-    """`RF` in Hz."""
-    if abs(1e6 * given[0] / expected - 1) < SAME_RF:
-        said.append(f"an RF of {given[0]:g} Hz would be that of another ring: it is taken in MHz")
-        data["RF"] = 1e6 * given[0]
-    data.setdefault("RF", given[0])
 
 
 def _step(new: Fields, data: dict[str, Any], said: list[str]) -> None:

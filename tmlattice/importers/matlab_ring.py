@@ -17,7 +17,7 @@ corrector whatever its class, and keeps its name:
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -63,8 +63,6 @@ def elements_of(
     """The lattice among a MATLAB file's variables.
 
     Args:
-        content: of `read_mat`.
-        path: of the file.
         sequence: the variable, where several are lattices.
         energy: GeV; None: what the elements state.
 
@@ -90,27 +88,12 @@ def elements_of(
 
 
 @dataclass(frozen=True)
-class Roles:
-    """What a measurement takes places of the lattice for.
-
-    Attributes:
-        monitors: places, from 0.
-        kicks: planes in which a place kicks, by place.
-        names: of thin correctors, by place and plane, where they have names of their own.
-    """
-
-    monitors: tuple[int, ...]
-    kicks: Mapping[int, frozenset[str]]
-    names: Mapping[tuple[int, str], str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Placed:
     """A ring and the names of the places that a measurement knows.
 
     Attributes:
         ring: the model.
-        monitors: names of the monitors, in the order of `Roles.monitors`.
+        monitors: names of the monitors, in the order of their places.
         correctors: names by place and plane.
         messages: what was done to the lattice; sentences.
     """
@@ -133,22 +116,27 @@ def planes_by(pairs: Iterable[tuple[Key, str]]) -> dict[Key, frozenset[str]]:
 
 
 def ring_of_elements(
-    elements: Sequence[Mapping[str, Any]], name: str, energy: float, roles: Roles
+    elements: Sequence[Mapping[str, Any]],
+    name: str,
+    energy: float,
+    monitors: Sequence[int],
+    kicks: Mapping[int, frozenset[str]],
+    own_names: Mapping[tuple[int, str], str] | None = None,
 ) -> Placed:
     """The ring of AT's elements as structures.
 
     Args:
-        elements: the fields of each, in beam order.
-        name: of the ring.
-        energy: GeV.
-        roles: what stands where; a place beyond the lattice is an error.
+        elements: the fields of each, in beam order; energy: GeV.
+        monitors: their places, from 0.
+        kicks: planes in which a place kicks.
+        own_names: of thin correctors, by place and plane, where they have names of their own.
 
     Raises:
         LatticeError: an element that AT cannot make, or a place that is not there.
     """
     import at
 
-    places = [*roles.monitors, *roles.kicks]
+    places = [*monitors, *kicks]
     if not elements:
         raise LatticeError("the lattice has no elements; nothing can be compared with it")
     if places and not (min(places) >= 0 and max(places) < len(elements)):
@@ -161,19 +149,24 @@ def ring_of_elements(
     with warnings.catch_warnings():  # AT's own, of what it finds in old files
         warnings.simplefilter("ignore")
         made = [at_element(fields, i, energy, messages) for i, fields in enumerate(elements)]
-    of_family = _planes_of_families(made, roles.kicks)
+    of_family = planes_by(
+        (_family(made[i]), plane)
+        for i, own in kicks.items()
+        if isinstance(made[i], at.Corrector)
+        for plane in own
+    )
     sequence: list[Any] = []
     where: dict[tuple[int, str], int] = {}  # (place, "" or plane) -> in the sequence
     for i, element in enumerate(made):
-        planes = roles.kicks.get(i, frozenset())
+        planes = kicks.get(i, frozenset())
         parts = _parts(element, planes, of_family, messages)
-        if i in roles.monitors:
+        if i in monitors:
             parts = _read(element, parts)
             where[i, ""] = len(sequence)
         for k, part in enumerate(parts):
             if plane := getattr(part, "Plane", ""):
                 where[i, plane] = len(sequence) + k
-                part.FamName = roles.names.get((i, plane), part.FamName)
+                part.FamName = (own_names or {}).get((i, plane), part.FamName)
         sequence += parts
     lattice = at.Lattice(sequence, name=name, energy=energy * 1e9, periodicity=1)
     with warnings.catch_warnings(record=True) as told:
@@ -186,11 +179,9 @@ def ring_of_elements(
     names = _names(ring, [_family(element) for element in sequence], where.values())
     return Placed(
         ring=ring,
-        monitors=tuple(names[where[i, ""]] for i in roles.monitors),
+        monitors=tuple(names[where[i, ""]] for i in monitors),
         correctors={
-            (i, plane): names[where[i, plane]]
-            for i, planes in roles.kicks.items()
-            for plane in planes
+            (i, plane): names[where[i, plane]] for i, planes in kicks.items() for plane in planes
         },
         messages=(
             *(f"{what} ({count})" for what, count in messages.items()),
@@ -234,20 +225,6 @@ def _kicker(family: str, length: float, plane: str) -> Any:
 
 def _thin(element: Any, planes: Iterable[str]) -> list[Any]:
     return [_kicker(f"{_family(element)}_{_LETTER[plane]}", 0.0, plane) for plane in sorted(planes)]
-
-
-def _planes_of_families(
-    made: Sequence[Any], kicks: Mapping[int, frozenset[str]]
-) -> dict[str, frozenset[str]]:
-    """Planes in which some corrector of a family kicks."""
-    import at
-
-    return planes_by(
-        (_family(made[i]), plane)
-        for i, own in kicks.items()
-        if isinstance(made[i], at.Corrector)
-        for plane in own
-    )
 
 
 def _parts(

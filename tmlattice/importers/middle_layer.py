@@ -47,10 +47,8 @@ def bring_middle_layer(
     """The measurement of the Middle Layer's files; the model is that of the LOCO file.
 
     Args:
-        response: variables with `Rmat`.
-        with_dispersion: variables with the dispersion or the noise.
-        loco: variables of the machine's LOCO file, the dictionary.
-        path: of the LOCO file.
+        response, with_dispersion: variables with `Rmat`; with the dispersion or the noise.
+        loco, path: variables of the machine's LOCO file, the dictionary.
         iteration, keep_bad, energy: see `bring_loco`.
 
     Raises:
@@ -75,10 +73,11 @@ def bring_middle_layer(
         radians = _kicks(own, steps, data, model, columns, found, "HV"[p])
         change = np.full((len(devices), len(model.monitors), 2), np.nan)
         for r in range(2):
-            where = _devices(blocks[r][p].get("Monitor"), "Monitor")
-            orbits = _orbits(blocks[r][p], steps, len(where))
-            at = [_look_up(reads[r], device, f"BPM of {'xy'[r]}") for device in where]
-            change[:, at, r] = orbits.T
+            block = blocks[r][p]
+            at = _places(reads, r, block.get("Monitor"), "Monitor")
+            length = str(block.get("UnitsString", "mm/")).split("/")[0]
+            orbits = numbers(block["Data"], "Rmat.Data", (len(at), len(steps)))
+            change[:, at, r] = (_unit(length, METRES, "orbits") * steps * orbits).T
         names += [model.correctors[i] for i in found]
         planes += [plane] * len(found)
         kicks += radians.tolist()
@@ -173,6 +172,11 @@ def _look_up(table: Mapping[Device, int], device: Device, what: str) -> int:
     return table[device]
 
 
+def _places(reads: Sequence[Mapping[Device, int]], p: int, structure: Any, what: str) -> list[int]:
+    """Places of the BPMs of a structure, of the plane p."""
+    return [_look_up(reads[p], d, f"BPM of {'xy'[p]}") for d in _devices(structure, what)]
+
+
 def _unit(text: Any, units: Mapping[str, float], what: str) -> float:
     if str(text).strip().lower() not in units:
         raise MeasurementError(f"{what} in '{text}': known units are {', '.join(units)}")
@@ -183,15 +187,6 @@ def _each(value: Any, what: str, count: int) -> Array:
     """A number for each of so many, or one for all."""
     found = numbers(value, what).ravel()
     return np.repeat(found, count) if found.size == 1 else numbers(found, what, (count,))
-
-
-def _orbits(block: Fields, steps: Array, monitors: int) -> Array:
-    """Orbit changes, m, [monitor, column]."""
-    length = str(block.get("UnitsString", "mm/")).split("/")[0]
-    return (
-        _unit(length, METRES, "orbits") * steps
-        * numbers(block["Data"], "Rmat.Data", (monitors, len(steps)))
-    )  # fmt: skip
 
 
 def _kicks(
@@ -238,7 +233,7 @@ def _noise(
         part = _part(with_dispersion, f"BPM{plane}Data")
         if part is None or "Sigma" not in part:
             return None
-        at = [_look_up(reads[p], d, f"BPM of {plane}") for d in _devices(part, "BPMxData")]
+        at = _places(reads, p, part, "BPMxData")
         unit = _unit(part.get("UnitsString", "mm"), METRES, "noise")
         noise[at, p] = np.sqrt(2) * unit * numbers(part["Sigma"], "Sigma", (len(at),))
     return np.where(noise > 0, noise, np.nan)
@@ -256,10 +251,7 @@ def _rf(
         part = _part(with_dispersion, f"BPM{plane}Disp")
         if part is None:
             return None
-        at = [
-            _look_up(reads[p], d, f"BPM of {plane}")
-            for d in _devices(part.get("Monitor"), "BPMxDisp.Monitor")
-        ]
+        at = _places(reads, p, part.get("Monitor"), "BPMxDisp.Monitor")
         length, _, per = str(part.get("UnitsString", "")).partition("/")
         unit = _unit(length, METRES, "dispersion")
         step = float(_each(part.get("ActuatorDelta"), "ActuatorDelta", 1)[0])

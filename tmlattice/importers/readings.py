@@ -8,7 +8,8 @@ the BPMs had a beam.
 """
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,9 +85,7 @@ def bring_readings(
 
     Args:
         path: what messages call it, see `columns.label`.
-        columns: of `read_columns`.
         ring: the lattice, whose monitors are looked for; None: names are as the file has them.
-        stated: names, unit, noise, bad monitors.
         monitors: names to look for, instead of the lattice's.
 
     Raises:
@@ -141,7 +140,6 @@ def bring_readings(
     left = [d for d in devices if monitor.get(d) is None and d not in besides]
     read = np.flatnonzero(taken[..., :SUM].any(axis=(0, 1, 3)))
     noise = None if stated.noise is None else np.full((len(read), 2), stated.noise)
-    hints = (None, None) if ring is None else (ring.name, ring.energy)
     devices_of = device_names(
         (names[at], device) for device in devices if (at := monitor.get(device)) in read.tolist()
     )
@@ -149,8 +147,8 @@ def bring_readings(
         readings[:, :, read],
         [names[i] for i in read],
         noise=noise,
-        lattice=hints[0],
-        energy=hints[1],
+        lattice=None if ring is None else ring.name,
+        energy=None if ring is None else ring.energy,
         devices=devices_of,
     )
     of_noise = (
@@ -236,14 +234,8 @@ def _taken_out(readings: Array, filled: Flags, fill: float | None) -> list[str]:
 
 def _unused(columns: Sequence[Column], stated: Stated) -> list[str]:
     """A sentence about columns that are not read."""
-    known = {
-        *SHOTS,
-        *TURNS,
-        *MONITORS,
-        *VALUES,
-        *PLANES,
-        *map(str.casefold, stated.columns.values()),
-    }
+    stated_names = map(str.casefold, stated.columns.values())
+    known = {*SHOTS, *TURNS, *MONITORS, *VALUES, *PLANES, *stated_names}
     names = [
         c.name for c in columns
         if c.name and _word(c.name) not in known
@@ -263,7 +255,8 @@ def _long(path: str, columns: Sequence[Column], stated: Stated) -> Found | None:
         return None
     value = _called(columns, "value", VALUES, stated)
     plane = _called(columns, "plane", PLANES, stated)
-    shots = _labels(columns, "shot", SHOTS, stated) or ["0"] * len(names.values)
+    of_shot = _called(columns, "shot", SHOTS, stated)
+    shots = ["0"] * len(names.values) if of_shot is None else of_shot.values
     turns = _turns(path, columns, stated) or [0] * len(names.values)
     if len(set(shots)) == len(shots) > 1 and len(set(names.values)) > 1:
         raise MeasurementError(
@@ -294,9 +287,9 @@ def _wide(path: str, columns: Sequence[Column], stated: Stated) -> Found:
     """A row a shot, a column a monitor and plane."""
     rows = len(columns[0].values)
     turns = _turns(path, columns, stated)
-    shots = _labels(columns, "shot", SHOTS, stated)
-    if shots is None:
-        shots = ["0"] * rows if turns is not None else [str(i) for i in range(rows)]
+    of_shot = _called(columns, "shot", SHOTS, stated)
+    numbered = [str(i) for i in range(rows)] if turns is None else ["0"] * rows
+    shots = numbered if of_shot is None else of_shot.values
     used = [
         column for column in columns
         if (place := place_of(column.name, stated)) is not None and _holds(place.plane, column)
@@ -328,16 +321,12 @@ def _joined(
     values: list[float] = []
     units: list[str] = []
     for of_shot, of_turn, of_place, column in parts:
-        for row, (shot, turn, place, text) in enumerate(
-            zip(of_shot, of_turn, of_place, column.values, strict=True)
-        ):
-            if place is None:
-                continue
-            shots.append(shot)
-            turns.append(turn)
-            places.append(place)
-            values.append(_number(path, row, column.name, text))
-            units.append(column.unit)
+        rows = [row for row, place in enumerate(of_place) if place is not None]
+        shots += [of_shot[row] for row in rows]
+        turns += [of_turn[row] for row in rows]
+        places += [place for place in of_place if place is not None]
+        values += [_number(path, row, column.name, column.values[row]) for row in rows]
+        units += [column.unit] * len(rows)
     return shots, turns, places, np.array(values), units
 
 
@@ -389,18 +378,11 @@ def _called(
     return None
 
 
-def _labels(
-    columns: Sequence[Column], key: str, usual: Sequence[str], stated: Stated
-) -> list[str] | None:
-    column = _called(columns, key, usual, stated)
-    return None if column is None else column.values
-
-
 def _turns(path: str, columns: Sequence[Column], stated: Stated) -> list[int] | None:
     column = _called(columns, "turn", TURNS, stated)
     if column is None:
         return None
-    numbers = [_number(path, i, column.name, text) for i, text in enumerate(column.values)]
+    numbers = numbers_of(path, column)
     if not all(number == int(number) and 0 <= number < 1e6 for number in numbers):
         raise MeasurementError(f"{path}: turns are whole numbers from 0 in column '{column.name}'")
     first = int(min(numbers))  # counted from 1, or from a trigger
@@ -447,7 +429,9 @@ class _Finder:
     def __init__(self, names: Sequence[str], stated: Stated, elements: Sequence[str] = ()) -> None:
         self._names = list(names)
         self._exact = {name.casefold(): i for i, name in enumerate(self._names)}
-        self._plain = _unique(_norm, self._names)
+        norms = [_norm(name) for name in self._names]
+        counts = Counter(norms)
+        self._plain = {norm: i for i, norm in enumerate(norms) if counts[norm] == 1}
         self._told: dict[str, int] = {}
         self._in_order = stated.in_order
         others = {name.casefold() for name in elements}
@@ -482,7 +466,10 @@ class _Finder:
                 f"{path}: {error}; assign the names in [channels] of "
                 "tmlattice.toml (`tmlattice import --example` writes one)"
             ) from error
-        loose = [d for d, at in found.items() if at is not None and not self._same(d, at)]
+        loose = [
+            d for d, at in found.items()
+            if at is not None and _norm(d) not in (_norm(self._names[at]), *self._told)
+        ]  # fmt: skip
         if loose and not self._in_order:
             at = found[loose[0]]
             assert at is not None
@@ -491,9 +478,6 @@ class _Finder:
                 + (f", and so on for {len(loose)}" if len(loose) > 1 else "")
             )
         return found
-
-    def _same(self, device: str, at: int) -> bool:
-        return _norm(device) in (_norm(self._names[at]), *self._told)
 
     def find(self, device: str) -> int | None:
         """Its place among the ring's monitors; None: it is none of them."""
@@ -512,15 +496,6 @@ class _Finder:
             if len(hits) == 1:
                 return hits.pop()
         return None
-
-
-def _unique(key: Callable[[str], str], names: Sequence[str]) -> dict[str, int]:
-    table: dict[str, int] = {}
-    twice = set()
-    for i, name in enumerate(names):
-        twice |= {key(name)} & table.keys()
-        table[key(name)] = i
-    return {name: i for name, i in table.items() if name not in twice}
 
 
 def _scale(values: Array, units: Sequence[str], stated: Stated) -> tuple[Array, str, str | None]:

@@ -52,9 +52,7 @@ def bring_table(
 
     Args:
         path: what messages call it, see `columns.label`.
-        columns: of `read_columns`.
         ring: the lattice, which knows the correctors' planes.
-        stated: names of monitors and correctors, bad monitors.
 
     Raises:
         MeasurementError: an unknown header, or a field that is no number: with its line.
@@ -90,11 +88,9 @@ def bring_turns(
     Sixteen and more are those of a stored beam that was kicked, fewer are first turns.
 
     Args:
-        path: the file.
         ring: the lattice, whose names the monitors then have; None: names as they are.
         kind: see `read_turn_by_turn`; None: lhc, then sps.
         unit: of the file; None: mm.
-        stated: names of monitors.
 
     Raises:
         OtherFormatError: it cannot be read.
@@ -166,10 +162,9 @@ Header = list[tuple[str, str]]
 
 def _number(path: str, line: int, text: str) -> float:
     try:
-        value = number(text) if text.strip() else np.nan
+        return number(text) if text.strip() else np.nan
     except ValueError:
         raise MeasurementError(f"{path}, row {line}: '{text}' is no number") from None
-    return value
 
 
 def _factor(path: str, name: str, unit: str, of: dict[str, float]) -> float:

@@ -232,8 +232,8 @@ class Builder:
         return [half, monitor, half]
 
     def _straight(
-        self, element: Element, normal: list[float], wrong: Build, walls: bool
-    ) -> Callable[[float], list[Any]]:
+        self, element: Element, normal: list[float], wrong: Build, walls: bool = False
+    ) -> list[Any]:
         """Return a straight multipole of strengths k_n, rolled about its own centre."""
         more: dict[str, Any] = dict(self.walls) if walls else {}
         more |= _frame(wrong, element.tilt + wrong.roll)
@@ -254,32 +254,25 @@ class Builder:
             length = share * element.length
             return [at.Multipole(element.name, length, A, B, NumIntSteps=self.steps, **more)]
 
-        return body
+        return self._with_middle(element, wrong, body)
 
     def _quadrupole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         source = element.source
         if getattr(source, "x_offs", 0) or getattr(source, "y_offs", 0):
             raise LatticeError(f"AT cannot build '{element.name}', a quadrupole passed off axis")
         k1 = element.k1 * (1 + setting["k1_relative"]) * wrong.scale
-        return self._with_middle(
-            element, wrong, self._straight(element, [0.0, k1, element.k2], wrong, True)
-        )
+        return self._straight(element, [0.0, k1, element.k2], wrong, True)
 
     def _sextupole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         k2 = element.k2 * (1 + setting["k2_relative"]) * wrong.scale
-        return self._with_middle(
-            element, wrong, self._straight(element, [0.0, element.k1, k2], wrong, False)
-        )
+        return self._straight(element, [0.0, element.k1, k2], wrong)
 
     def _octupole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
-        k3 = float(element.source.k3)
-        body = self._straight(element, [0.0, 0.0, 0.0, k3], wrong, False)
-        return self._with_middle(element, wrong, body)
+        return self._straight(element, [0.0, 0.0, 0.0, float(element.source.k3)], wrong)
 
     def _multipole(self, element: Element, wrong: Build, setting: Any) -> list[Any]:
         if not hasattr(element.source, "kn"):
-            body = self._straight(element, [0.0, element.k1, element.k2], wrong, False)
-            made = self._with_middle(element, wrong, body)
+            made = self._straight(element, [0.0, element.k1, element.k2], wrong)
             if element.bending:
                 # AT's (delta, ct) are OCELOT's (p, tau) of a beam as fast as light
                 bend = bend_matrix(element.source, np.inf)[np.ix_(SWAPPED, SWAPPED)]

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import c as SPEED_OF_LIGHT
 
 from tmlattice.arrays import Array
-from tmlattice.beam.rf import RELATIVISTIC, Rf, rf_of, stable_phase
+from tmlattice.beam.rf import RELATIVISTIC, rf_of, stable_phase
 from tmlattice.effects import Cause, RingEffect, check, find
 from tmlattice.effects.apply import groups
 from tmlattice.effects.build import Build
@@ -113,7 +113,16 @@ class AtEngine:
             [i for i, e in enumerate(self._line) if isinstance(e, at.Monitor)], dtype=np.uint32
         )
         self.expected_loss = expected_loss(ring, self._bends, self._wigglers)
-        self._set_rf(rf)
+        behind = len(self._line) - 1  # the marker at the end
+        self._cavities = [
+            self._places[i].start if i < len(self._places) else behind for i in rf.places
+        ]
+        self._has_rf, self._harmonic, self._voltage = rf.own, rf.harmonic, rf.voltage
+        if self.expected_loss and self.expected_loss >= rf.voltage:
+            raise LatticeError(
+                f"an RF of {rf.voltage / 1e6:.3g} MV cannot replace a loss of "
+                f"{self.expected_loss / 1e6:.3g} MeV a turn; give voltage="
+            )
 
     def _build(self, cavities: Sequence[int]) -> None:
         """Build the line. AT's ct is the path length: the velocity's contribution of slower
@@ -145,18 +154,6 @@ class AtEngine:
         if len(scales) > 1:
             raise LatticeError(f"AT gives every {kind} the same share of its expected loss")
         return scales.pop() if scales else 0.0
-
-    def _set_rf(self, rf: Rf) -> None:
-        behind = len(self._line) - 1  # the marker at the end
-        self._cavities = [
-            self._places[i].start if i < len(self._places) else behind for i in rf.places
-        ]
-        self._has_rf, self._harmonic, self._voltage = rf.own, rf.harmonic, rf.voltage
-        if self.expected_loss and self.expected_loss >= rf.voltage:
-            raise LatticeError(
-                f"an RF of {rf.voltage / 1e6:.3g} MV cannot replace a loss of "
-                f"{self.expected_loss / 1e6:.3g} MeV a turn; give voltage="
-            )
 
     def track(
         self, launches: ArrayLike, turns: int = 1, settings: Sequence[Settings] | None = None
@@ -192,7 +189,7 @@ class AtEngine:
             line = self._set(changed)
             if turns > 1:
                 self._switch_on(line, frequency)
-            readings[shots] = self.run(line, state[shots], turns)
+            readings[shots] = self._run(line, np.asfortranarray(state[shots].T), turns)
         return readings
 
     def closed_orbits(self, settings: Sequence[Settings]) -> Array:
@@ -209,8 +206,8 @@ class AtEngine:
         readings = np.empty((len(settings), len(self._monitors), 2))
         for orbits, changed, frequency in self._groups(settings):
             line = self._set(changed)
-            late = -self.ring.length * frequency / (1 + frequency)
-            readings[orbits] = at_orbit.settle(self._again(line), start, solve, late)[1]
+            turn = self._again(line)
+            readings[orbits] = at_orbit.settle(turn, start, solve, self._late(frequency))[1]
         return readings
 
     @functools.cached_property
@@ -225,7 +222,11 @@ class AtEngine:
         line = self._set(changed)
         with_rf = line.copy()
         self._switch_on(with_rf, frequency)
-        return line, with_rf, -self.ring.length * frequency / (1 + frequency)
+        return line, with_rf, self._late(frequency)
+
+    def _late(self, frequency: float) -> float:
+        """Excess of a turn over that of the RF at a relative change of its frequency, m."""
+        return -self.ring.length * frequency / (1 + frequency)
 
     def _set(self, changed: Mapping[int, Mapping[str, float]]) -> list[Any]:
         """Return the line with settings, by index in the ring."""
@@ -246,7 +247,7 @@ class AtEngine:
 
         `known`: the line is that of AT's latest tracking, which takes most of the time to read it.
         """
-        return np.asarray(self.run(line, beam.T, 1, beam, known=known)[0, 0])
+        return np.asarray(self._run(line, beam, 1, known=known)[0, 0])
 
     def _again(self, line: list[Any]) -> at_orbit.Turn:
         """Passes through one line, with no other tracking between them."""
@@ -258,7 +259,7 @@ class AtEngine:
         lost, [monitor] (beam: the particles, [6, particle]; they are moved)."""
         block = max(TURNS_AT_ONCE // (beam.shape[1] * len(self._monitors)), 1)
         for turn in range(0, turns, block):
-            seen = self.run(line, beam.T, min(block, turns - turn), beam, turn)
+            seen = self._run(line, beam, min(block, turns - turn), turn)
             alive = np.isfinite(seen[..., 0]).mean(axis=0)
             mean = np.nansum(seen, axis=0) / np.maximum(alive * len(seen), 1)[..., None]
             yield from zip(mean, alive, strict=True)
@@ -316,23 +317,15 @@ class AtEngine:
         scale = self._bends if self._bends > 0 else 1.0
         return self.ring.energy * 1e9 * float(np.cbrt(scale))
 
-    def run(
-        self,
-        line: list[Any],
-        state: Array,
-        turns: int,
-        beam: Array | None = None,
-        first: int = 0,
-        known: bool = False,
+    def _run(
+        self, line: list[Any], beam: Array, turns: int, first: int = 0, known: bool = False
     ) -> Array:
-        """Return readings of the states [shot, 6], in AT's coordinates, [shot, turn, monitor, 2].
-
-        A given `beam`, the states for AT, [6, shot], is moved to the line's end; `first` is the
-        number of the first turn, for the RF; `known`: see `one_pass`.
-        """
-        beam = np.asfortranarray(state.T) if beam is None else beam
-        readings = np.empty((len(state), turns, len(self._monitors), 2))
-        block = max(TURNS_AT_ONCE // max(len(state) * len(self._monitors), 1), 1)
+        """Return readings [shot, turn, monitor, 2] of states in AT's coordinates, [6, shot], which
+        are moved to the line's end; `first` is the number of the first turn, for the RF; `known`:
+        see `one_pass`."""
+        shots = beam.shape[1]
+        readings = np.empty((shots, turns, len(self._monitors), 2))
+        block = max(TURNS_AT_ONCE // max(shots * len(self._monitors), 1), 1)
         for turn in range(0, turns, block):
             seen = at.internal_lpass(  # leaves the next block's start in `beam`
                 line,

@@ -6,9 +6,10 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tmlattice.arrays import Array
 from tmlattice.by_name import by_name
@@ -103,18 +104,16 @@ def rms_of(noise: float | Sequence[float]) -> Array:
     return np.broadcast_to(rms, (2,))
 
 
+def add_noise(readings: Array, rms: ArrayLike, seed: int, purpose: str, first: int = 0) -> None:
+    """Add noise to readings [shot, ...], whose first shot has the number `first`; each shot has its
+    own random stream."""
+    for shot, reading in enumerate(readings, first):
+        reading += rms * stream(seed, purpose, shot).standard_normal(reading.shape)  # noqa: PLW2901
+
+
 def stated_noise(rms: Array, monitors: int) -> Array | None:
     """Return the noise in the record, [monitor, 2]; None: without noise in a plane."""
     return np.tile(rms, (monitors, 1)) if (rms > 0).all() else None
-
-
-class Engine(Protocol):
-    """Tracks a ring with causes in it."""
-
-    def track(
-        self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None
-    ) -> Array:
-        """Return (x, y) at every monitor, [shot, turn, monitor, 2], from launches [shot, 6]."""
 
 
 def check_engine(name: str, known: Sequence[str] = ENGINES) -> None:
@@ -122,18 +121,6 @@ def check_engine(name: str, known: Sequence[str] = ENGINES) -> None:
     unknown."""
     if name not in known:
         raise TmlatticeError(f"no engine '{name}'; there are {' and '.join(known)}")
-
-
-def _engine(name: str, ring: Ring, causes: Sequence[Cause], radiation: bool) -> Engine:
-    check_engine(name)
-    scale = float(radiation)
-    if name == "at":
-        from tmlattice.machine.at_engine import AtEngine
-
-        return AtEngine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
-    from tmlattice.machine.ocelot_engine import OcelotEngine
-
-    return OcelotEngine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
 
 
 class Machine:
@@ -169,7 +156,14 @@ class Machine:
         self.noise = rms_of(noise)
         self.engine = engine
         self._made_of: dict[str, Any] = {"engine": engine, "radiation": radiation, "noise": noise}
-        self._engine = _engine(engine, ring, causes, radiation)
+        check_engine(engine)
+        track: Any  # imported where it is chosen: AT takes long
+        if engine == "at":
+            from tmlattice.machine.at_engine import AtEngine as track
+        else:
+            from tmlattice.machine.ocelot_engine import OcelotEngine as track
+        scale = float(radiation)
+        self._engine = track(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
 
     def beam(
         self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None
@@ -193,9 +187,7 @@ class Machine:
         further = turns + self.monitors.ahead
         beam = self.beam(shots.launches[part], further, shots.settings[part])
         readings = self.monitors.read(self.monitors.counted(beam, turns))
-        for shot, reading in zip(chunk, readings, strict=True):
-            noise = stream(seed, "noise", shot).standard_normal(reading.shape)
-            reading += self.noise * noise  # noqa: PLW2901
+        add_noise(readings, self.noise, seed, "noise", chunk.start)
         return readings
 
     def measure(
@@ -203,11 +195,7 @@ class Machine:
     ) -> Iterator[tuple[int, Array]]:
         """Yield the shots one after another: index and readings [turn, monitor, 2], m.
 
-        Each shot's noise has its own random stream: it depends neither on the number of shots nor
-        on the number of processes.
-
-        Args:
-            shots: see `draw_shots`.
+        A shot's noise depends neither on the number of shots nor on that of the processes.
         """
         frozen = self.monitors.frozen
         first: Array | None = None

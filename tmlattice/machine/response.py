@@ -1,6 +1,8 @@
 """A simulated orbit response: closed orbits of a machine whose errors are known."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -14,12 +16,12 @@ from tmlattice.lattice import Ring
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.machine import (
     StoredSimulation,
+    add_noise,
     check_engine,
     errors,
     rms_of,
     stated_noise,
 )
-from tmlattice.machine.shots import stream
 from tmlattice.measurement import OrbitResponse, RfStep
 from tmlattice.observe.calibration import corrector_scales, offset_of
 
@@ -59,11 +61,7 @@ def simulate_response(
         machine_seed: of the background; else `seed`.
     """
     check_engine(engine)
-    made_of = errors(
-        ring, causes, background, seed, machine_seed, engine=engine, one_sided=one_sided
-    )
-    every = made_of.every()
-    names = tuple(monitor.name for monitor in ring.monitors)
+    machine = StoredMachine(ring, causes, background, seed, machine_seed)
     design = ResponseModel(ring)
     columns = design.columns(correctors)
     rf = rf_of(ring)
@@ -75,34 +73,87 @@ def simulate_response(
     if rf_step:
         relative = rf_step / frequency
         steps.append((None, 0.0, relative) if one_sided else (None, -relative / 2, relative / 2))
-    orbits = _centroids(ring, every, steps, _at_orbits if engine == "at" else _map_orbits)
-    monitors = monitors_with(ring, every)
-    changes = np.stack(
-        [
-            monitors.read(up) - monitors.read(down)
-            for down, up in tqdm(
-                orbits, total=len(steps), unit="step", disable=None if progress else True
-            )
-        ]
-    )
-    changes[:, monitors.frozen] = 0.0
-    sigma = rms_of(noise)
-    for i, change in enumerate(changes):
-        change += sigma * stream(seed, "response", i).standard_normal(change.shape)  # noqa: PLW2901
+    orbits = tqdm(
+        _orbits(machine, steps, engine), total=len(steps), unit="step",
+        disable=None if progress else True,
+    )  # fmt: skip
+    changes, known = machine.changes(orbits, noise, "response")
     count = len(columns.names)
     stepped = RfStep(frequency, harmonic, rf_step, changes[-1]) if rf_step else None
     measured = OrbitResponse(
         correctors=columns.names,
         planes=columns.planes,
         kicks=np.full(count, kick),
-        monitors=names,
         response=changes[:count],
-        noise=stated_noise(sigma, len(names)),
+        noise=known,
         rf=stepped,
-        lattice=ring.name,
-        energy=ring.energy,
+        **machine.fields,
     )
-    return StoredSimulation(measured=measured, **vars(made_of))
+    return machine.simulation(measured, engine=engine, one_sided=one_sided)
+
+
+class StoredMachine:
+    """The ring with all its errors, of the arguments that all simulations of a stored beam have."""
+
+    def __init__(
+        self,
+        ring: Ring,
+        causes: Sequence[Cause],
+        background: str | Mapping[str, float | None] | None,
+        seed: int,
+        machine_seed: int | None,
+        radiation: bool = False,
+    ) -> None:
+        self.made_of = errors(ring, causes, background, seed, machine_seed)
+        self.ring, self.seed, self.radiation = ring, seed, float(radiation)
+        self.every = self.made_of.every()
+        self.monitors = monitors_with(ring, self.every)
+        names = tuple(monitor.name for monitor in ring.monitors)
+        self.fields: dict[str, Any] = {
+            "monitors": names, "lattice": ring.name, "energy": ring.energy
+        }  # fmt: skip
+
+    @cached_property
+    def engine(self) -> AtEngine:
+        """AT's ring."""
+        scale = self.radiation
+        return AtEngine(self.ring, self.every, radiation_bends=scale, radiation_wigglers=scale)
+
+    def orbits(
+        self, settings: Sequence[Settings], nodes: tuple[Array, Array] | None = None
+    ) -> Array:
+        """Return the centroid of the stored beam, [shot, monitor, 2]: orbits depend on the energy.
+        `nodes`: else those of `energies`."""
+        weights, frequencies = energies(self.ring, self.every) if nodes is None else nodes
+        each = [
+            self.engine.closed_orbits([_with_frequency(s, float(f)) for s in settings])
+            for f in frequencies
+        ]
+        return np.asarray(np.tensordot(weights, np.array(each), 1))
+
+    def noisy(
+        self, readings: Array, noise: float | Sequence[float], purpose: str
+    ) -> tuple[Array, Array | None]:
+        """Return readings [shot, ..., monitor, 2] with noise, and the noise of the record."""
+        rms = rms_of(noise)
+        add_noise(readings, rms, self.seed, purpose)
+        return readings, stated_noise(rms, len(self.ring.monitors))
+
+    def changes(
+        self, orbits: Iterable[Array], noise: float | Sequence[float], purpose: str
+    ) -> tuple[Array, Array | None]:
+        """Return what the monitors read of orbits below and above each step, [step, monitor, 2],
+        and the noise of the record."""
+        read = [self.monitors.read(up) - self.monitors.read(down) for down, up in orbits]
+        changes = np.array(read).reshape(-1, len(self.ring.monitors), 2)
+        changes[:, self.monitors.frozen] = 0.0
+        return self.noisy(changes, noise, purpose)
+
+    def simulation(self, measured: Any, **more: Any) -> StoredSimulation:
+        """Return the measurement with its inputs."""
+        return StoredSimulation(
+            **{**vars(self.made_of), "more": {"engine": "at", **more}}, measured=measured
+        )
 
 
 def rf_step_of(ring: Ring, design: ResponseModel | None = None) -> float:
@@ -115,24 +166,43 @@ def rf_step_of(ring: Ring, design: ResponseModel | None = None) -> float:
 
 
 Step = tuple[str | None, float, float]
-Orbits = Iterator[tuple[Array, Array]]
-Engine = Callable[[Ring, Sequence[Cause], Sequence[Step], float], Orbits]
 
 
-def _centroids(
-    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], engine: Engine
-) -> Orbits:
-    """Orbits of the centroid of a beam with an energy spread.
-
-    Three Gauss-Hermite nodes; a particle's energy is that of another RF frequency.
-    """
+def _orbits(machine: StoredMachine, steps: Sequence[Step], engine: str) -> Iterator[Array]:
+    """Orbits [2, monitor, 2] of the centroid below and above each step of a corrector, or of the
+    RF (None)."""
+    ring, causes = machine.ring, machine.every
     weights, nodes = energies(ring, causes)
     if offset := offset_of(causes):
         nodes = nodes + offset / ResponseModel(apply(ring, causes)).rf_start[5]
-    each = [engine(ring, causes, steps, float(node)) for node in nodes]
+    if engine == "at":
+        for name, *sides in steps:
+            yield machine.orbits([
+                rf_setting(side) if name is None else {name: {"kick": ring[name].angle + side}}
+                for side in sides
+            ], (weights, nodes))  # fmt: skip
+        return
+    each = [_map_orbits(ring, causes, steps, float(node)) for node in nodes]
     for orbits in zip(*each, strict=True):
-        down, up = np.tensordot(weights, np.array(orbits), 1)
-        yield down, up
+        yield np.asarray(np.tensordot(weights, np.array(orbits), 1))
+
+
+def rf_setting(relative: float) -> Settings:
+    """Return the setting of a relative change of the RF frequency."""
+    return {"rf": {"frequency_relative": relative}}
+
+
+def _with_frequency(settings: Settings, relative: float) -> Settings:
+    """A shot's settings with a change of the RF frequency."""
+    if relative == 0:
+        return settings
+    changed = {name: own for name, own in settings.items() if name.casefold() != "rf"}
+    before = sum(
+        own.get("frequency_relative", 0.0)
+        for name, own in settings.items()
+        if name.casefold() == "rf"
+    )
+    return changed | dict(rf_setting(before + relative))
 
 
 def spread_of(causes: Sequence[Cause]) -> float:
@@ -141,7 +211,8 @@ def spread_of(causes: Sequence[Cause]) -> float:
 
 
 def energies(ring: Ring, causes: Sequence[Cause]) -> tuple[Array, Array]:
-    """Weights of the nodes of the beam's energy, and the RF frequency (relative) of each."""
+    """Weights of three Gauss-Hermite nodes of the beam's energy, and the RF frequency (relative)
+    that is equivalent to each."""
     spread = spread_of(causes)
     if spread == 0:
         return np.ones(1), np.zeros(1)
@@ -150,27 +221,10 @@ def energies(ring: Ring, causes: Sequence[Cause]) -> tuple[Array, Array]:
     return np.array([1, 4, 1]) / 6, nodes
 
 
-def _at_orbits(
-    ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], frequency: float
-) -> Orbits:
-    """Orbits below and above each step of a corrector, or of the RF (None)."""
-    engine = AtEngine(ring, causes)
-
-    def setting(name: str | None, amount: float) -> Settings:
-        if name is None:
-            return {"rf": {"frequency_relative": frequency + amount}}
-        kick = {name: {"kick": ring[name].angle + amount}}
-        return {**kick, "rf": {"frequency_relative": frequency}} if frequency else kick
-
-    for name, low, high in steps:
-        down, up = engine.closed_orbits([setting(name, low), setting(name, high)])
-        yield down, up
-
-
 def _map_orbits(
     ring: Ring, causes: Sequence[Cause], steps: Sequence[Step], frequency: float
-) -> Orbits:
-    """Orbits from the second-order maps, as `_at_orbits`."""
+) -> Iterator[tuple[Array, Array]]:
+    """The same of one energy, from the second-order maps."""
     wrong = apply(ring, causes)
     model = ResponseModel(wrong, frequency=frequency)
     names = [name for name, _, _ in steps if name is not None]

@@ -9,26 +9,17 @@ the ring's RF. Readings have the monitors' errors, and noise.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
 from tmlattice.beam.rf import rf_of
-from tmlattice.effects import Cause, Settings, monitors_with
+from tmlattice.effects import Cause, Settings
 from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.lattice import Ring
-from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.at_stored import Beam, tunes_of, turns_of
-from tmlattice.machine.machine import (
-    StoredSimulation,
-    check_engine,
-    errors,
-    rms_of,
-    stated_noise,
-)
+from tmlattice.machine.machine import StoredSimulation, add_noise, check_engine
 from tmlattice.machine.network_engine import NetworkEngine
-from tmlattice.machine.response import NOISE, energies, rf_step_of, spread_of
+from tmlattice.machine.response import NOISE, StoredMachine, rf_setting, rf_step_of, spread_of
 from tmlattice.machine.shots import draw_shots, each_setting, stream
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
 
@@ -38,35 +29,6 @@ TURN_NOISE = 2e-5
 """rms of one reading of one turn, m."""
 TUNE_NOISE = (2e-5, 0.05)
 """rms of a tune, and of a chromaticity."""
-
-
-class _Machine:
-    """The ring with all its errors, of the arguments that all simulations have."""
-
-    def __init__(
-        self,
-        ring: Ring,
-        causes: Sequence[Cause],
-        background: str | Mapping[str, float | None] | None,
-        seed: int,
-        machine_seed: int | None,
-        radiation: bool = False,
-    ) -> None:
-        self.made_of = errors(ring, causes, background, seed, machine_seed)
-        self.every = self.made_of.every()
-        scale = float(radiation)
-        self.engine = AtEngine(ring, self.every, radiation_bends=scale, radiation_wigglers=scale)
-        self.monitors = monitors_with(ring, self.every)
-        names = tuple(monitor.name for monitor in ring.monitors)
-        self.fields: dict[str, Any] = {
-            "monitors": names, "lattice": ring.name, "energy": ring.energy
-        }  # fmt: skip
-
-    def simulation(self, measured: Any, **more: Any) -> StoredSimulation:
-        """Return the measurement with its inputs."""
-        return StoredSimulation(
-            **{**vars(self.made_of), "more": {"engine": "at", **more}}, measured=measured
-        )
 
 
 def simulate_turns(
@@ -113,7 +75,7 @@ def simulate_turns(
         UnstableRingError: no closed orbit, or no stable motion.
         MeasurementError: too few or too many turns.
     """
-    machine = _Machine(ring, causes, background, seed, machine_seed, radiation)
+    machine = StoredMachine(ring, causes, background, seed, machine_seed, radiation)
     own = spread_of(machine.every)
     if own and particles == 1:
         raise TmlatticeError(
@@ -130,20 +92,15 @@ def simulate_turns(
     if radiation and engine == "network":
         raise EffectError("the network has no radiation; take the engine 'at'")
     tracker = machine.engine if engine == "at" else NetworkEngine(ring, machine.every)
-    readings = np.stack(
-        [
-            turns_of(tracker, kicked[i], further, each[i], beam, stream(seed, "particles", i))
-            for i in range(shots)
-        ]
-    )
+    passed = np.stack([
+        turns_of(tracker, kicked[i], further, each[i], beam, stream(seed, "particles", i))
+        for i in range(shots)
+    ])  # fmt: skip
     # before its kick the beam is on the closed orbit
-    orbit = _orbits(machine, each)[:, None] if (monitors.late < 0).any() else np.nan
-    readings = monitors.read(monitors.counted(readings, turns, orbit))
-    sigma = rms_of(noise)
-    for i, reading in enumerate(readings):
-        reading += sigma * stream(seed, "turns", i).standard_normal(reading.shape)  # noqa: PLW2901
+    orbit = machine.orbits(each)[:, None] if (monitors.late < 0).any() else np.nan
+    read = monitors.read(monitors.counted(passed, turns, orbit))
+    readings, known = machine.noisy(read, noise, "turns")
     readings[:, :, monitors.frozen] = readings[0, 0, monitors.frozen]
-    known = stated_noise(sigma, len(ring.monitors))
     measured = TurnByTurn(
         readings=readings, noise=known, settings=each if settings else (), **machine.fields
     )
@@ -173,14 +130,11 @@ def simulate_orbits(
 
     The other arguments and the errors are as in `simulate_turns`.
     """
-    machine = _Machine(ring, causes, background, seed, machine_seed, radiation)
+    machine = StoredMachine(ring, causes, background, seed, machine_seed, radiation)
     each = each_setting(settings, shots)
-    orbit = machine.monitors.read(_orbits(machine, each))
-    sigma = rms_of(noise)
-    for i, reading in enumerate(orbit):
-        reading += sigma * stream(seed, "orbit", i).standard_normal(reading.shape)  # noqa: PLW2901
+    read = machine.monitors.read(machine.orbits(each))
+    orbit, known = machine.noisy(read, noise, "orbit")
     orbit[:, machine.monitors.frozen] = orbit[0, machine.monitors.frozen]
-    known = stated_noise(sigma, len(ring.monitors))
     measured = ClosedOrbit(
         orbit=orbit, noise=known, settings=each if settings else (), **machine.fields
     )
@@ -208,23 +162,20 @@ def simulate_dispersion(
 
     The other arguments and the errors are as in `simulate_turns`.
     """
-    machine = _Machine(ring, causes, background, seed, machine_seed)
+    machine = StoredMachine(ring, causes, background, seed, machine_seed)
     rf = rf_of(ring)
     frequency = rf.frequency(ring)
     chosen = [rf_step_of(ring)] if steps is None else [float(step) for step in steps]
-    sigma = rms_of(noise)
-    made = []
-    for i, step in enumerate(chosen):
+    orbits = []
+    for step in chosen:
         low = 0.0 if one_sided else -step / 2
-        down, up = machine.monitors.read(
-            _orbits(machine, [_rf_setting(s / frequency) for s in (low, low + step)])
-        )
-        change = up - down
-        change[machine.monitors.frozen] = 0.0
-        change += sigma * stream(seed, "dispersion", i).standard_normal(change.shape)
-        made.append(RfStep(frequency, rf.harmonic, step, change))
-    known = stated_noise(sigma, len(ring.monitors))
-    measured = Dispersion(steps=tuple(made), noise=known, **machine.fields)
+        orbits.append(machine.orbits([rf_setting(s / frequency) for s in (low, low + step)]))
+    changes, known = machine.changes(orbits, noise, "dispersion")
+    steps_made = tuple(
+        RfStep(frequency, rf.harmonic, step, change)
+        for step, change in zip(chosen, changes, strict=True)
+    )
+    measured = Dispersion(steps=steps_made, noise=known, **machine.fields)
     return machine.simulation(measured, one_sided=one_sided)
 
 
@@ -247,12 +198,11 @@ def simulate_tunes(
 
     The other arguments and the errors are as in `simulate_turns`.
     """
-    machine = _Machine(ring, causes, background, seed, machine_seed)
+    machine = StoredMachine(ring, causes, background, seed, machine_seed)
     each = each_setting(settings, shots)
     found = {key: tunes_of(machine.engine, s) for key, s in {repr(s): s for s in each}.items()}
     values = np.array([found[repr(s)] for s in each])  # [shot, tune or chromaticity, mode]
-    for i, value in enumerate(values):
-        value += np.reshape(noise, (2, 1)) * stream(seed, "tunes", i).standard_normal((2, 2))  # noqa: PLW2901
+    add_noise(values, np.reshape(noise, (2, 1)), seed, "tunes")
     sigma = [np.full((shots, 2), rms) if rms > 0 else None for rms in noise]
     measured = TuneReading(
         tune=values[:, 0] % 1,
@@ -264,30 +214,3 @@ def simulate_tunes(
         energy=ring.energy,
     )
     return machine.simulation(measured)
-
-
-def _orbits(machine: _Machine, settings: Sequence[Settings]) -> Array:
-    """Centroid of the stored beam, [shot, monitor, 2]: orbits depend on the energy."""
-    weights, frequencies = energies(machine.engine.ring, machine.every)
-    each = [
-        machine.engine.closed_orbits([_with_frequency(s, float(f)) for s in settings])
-        for f in frequencies
-    ]
-    return np.asarray(np.tensordot(weights, np.array(each), 1))
-
-
-def _rf_setting(relative: float) -> Settings:
-    return {"rf": {"frequency_relative": relative}}
-
-
-def _with_frequency(settings: Settings, relative: float) -> Settings:
-    """A shot's settings with a change of the RF frequency."""
-    if relative == 0:
-        return settings
-    changed = {name: own for name, own in settings.items() if name.casefold() != "rf"}
-    before = sum(
-        own.get("frequency_relative", 0.0)
-        for name, own in settings.items()
-        if name.casefold() == "rf"
-    )
-    return changed | dict(_rf_setting(before + relative))

@@ -45,11 +45,8 @@ def element_map(element: Element, energy: float, dimension: int = 4) -> TaylorMa
 
 
 def part_maps(element: Element, energy: float) -> list[TaylorMap]:
-    """Return OCELOT's second-order maps of an element's parts: the body, or edge, body and edge.
-
-    Args:
-        element, energy: see `element_map`.
-    """
+    """Return OCELOT's second-order maps of an element's parts: the body, or edge, body and edge
+    (energy: GeV)."""
     return [TaylorMap(of_ocelot(part, 4).reduced()) for part in parts_of(element, energy, False)]
 
 
@@ -298,7 +295,10 @@ def ring_maps(ring: Ring, dimension: int = 4, layers: LayerMaps | None = None) -
         return kept
     maps = _made(ring, dimension, LayerMaps(ring, dimension) if layers is None else layers)
     if key:
-        cache.save(key, _written(maps))
+        content = io.BytesIO()
+        stacks = {name: getattr(maps, name) for name in _KEPT}
+        np.savez(content, *maps.closing.coefficients, **stacks)
+        cache.save(key, content.getvalue())
     return maps
 
 
@@ -324,12 +324,6 @@ def changed_maps(maps: RingMaps, layers: LayerMaps, touched: Sequence[int]) -> R
 
 
 _KEPT = ("s", "W0", "W1", "W2", "s_monitors", "at", "R0", "R1", "R2")
-
-
-def _written(maps: RingMaps) -> bytes:
-    content = io.BytesIO()
-    np.savez(content, *maps.closing.coefficients, **{name: getattr(maps, name) for name in _KEPT})
-    return content.getvalue()
 
 
 def _read(ring: Ring, dimension: int, content: bytes) -> RingMaps:

@@ -19,9 +19,16 @@ from numpy.typing import ArrayLike
 
 from tmlattice.arrays import Array
 from tmlattice.errors import TmlatticeError
-from tmlattice.maps.taylor import TaylorMap, _Table, _table, kronecker_exponents
+from tmlattice.maps.taylor import (
+    Exponents,
+    TaylorMap,
+    _Table,
+    _table,
+    exponents_up_to,
+    kronecker_exponents,
+    parent_of,
+)
 
-Exponents = tuple[int, ...]
 Terms = Mapping[Exponents, ArrayLike | Callable[[float], ArrayLike]]
 
 ROUNDING = 1e-17  # below half a unit in the last place
@@ -53,7 +60,7 @@ class _Equation:
             below = tuple(exponents)
             while sum(below) > 0:
                 needed[below] = None
-                below = _parent(below)[0]
+                below = parent_of(below)[0]
         self.products = sorted((e for e in needed if sum(e) > 1), key=sum)  # parents come first
 
     def coefficients(self, t: float) -> list[tuple[Exponents, Array]]:
@@ -63,18 +70,11 @@ class _Equation:
             for e, c in self._coefficients.items()
         ]
 
-    def of_state(self, t: float, x: Array) -> Array:
-        """dX/dt of states x [..., n]."""
-        total = np.zeros_like(x)
-        for exponents, coefficient in self.coefficients(t):
-            total += np.prod(x ** np.array(exponents), axis=-1)[..., None] * coefficient
-        return total
-
     def of_map(self, t: float, rows: Array, table: _Table) -> Array:
         """Return d rows/dt of a map's rows [n, monomial]: the right-hand side of the weights."""
         values = self._units(rows)
         for exponents in self.products:
-            below, variable = _parent(exponents)
+            below, variable = parent_of(exponents)
             values[exponents] = table.multiply(values[below], rows[variable])
         total = np.zeros_like(rows)
         for exponents, coefficient in self.coefficients(t):
@@ -89,14 +89,6 @@ class _Equation:
         return {(0,) * self.n: one, **units}
 
 
-def _parent(exponents: Exponents) -> tuple[Exponents, int]:
-    """Monomial with one factor less, and the index of that factor."""
-    variable = next(i for i, e in enumerate(exponents) if e)
-    below = list(exponents)
-    below[variable] -= 1
-    return tuple(below), variable
-
-
 def right_hand_side(terms: Terms) -> Callable[[float, ArrayLike], Array]:
     """Return dX/dt as a function of the time and of states [..., n], for a numerical solver.
 
@@ -104,7 +96,15 @@ def right_hand_side(terms: Terms) -> Callable[[float, ArrayLike], Array]:
         terms: exponents -> coefficient vector [n], or a function of t that returns it.
     """
     equation = _Equation(terms)
-    return lambda t, x: equation.of_state(t, np.asarray(x, dtype=float))
+
+    def slope(t: float, x: ArrayLike) -> Array:
+        x = np.asarray(x, dtype=float)
+        total = np.zeros_like(x)
+        for exponents, coefficient in equation.coefficients(t):
+            total += np.prod(x ** np.array(exponents), axis=-1)[..., None] * coefficient
+        return total
+
+    return slope
 
 
 def recentred(terms: Mapping[Exponents, ArrayLike], centre: ArrayLike) -> dict[Exponents, Array]:
@@ -204,7 +204,7 @@ def _series(
     coefficients = equation.coefficients(0.0)
     for j in range(degree):
         for exponents in equation.products:
-            below, variable = _parent(exponents)
+            below, variable = parent_of(exponents)
             values[exponents][j] = table.convolve(values[below][: j + 1], x[j::-1, variable])
         slope = sum(c[:, None] * values[e][j] for e, c in coefficients)
         x[j + 1] = direction * slope / (j + 1)
@@ -266,13 +266,13 @@ def ode_of_taylor_map(taylor_map: TaylorMap, time: float) -> dict[Exponents, Arr
         correction = wanted - _logarithm(taylor_map_of_ode(terms, order, time), time)
         rows = rows + correction
         if np.abs(correction).max() <= 1e-13 * np.abs(rows).max():
-            return {e: column.copy() for e, column in zip(exponents, rows.T, strict=True)}
-    if np.abs(correction).max() <= 1e-9 * np.abs(rows).max():  # within rounding
-        return {e: column.copy() for e, column in zip(exponents, rows.T, strict=True)}
-    raise OdeError(
-        "no equation of the map's order was found near its logarithm: W0 is too large for it; "
-        "expand the map about another centre"
-    )
+            break
+    if not np.abs(correction).max() <= 1e-9 * np.abs(rows).max():  # within rounding
+        raise OdeError(
+            "no equation of the map's order was found near its logarithm: W0 is too large for it; "
+            "expand the map about another centre"
+        )
+    return {e: column.copy() for e, column in zip(exponents, rows.T, strict=True)}
 
 
 def _logarithm(taylor_map: TaylorMap, time: float) -> Array:
@@ -340,8 +340,3 @@ def _derivation(A: Array, degree: int) -> Array:
                     moved[j] += 1
                     result[row, index[tuple(moved)]] += power * A[i, j]
     return result
-
-
-def exponents_up_to(n: int, order: int) -> list[Exponents]:
-    """Return exponents of degree 0 to `order` in n coordinates, in the order of a map's weights."""
-    return [e for degree in range(order + 1) for e in kronecker_exponents(n, degree)]

@@ -6,7 +6,7 @@ each x -> B + R x + x^T T x. The parts are composed to second order.
 
 import cmath
 import functools
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TypeVar
@@ -175,8 +175,12 @@ def quadratic_maps(elements: Sequence[Element], energy: float, n: int) -> Quadra
     Raises:
         LatticeError: a map is not finite, or it loses energy, which needs six coordinates.
     """
-    # a cavity's gain depends on the turn, see `beam.rf`
-    given = [_empty(element) if element.kind == "cavity" else element for element in elements]
+    from tmlattice.lattice.ocelot import elements as ocelot
+
+    # a cavity is a drift: its gain depends on the turn, see `beam.rf`
+    given = [
+        replace(e, source=ocelot.Drift(l=e.length)) if e.kind == "cavity" else e for e in elements
+    ]
     wrong = [element for element in given if element.errors != NO_ERRORS]
     with_errors = iter(_with_errors(wrong, energy, n).each() if wrong else ())
     total = stacked([
@@ -227,13 +231,6 @@ def _in_the_middle(element: Element) -> tuple[float, float]:
     return x, y
 
 
-def _empty(element: Element) -> Element:
-    """Return the same element as a drift."""
-    from tmlattice.lattice.ocelot import elements
-
-    return replace(element, source=elements.Drift(l=element.length))
-
-
 def composed(parts: Iterable[Quadratic | None]) -> Quadratic:
     """Return the parts composed in beam order; None is the identity."""
     given = [part for part in parts if part is not None]
@@ -266,28 +263,32 @@ def _thin(
     n: int, kick_x: Array, kick_y: Array, k1l: Array, k1sl: Array, slopes: Array
 ) -> Quadratic | None:
     """px += kick_x - k1l x + k1sl y, py += kick_y + k1l y + k1sl x, and the slopes' kicks."""
-    if not any(own.any() for own in (kick_x, kick_y, k1l, k1sl, slopes)):
+    return _linear(n, (kick_x, kick_y, k1l, k1sl, slopes), {1: kick_x, 3: kick_y}, {
+        (1, 0): slopes[:, 0] - k1l, (1, 2): slopes[:, 1] + k1sl,
+        (3, 0): slopes[:, 2] + k1sl, (3, 2): slopes[:, 3] + k1l,
+    })  # fmt: skip
+
+
+def _linear(
+    n: int,
+    changes: Iterable[Array],
+    B: Mapping[int, Array],
+    R: Mapping[tuple[int, int], Array],
+) -> Quadratic | None:
+    """Linear maps [map] with these entries of B and R, else the identity's; None: no changes."""
+    if not any(own.any() for own in changes):
         return None
-    B, R = _nothing(n, len(k1l))
-    B[:, 1], B[:, 3] = kick_x, kick_y
-    R[:, 1, 0] = slopes[:, 0] - k1l
-    R[:, 1, 2] = slopes[:, 1] + k1sl
-    R[:, 3, 0] = slopes[:, 2] + k1sl
-    R[:, 3, 2] = slopes[:, 3] + k1l
-    return Quadratic(B, R, None)
-
-
-def _nothing(n: int, count: int) -> tuple[Array, Array]:
-    """B and R of identities."""
-    return np.zeros((count, n)), np.tile(np.eye(n), (count, 1, 1))
+    count = len(next(iter((*B.values(), *R.values()))))
+    total = Quadratic(np.zeros((count, n)), np.tile(np.eye(n), (count, 1, 1)), None)
+    for i, constant in B.items():
+        total.B[:, i] = constant
+    for (i, j), entry in R.items():
+        total.R[:, i, j] = entry
+    return total
 
 
 def _shift(n: int, dx: Array, dy: Array) -> Quadratic | None:
-    if not (dx.any() or dy.any()):
-        return None
-    B, R = _nothing(n, len(dx))
-    B[:, 0], B[:, 2] = dx, dy
-    return Quadratic(B, R, None)
+    return _linear(n, (dx, dy), {0: dx, 2: dy}, {})
 
 
 def _way(n: int, length: Array, energy: float) -> Quadratic | None:
@@ -310,30 +311,22 @@ def _metre(n: int, energy: float) -> Quadratic:
 
 def _turn(n: int, roll: Array) -> Quadratic | None:
     """Rotations to axes that are turned by `roll` from x towards y."""
-    if not roll.any():
-        return None
-    B, R = _nothing(n, len(roll))
-    for i in (0, 1):
-        R[:, i, i] = R[:, i + 2, i + 2] = np.cos(roll)
-        R[:, i, i + 2] = np.sin(roll)
-        R[:, i + 2, i] = -np.sin(roll)
-    return Quadratic(B, R, None)
+    cosine, sine = np.cos(roll), np.sin(roll)
+    return _linear(n, (roll,), {}, {
+        (0, 0): cosine, (0, 2): sine, (1, 1): cosine, (1, 3): sine,
+        (2, 2): cosine, (2, 0): -sine, (3, 3): cosine, (3, 1): -sine,
+    })  # fmt: skip
 
 
 def _loss(n: int, loss: Array, elements: Sequence[Element]) -> Quadratic | None:
     """Energy losses of loss (1 + p)^2; the slopes stay, so the momenta fall with it."""
-    if not loss.any():
-        return None
-    if n != 6:
+    if loss.any() and n != 6:
         losing = elements[int(np.flatnonzero(loss)[0])]
         raise LatticeError(
             f"{losing.kind} '{losing.name}' loses energy, which needs six coordinates (dimension=6)"
         )
-    B, R = _nothing(n, len(loss))
-    B[:, 5] = -loss
-    R[:, 5, 5] = 1 - 2 * loss
-    R[:, 1, 1] = R[:, 3, 3] = 1 - loss
-    return Quadratic(B, R, None)
+    kept = 1 - loss
+    return _linear(n, (loss,), {5: -loss}, {(5, 5): 1 - 2 * loss, (1, 1): kept, (3, 3): kept})
 
 
 def drift(length: float, n: int) -> Quadratic:

@@ -20,14 +20,26 @@ from numpy.typing import ArrayLike, NDArray
 from tmlattice.arrays import Array
 
 Indices = NDArray[np.intp]
+Exponents = tuple[int, ...]
 
 
-def kronecker_exponents(n: int, degree: int) -> list[tuple[int, ...]]:
+def kronecker_exponents(n: int, degree: int) -> list[Exponents]:
     """Exponents of the monomials of one degree in n variables, in the reduced Kronecker order."""
     return [
         tuple(variables.count(i) for i in range(n))
         for variables in combinations_with_replacement(range(n), degree)
     ]
+
+
+def exponents_up_to(n: int, order: int) -> list[Exponents]:
+    """Return exponents of degree 0 to `order` in n coordinates, in the order of a map's weights."""
+    return [e for degree in range(order + 1) for e in kronecker_exponents(n, degree)]
+
+
+def parent_of(exponents: Exponents) -> tuple[Exponents, int]:
+    """Return the monomial with one factor less, and the index of that factor."""
+    variable = next(i for i, e in enumerate(exponents) if e)
+    return tuple(e - (i == variable) for i, e in enumerate(exponents)), variable
 
 
 def second_derivatives(W2: Array) -> Array:
@@ -84,16 +96,11 @@ class _Table:
 
 @functools.cache
 def _table(n: int, order: int) -> _Table:
-    rows: list[tuple[int, ...]] = []
-    starts = [0]
-    for degree in range(order + 1):
-        rows += kronecker_exponents(n, degree)
-        starts.append(len(rows))
+    rows = exponents_up_to(n, order)
+    starts = [0, *(comb(n + degree, degree) for degree in range(order + 1))]
     index = {row: i for i, row in enumerate(rows)}
     parents = [(0, 0)]
-    for row in rows[1:]:
-        variable = next(i for i in range(n) if row[i])
-        below = tuple(e - (i == variable) for i, e in enumerate(row))
+    for below, variable in map(parent_of, rows[1:]):
         parents.append((index[below], variable))
     left, right, target = [], [], []
     for i, a in enumerate(rows):
@@ -236,9 +243,8 @@ class TaylorMap:
 
     def _derivative(self, i: int) -> Array:
         """Rows over monomials up to order - 1 of the derivative by x_i."""
-        lower = _table(self.n, self.order - 1)
-        index = {tuple(row): k for k, row in enumerate(lower.exponents.tolist())}
-        rows = np.zeros((self.n, len(lower.exponents)))
+        index = {row: k for k, row in enumerate(exponents_up_to(self.n, self.order - 1))}
+        rows = np.zeros((self.n, len(index)))
         for k, exponents in enumerate(self._table.exponents.tolist()):
             if exponents[i]:
                 below = list(exponents)

@@ -182,11 +182,8 @@ def _reverse(monitors: Sequence[str]) -> Order:
 
 def _alphabet(monitors: Sequence[str]) -> Order:
     """The readings stand in the order of the sorted names."""
-    ranks = np.empty(len(monitors), dtype=np.intp)
-    ranks[np.argsort(np.array([name.casefold() for name in monitors]), kind="stable")] = np.arange(
-        len(monitors)
-    )
-    return ranks
+    names = np.array([name.casefold() for name in monitors])
+    return np.argsort(np.argsort(names, kind="stable"))
 
 
 def _no_noise(data: Measurement) -> Measurement:
@@ -327,16 +324,14 @@ _TABLE: tuple[_Row, ...] = (
      SIGN.format("x and y"), _sign, -1, -1),
     ("planes-swapped", (*_READ, TuneReading), "x and y are swapped everywhere",
      "swap x and y", _exchanged),
-    ("readings-in-mm", _ORBITS, "the readings are in mm", UNIT.format("them", "m"), _unit, 1e-3),
-    ("readings-in-um", _ORBITS, "the readings are in µm", UNIT.format("them", "m"), _unit, 1e-6),
-    ("readings-in-nm", _ORBITS, "the readings are in nm", UNIT.format("them", "m"), _unit, 1e-9),
-    ("readings-in-cm", _ORBITS, "the readings are in cm", UNIT.format("them", "m"), _unit, 1e-2),
-    ("readings-in-inches", _ORBITS, "the readings are in inches", UNIT.format("them", "m"), _unit,
-     0.0254),
-    ("readings-in-km", _ORBITS, "the readings are a thousand times too small",
-     UNIT.format("them", "m"), _unit, 1e3),
-    ("readings-in-Mm", _CHANGES, "the readings are a million times too small",
-     UNIT.format("them", "m"), _unit, 1e6),
+    *((f"readings-in-{unit}", kinds, f"the readings are {words}", UNIT.format("them", "m"), _unit,
+       factor) for unit, kinds, words, factor in (
+        ("mm", _ORBITS, "in mm", 1e-3), ("um", _ORBITS, "in µm", 1e-6),
+        ("nm", _ORBITS, "in nm", 1e-9), ("cm", _ORBITS, "in cm", 1e-2),
+        ("inches", _ORBITS, "in inches", 0.0254),
+        ("km", _ORBITS, "a thousand times too small", 1e3),
+        ("Mm", _CHANGES, "a million times too small", 1e6),
+    )),
     ("readings-doubled", (*_FIRST, *_RESPONSE), "the readings are twice what they should be",
      "halve them", _unit, 0.5),
     ("readings-halved", (*_FIRST, *_RESPONSE), "the readings are half of what they should be",

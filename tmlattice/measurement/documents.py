@@ -60,32 +60,13 @@ def _misspelt(document: dict[str, Any], schema: dict[str, Any]) -> str | None:
     return None
 
 
-class Digest:
-    """Digest that proves that a table was written together with its measurement.json.
-
-    Lines may end as any system ends them.
-    """
-
-    def __init__(self) -> None:
-        self._sum = hashlib.sha256()
-
-    def add(self, text: bytes) -> None:
-        """More of the table."""
-        self._sum.update(text.replace(b"\r", b""))
-
-    def told(self) -> str:
-        """64 characters."""
-        return self._sum.hexdigest()
-
-
 def check_table(document: dict[str, Any], table: Path) -> None:
     """Whether a table is whole, and belongs to its document, where that holds a digest;
     MeasurementError: it cannot be read, or is another."""
     if (stated := document.get("table_sha256")) is None:
         return
-    digest = Digest()
-    digest.add(content_of(table, MeasurementError))
-    if digest.told() != stated:
+    content = content_of(table, MeasurementError).replace(b"\r", b"")  # of any system's lines
+    if hashlib.sha256(content).hexdigest() != stated:
         raise MeasurementError(
             f"{table}: it is not the table that measurement.json was written with: cut off, "
             'damaged or changed; copy it anew, or, if you changed it, take "table_sha256" out of '

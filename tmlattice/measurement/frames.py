@@ -46,19 +46,14 @@ def to_dataframe(measured: AnyMeasurement) -> Any:
     units = {"x": "m", "y": "m"} if "x" in frame.columns else {}
     if isinstance(measured, OrbitResponse):
         units["kick"] = "rad"
-        for column, values in _of_columns(measured).items():
-            frame[column] = frame["corrector"].map(values)
+        kicks = dict(zip(measured.correctors, measured.kicks.tolist(), strict=True))
+        planes = dict(zip(measured.correctors, measured.planes, strict=True))
+        if measured.rf is not None:
+            kicks["rf"], planes["rf"] = measured.rf.step, ""
+        frame["kick"] = frame["corrector"].map(kicks)
+        frame["plane"] = frame["corrector"].map(planes)
     frame.attrs = {"units": units, ATTRIBUTE: document}
     return frame
-
-
-def _of_columns(response: OrbitResponse) -> dict[str, dict[str, Any]]:
-    """Kick and plane by the name of the corrector."""
-    kicks = dict(zip(response.correctors, response.kicks.tolist(), strict=True))
-    planes = dict(zip(response.correctors, response.planes, strict=True))
-    if response.rf is not None:
-        kicks["rf"], planes["rf"] = response.rf.step, ""
-    return {"kick": kicks, "plane": planes}
 
 
 def to_xarray(measured: AnyMeasurement) -> Any:

@@ -3,7 +3,8 @@ table, and a writer of the table that completes the document.
 """
 
 import csv
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -62,36 +63,22 @@ def _read(
     return names, readings
 
 
-def _trajectory(file: Path, document: Document, monitors: Known) -> Measurement:
+def _of_shots(
+    file: Path, document: Document, monitors: Known
+) -> Measurement | TurnByTurn | ClosedOrbit:
+    record = KINDS[document["kind"]].record
     shots, settings = _shots(file, document)
-    with located(file):
-        launches, sigma = _launches(document["shots"])
+    own: dict[str, Any] = {"shots": shots, "settings": settings}
+    if record is Measurement:
+        with located(file):
+            own["launches"], own["launch_sigma"] = _launches(document["shots"])
     names, readings = _read(file, document, shots, monitors)
+    own[record.READ] = readings if "turn" in record.AXES else readings[:, 0]
     with located(file):
-        common = _common(document, names, monitors)
-        return Measurement(
-            launches, readings, names, launch_sigma=sigma, settings=settings, shots=shots,
-            devices=document.get("devices") or {}, **common,
-        )  # fmt: skip
-
-
-def _turn_by_turn(file: Path, document: Document, monitors: Known) -> TurnByTurn:
-    shots, settings = _shots(file, document)
-    names, readings = _read(file, document, shots, monitors)
-    with located(file):
-        common = _common(document, names, monitors)
-        devices = document.get("devices") or {}
-        return TurnByTurn(
-            readings, names, settings=settings, shots=shots, devices=devices, **common
+        made: Measurement | TurnByTurn | ClosedOrbit = record(
+            monitors=names, **own, **_common(document, names, monitors)
         )
-
-
-def _closed_orbit(file: Path, document: Document, monitors: Known) -> ClosedOrbit:
-    shots, settings = _shots(file, document)
-    names, orbit = _read(file, document, shots, monitors)
-    with located(file):
-        common = _common(document, names, monitors)
-        return ClosedOrbit(orbit[:, 0], names, settings=settings, shots=shots, **common)
+        return made
 
 
 def _dispersion(file: Path, document: Document, monitors: Known) -> Dispersion:
@@ -161,7 +148,7 @@ def _orbit_response(file: Path, document: Document, monitors: Known) -> OrbitRes
             correctors.names, tuple(column["plane"] for column in columns),
             np.array([column["kick"] for column in columns], dtype=float), names, response[:-1],
             rf=rf and _rf_step(rf, response[-1] if dispersion else None),
-            devices=document.get("devices") or {}, **_common(document, names, monitors),
+            **_common(document, names, monitors),
         )  # fmt: skip
 
 
@@ -178,11 +165,15 @@ def _written_rf(rf: RfStep) -> Document:
 
 
 def _common(document: Document, read: Sequence[str], known: Known) -> dict[str, Any]:
-    return {
+    """Fields of all records, and those of some."""
+    common = {
         "noise": read_noise(document.get("noise"), read, known),
         "lattice": document.get("lattice"),
         "energy": document.get("energy_gev"),
     }
+    if any(field.name == "devices" for field in dataclass_fields(KINDS[document["kind"]].record)):
+        common["devices"] = document.get("devices") or {}
+    return common
 
 
 def _shots(file: Path, document: Document) -> tuple[tuple[int, ...], tuple[Settings, ...]]:
@@ -230,29 +221,35 @@ def places_of(rows: Rows, column: str, known: Sequence[int]) -> Indices:
 
 
 # --- writing --------------------------------------------------------------------------------------
+def _write_rows(
+    table: TextIO,
+    columns: Sequence[str],
+    monitors: Sequence[str],
+    rows: Iterable[tuple[str, Array]],
+) -> None:
+    """Write the header and rows of readings: what they begin with, and [monitor, 2], m."""
+    table.write(",".join(columns) + "\n")
+    names = quoted(monitors)
+    for start, readings in rows:
+        check_size(readings, monitors)
+        table.writelines(reading_lines(f"{start},", names, readings.tolist()))
+
+
 def _write_turns(table: TextIO, m: TurnByTurn) -> Document:
-    check_size(m.readings, m.monitors)
-    table.write(",".join(TURNS) + "\n")
-    names = quoted(m.monitors)
-    for shot, turns in zip(m.shots, m.readings, strict=True):
-        for turn, row in enumerate(turns.tolist()):
-            table.writelines(reading_lines(f"{shot},{turn},", names, row))
+    shots = zip(m.shots, m.readings, strict=True)
+    rows = ((f"{shot},{turn}", own) for shot, turns in shots for turn, own in enumerate(turns))
+    _write_rows(table, TURNS, m.monitors, rows)
     return header("turn_by_turn", m) | _written_shots(m)
 
 
 def _write_orbits(table: TextIO, m: ClosedOrbit) -> Document:
-    check_size(m.orbit, m.monitors)
-    table.write(",".join(ORBITS) + "\n")
-    for shot, row in zip(m.shots, m.orbit.tolist(), strict=True):
-        table.writelines(reading_lines(f"{shot},", quoted(m.monitors), row))
+    _write_rows(table, ORBITS, m.monitors, zip(map(str, m.shots), m.orbit, strict=True))
     return header("closed_orbit", m) | _written_shots(m)
 
 
 def _write_dispersion(table: TextIO, m: Dispersion) -> Document:
-    check_size(m.orbits, m.monitors)
-    table.write(",".join(STEPS) + "\n")
-    for step, row in enumerate(m.orbits.tolist()):
-        table.writelines(reading_lines(f"{step},", quoted(m.monitors), row))
+    rows = ((str(i), orbit) for i, orbit in enumerate(m.orbits))
+    _write_rows(table, STEPS, m.monitors, rows)
     return header("dispersion", m) | {"steps": [_written_rf(step) for step in m.steps]}
 
 
@@ -277,11 +274,9 @@ def write_response_table(
 ) -> None:
     """Write orbit changes as the table of an orbit response's folder (orbits: a corrector's name,
     or "rf", and its orbit change, m, [monitor, 2])."""
-    table.write(",".join(RESPONSE) + "\n")
-    names = quoted(monitors)
-    for start, (_, orbit) in zip(quoted([name for name, _ in orbits]), orbits, strict=True):
-        check_size(orbit, monitors)
-        table.writelines(reading_lines(f"{start},", names, orbit.tolist()))
+    starts = quoted([name for name, _ in orbits])
+    rows = ((start, orbit) for start, (_, orbit) in zip(starts, orbits, strict=True))
+    _write_rows(table, RESPONSE, monitors, rows)
 
 
 def _write_tunes(table: TextIO, m: TuneReading) -> Document:
@@ -339,7 +334,7 @@ def reading_lines(
 class Kind(NamedTuple):
     """One kind of measurement: its record, and how a folder of it is handled."""
 
-    record: type
+    record: Any
     table: str
     columns: tuple[str, ...]
     read: Callable[[Path, Document, Known], Any]
@@ -348,13 +343,13 @@ class Kind(NamedTuple):
 
 
 STORED = {
-    "turn_by_turn": Kind(TurnByTurn, "readings.csv", TURNS, _turn_by_turn, _write_turns),
-    "closed_orbit": Kind(ClosedOrbit, "readings.csv", ORBITS, _closed_orbit, _write_orbits),
+    "turn_by_turn": Kind(TurnByTurn, "readings.csv", TURNS, _of_shots, _write_turns),
+    "closed_orbit": Kind(ClosedOrbit, "readings.csv", ORBITS, _of_shots, _write_orbits),
     "dispersion": Kind(Dispersion, "readings.csv", STEPS, _dispersion, _write_dispersion),
     "tunes": Kind(TuneReading, "tunes.csv", TUNES, _tunes, _write_tunes),
 }
 KINDS = {
-    "trajectory": Kind(Measurement, "readings.csv", TURNS, _trajectory, None),
+    "trajectory": Kind(Measurement, "readings.csv", TURNS, _of_shots, None),
     "orbit_response": Kind(
         OrbitResponse, "response.csv", RESPONSE, _orbit_response, _write_response
     ),

@@ -106,14 +106,20 @@ def _planes(data: Data) -> Data:
 def _turns(data: Data) -> Data:
     """Without turns in which all BPMs read one constant, where other turns of the shot are none."""
     there = np.isfinite(data.readings)
-    high = np.where(there, data.readings, -np.inf).max(axis=2)
-    low = np.where(there, data.readings, np.inf).min(axis=2)
     read = there.any(axis=(2, 3)) & (there.any(axis=3).sum(axis=2) >= FEWEST)
-    constant = read & ((high == low) | ~there.any(axis=2)).all(axis=2)
+    constant = read & constant_or_none(data.readings, 2).all(axis=2)
     constant &= (read & ~constant).any(axis=1, keepdims=True)
     if exact(data) or not constant.any():
         return data
     return replace(data, readings=np.where(constant[..., None, None], np.nan, data.readings))
+
+
+def constant_or_none(readings: Array, axis: int) -> Flags:
+    """Where all that was read along an axis is one number, or nothing is."""
+    there = np.isfinite(readings)
+    high = np.where(there, readings, -np.inf).max(axis=axis)
+    low = np.where(there, readings, np.inf).min(axis=axis)
+    return np.asarray(high <= low)
 
 
 def exact(data: Data) -> bool:
@@ -141,9 +147,7 @@ def _frozen_from(readings: Array, there: Flags) -> int:
     """The first of the last readings [shot, reading, 2] that are each the same in all shots."""
     count = readings.shape[1]
     several = there.sum(axis=0) > 1  # [reading, plane]
-    high = np.where(there, readings, -np.inf).max(axis=0)
-    low = np.where(there, readings, np.inf).min(axis=0)
-    stuck = (several & (high == low)) | ~there.any(axis=0)
+    stuck = (several | ~there.any(axis=0)) & constant_or_none(readings, 0)
     signal = np.flatnonzero(~stuck.all(axis=1))
     start = int(signal[-1]) + 1 if len(signal) else 0
     number = int(several[start:].any(axis=1).sum())

@@ -212,10 +212,3 @@ def places_of(kind: str, known: Sequence[str], wanted: Sequence[str]) -> list[in
     """Where the wanted monitors, or correctors, stand among the known ones."""
     names = Names(kind, known)
     return [names[name] for name in wanted]
-
-
-def spread(values: Array, places: Sequence[int], number: int) -> Array:
-    """[..., monitor, 2] among `number` monitors: NaN where there was none."""
-    full = np.full((*values.shape[:-2], number, 2), np.nan)
-    full[..., places, :] = values
-    return full

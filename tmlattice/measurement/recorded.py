@@ -13,7 +13,7 @@ import numpy as np
 from tmlattice.arrays import Array, Flags
 from tmlattice.errors import MeasurementError, first_of
 from tmlattice.measurement.assume import in_beam_order, read_of, with_read
-from tmlattice.measurement.lost_beam import beam_lost, exact
+from tmlattice.measurement.lost_beam import beam_lost, constant_or_none, exact
 from tmlattice.measurement.monitors import LARGEST_READING
 from tmlattice.measurement.orbit_response import OrbitResponse
 from tmlattice.measurement.shots import ClosedOrbit, TurnByTurn
@@ -208,9 +208,7 @@ def _again(readings: Array) -> Flags:
 def _stuck(readings: Array) -> Flags:
     """Which signals [monitor, 2] of readings [.., monitor, 2] are always the same."""
     flat = readings.reshape(-1, *readings.shape[-2:])
-    there = np.isfinite(flat)
-    high = np.where(there, flat, -np.inf).max(axis=0)
-    return np.asarray((there.sum(axis=0) > 2) & ((flat == high) | ~there).all(axis=0))
+    return np.asarray((np.isfinite(flat).sum(axis=0) > 2) & constant_or_none(flat, 0))
 
 
 def _ends(readings: Array) -> tuple[Flags, Flags]:

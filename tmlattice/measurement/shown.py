@@ -8,7 +8,7 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.late import ClassMethod, Method
-from tmlattice.measurement.monitors import places_of, spread
+from tmlattice.measurement.monitors import places_of
 from tmlattice.speaks import Speaks, counted, last_part
 
 
@@ -99,7 +99,13 @@ class OfMonitors(Shown):
             UnknownNameError: this measurement has a monitor that is not among them.
         """
         places = places_of("BPM", monitors, vars(self)["monitors"])
-        return self._of(monitors, lambda values: spread(values, places, len(monitors)))
+
+        def spread(values: Array) -> Array:
+            full = np.full((*values.shape[:-2], len(monitors), 2), np.nan)
+            full[..., places, :] = values
+            return full
+
+        return self._of(monitors, spread)
 
     def at_monitors(self, monitors: Sequence[str]) -> Self:
         """A part of the monitors, in the order asked for.

@@ -1,5 +1,6 @@
 """Writing the measurement folder, format version 1: see `measurement.folder`."""
 
+import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -11,7 +12,6 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError
 from tmlattice.files import output_folder, write_json
-from tmlattice.measurement.documents import Digest
 from tmlattice.measurement.folder import AnyMeasurement
 from tmlattice.measurement.header import finite, header
 from tmlattice.measurement.kinds import KINDS, TURNS, plain_settings, quoted, reading_lines
@@ -39,12 +39,9 @@ def write_measurement(folder: str | Path, measurement: AnyMeasurement, force: bo
             assert kind.write is not None
             with table.open("w", encoding="utf-8", newline="") as file:
                 document = kind.write(file, measurement)
-            digest = Digest()
             with table.open("rb") as written:
-                while part := written.read(1 << 20):
-                    digest.add(part)
-            signed = {**document, "table_sha256": digest.told()}
-            write_json(temporary / "measurement.json", signed)
+                digest = hashlib.file_digest(written, "sha256").hexdigest()
+            write_json(temporary / "measurement.json", {**document, "table_sha256": digest})
         return
     m = measurement
     with measurement_writer(
@@ -102,7 +99,7 @@ class MeasurementWriter:
             indent=2, ensure_ascii=False, allow_nan=False,
         )  # fmt: skip
         document.write(start.removesuffix("\n}") + ',\n  "shots": [')
-        self._digest = Digest()
+        self._digest = hashlib.sha256()  # proves that table and document were written together
         self._write([",".join(TURNS) + "\n"])
         self._names = quoted(self.monitors)
 
@@ -153,7 +150,7 @@ class MeasurementWriter:
 
     def _write(self, lines: Iterable[str]) -> None:
         text = "".join(lines)
-        self._digest.add(text.encode())
+        self._digest.update(text.encode())
         self._table.write(text)
 
     def close(self) -> None:
@@ -164,7 +161,7 @@ class MeasurementWriter:
         """
         if not self._some:
             raise MeasurementError("no reading was written; a measurement has one at least")
-        self._document.write(f'\n  ],\n  "table_sha256": "{self._digest.told()}"\n}}\n')
+        self._document.write(f'\n  ],\n  "table_sha256": "{self._digest.hexdigest()}"\n}}\n')
 
 
 def _coordinates(values: Any, what: str) -> dict[str, float | None]:
