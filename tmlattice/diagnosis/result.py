@@ -308,7 +308,7 @@ class Diagnosis(Speaks):
     )
 
     def _told(self) -> tuple[str, dict[str, str]]:
-        explained = self.heldout and self.heldout.explained
+        explained = None if self.heldout is None else self.heldout.explained
         rows = {"of": f"{self.kind} of {last_part(self.ring.name)}"}
         for number, finding in enumerate(self.findings[:MOST], 1):
             rows[f"finding {number}"] = finding.in_short
