@@ -21,6 +21,8 @@ from tmlattice.maps import ring_matrix
 from tmlattice.maps.magnets import way_map
 from tmlattice.optics import ring_tunes
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 ENERGY = 3.0
 
 FODO = """

@@ -20,6 +20,8 @@ from tmlattice.importers.stated import Stated
 from tmlattice.machine_file import load_machine_file
 from tmlattice.measurement.lost_beam import beam_lost
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 
 @pytest.fixture(scope="module")
 def data(small_ring):
