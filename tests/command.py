@@ -1,7 +1,9 @@
-"""`tmlattice` as a user calls it, in this process: without the seconds of a start."""
+"""`tmlattice` as a user calls it, in this process: without the seconds of a start; Python, in one
+of its own."""
 
 import contextlib
 import io
+import os
 import subprocess
 import sys
 import warnings
@@ -32,3 +34,19 @@ def tmlattice(*arguments, cwd, check=None):
     if check is not None:
         assert done.returncode == check, done.stdout + done.stderr
     return done
+
+
+def python(*words, cwd, **environment):
+    """`python WORDS` in a process of its own, with another environment; None takes a name out."""
+    changed = {**os.environ, **environment}
+    return subprocess.run(
+        [sys.executable, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False,
+        env={name: str(value) for name, value in changed.items() if value is not None},
+    )  # fmt: skip
+
+
+def printed(*words, cwd, **environment):
+    """What `python WORDS` prints; it ends well."""
+    done = python(*words, cwd=cwd, **environment)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout

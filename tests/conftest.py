@@ -86,6 +86,7 @@ def forked_readers():
     """Binary files are read by copies of this process, which have the libraries already."""
     import h5py  # noqa: F401
     import scipy.io  # noqa: F401
+    import turn_by_turn  # noqa: F401
 
     sys.path.append(str(Path(__file__).parent / "fuzz"))
     from contract import forked

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import termios
 import time
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +30,6 @@ from tmlattice.network import load_network
 from tmlattice.optics import matrix_tunes, one_turn_optics
 
 QUICK = ["--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--epochs", "20"]
-
-
-def schema(name):
-    return json.loads((files("tmlattice") / "schemas" / f"{name}.schema.json").read_text())
 
 
 @pytest.fixture(scope="module")

@@ -374,7 +374,7 @@ def test_names_under_the_bars_of_the_gap_do_not_overlap(diagnoses, count):
 
 def test_a_fine_tuned_network_is_read_as_physics(folders, tmp_path):
     fitted = tmlattice(
-        "tune-fit", SMALL, "--measurement", folders / "weak", "--epochs", 50, "--out", "fit",
+        "tune-fit", SMALL, "--measurement", folders / "weak", "--method", "sparse", "--out", "fit",
         cwd=tmp_path, check=0,
     )  # fmt: skip
     assert "network.pt" in fitted.stdout

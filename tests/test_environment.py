@@ -8,7 +8,7 @@ import time
 
 import psutil
 import pytest
-from command import tmlattice
+from command import python, tmlattice
 from conftest import SMALL
 
 from tmlattice.temporaries import PREFIX
@@ -23,20 +23,16 @@ def data(tmp_path_factory):
 
 
 def run(folder, *words, **environment):
-    """The command in a process of its own, with another environment; None takes a name out."""
-    changed = {**os.environ, **environment}
-    return subprocess.run(
-        [sys.executable, "-m", "tmlattice", *words], cwd=folder, capture_output=True, check=False,
-        env={name: value for name, value in changed.items() if value is not None},
-    )  # fmt: skip
+    """The command in a process of its own, with another environment."""
+    return python("-m", "tmlattice", *words, cwd=folder, **environment)
 
 
 def test_a_stream_of_few_letters_spells_units(data):
     done = run(data, "diagnose", "ring.py", "M", PYTHONIOENCODING="ascii")
     assert done.returncode == 0, done.stderr
-    text = done.stdout.decode("ascii")
-    assert " um in x" in text
-    assert "chi^2" in text
+    assert done.stdout.isascii()
+    assert " um in x" in done.stdout
+    assert "chi^2" in done.stdout
     (data / "µ.csv").write_text("no table")
     done = run(data, "check", "ring.py", "µ.csv", PYTHONIOENCODING="ascii")
     assert done.returncode == 2

@@ -19,6 +19,8 @@ from tmlattice.lattice.mat_file import read_mat
 from tmlattice.measurement import read_turn_by_turn
 from tmlattice.observe.calibration import read_calibration
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 NAMES = [f"bpm{i}" for i in range(6)]
 
 

@@ -1,12 +1,10 @@
 """The package away from its repository: wheel, editable, plain install, missing extras."""
 
-import os
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from command import printed, python
 from conftest import SMALL
 
 ROOT = Path(__file__).parent.parent
@@ -19,47 +17,24 @@ CHECK = (
 )
 
 
-def run(*arguments, cwd):
-    done = subprocess.run(
-        [sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     # the sdist, and the wheel from that
-    run("-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT), cwd=folder)
+    printed("-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT), cwd=folder)
     (built,) = folder.glob("*.whl")
     return built
 
 
 def test_wheel_in_an_empty_folder_brings_the_ring(wheel, tmp_path):
     place = tmp_path / "site"
-    run(
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--target",
-        str(place),
-        str(wheel),
-        cwd=tmp_path,
-    )
+    printed("-m", "pip", "install", "--quiet", "--no-deps", "--target", place, wheel, cwd=tmp_path)
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert run("-I", "-c", CHECK.format(place=str(place)), cwd=empty).split()[:2] == ["1519", "246"]
-    for name in (
-        "py.typed",
-        "schemas/tune-fit.schema.json",
-        "lattices/match_petra3.py",
-        "report/page.js",
-        "report/style.css",
-        "report/vendor/plotly-LICENSE",
-    ):
+    said = printed("-I", "-c", CHECK.format(place=str(place)), cwd=empty)
+    assert said.split()[:2] == ["1519", "246"]
+    for name in ("py.typed", "schemas/tune-fit.schema.json", "lattices/match_petra3.py",
+                 "report/page.js", "report/style.css", "report/vendor/plotly-LICENSE"):  # fmt: skip
         assert (place / "tmlattice" / name).exists(), name
     assert not (place / "tests").exists()
 
@@ -69,15 +44,13 @@ def test_installed_command_is_there(tmp_path):
 
     (command,) = entry_points(group="console_scripts", name="tmlattice")
     assert command.value == "tmlattice.cli:main"
-    assert run(
+    assert printed(
         "-I", "-c", "import tmlattice; print(tmlattice.load_ring('petra3').name)", cwd=tmp_path
     )
 
 
 def test_the_conda_recipe_asks_for_what_pip_does():
     """Names that differ between the two stand here; versions and the rest are the same."""
-    import tomllib
-
     import yaml
 
     from tmlattice import __version__
@@ -96,8 +69,6 @@ def test_the_conda_recipe_asks_for_what_pip_does():
 
 
 def test_a_plain_install_takes_nothing_that_only_studies_need():
-    import tomllib
-
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     plain = {wanted.partition(">=")[0] for wanted in project["dependencies"]}
     assert not plain & {"distributed", "dask", "scikit-learn", "torch"}
@@ -117,14 +88,8 @@ PLAIN = (
 
 
 def plain(code, folder, *arguments):
-    return subprocess.run(
-        [sys.executable, "-c", PLAIN + code, *map(str, arguments)],
-        env={**os.environ, "TMLATTICE_CACHE": str(folder / "cache")},
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    cache = folder / "cache"
+    return python("-c", PLAIN + code, *arguments, cwd=folder, TMLATTICE_CACHE=cache)
 
 
 def test_a_plain_install_simulates_diagnoses_and_reports(tmp_path):

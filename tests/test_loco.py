@@ -134,11 +134,16 @@ FORMS = {
 }  # fmt: skip
 
 
+@pytest.fixture
+def variables(simulated):  # noqa: F811
+    """Of the usual file; a test may change them."""
+    return copy.deepcopy(simulated)
+
+
 @pytest.mark.parametrize("form", FORMS)
-def test_other_forms_are_the_usual_one(simulated, brought, form):  # noqa: F811
-    usual = brought(simulated)
+def test_other_forms_are_the_usual_one(variables, brought, form):  # noqa: F811
+    usual = brought(variables)
     change, said = FORMS[form]
-    variables = copy.deepcopy(simulated)
     change(variables)
     found = brought(variables)
     assert any(said in sentence for sentence in found.assumed), found.assumed
@@ -156,8 +161,7 @@ def test_other_forms_are_the_usual_one(simulated, brought, form):  # noqa: F811
     assert found.ring.energy == pytest.approx(usual.ring.energy)
 
 
-def test_what_is_not_measured_is_left_out_and_said(simulated, brought):  # noqa: F811
-    variables = copy.deepcopy(simulated)
+def test_what_is_not_measured_is_left_out_and_said(variables, brought):  # noqa: F811
     data = variables["LocoMeasData"]
     data["Eta"], data["BPMSTD"] = 0 * data["Eta"], data["BPMSTD"][:7]
     variables["CMData"]["HCMKicks"][3] = np.nan
@@ -174,9 +178,8 @@ def test_what_is_not_measured_is_left_out_and_said(simulated, brought):  # noqa:
         assert any(said in sentence for sentence in found.assumed), found.assumed
 
 
-def test_zeros_that_no_bpm_reads_are_not_measured(simulated, brought):  # noqa: F811
+def test_zeros_that_no_bpm_reads_are_not_measured(variables, brought):  # noqa: F811
     """A block that was not recorded, a corrector, and the vertical dispersion."""
-    variables = copy.deepcopy(simulated)
     data = variables["LocoMeasData"]
     data["M"][:16, 16:] = data["M"][:, 3] = data["Eta"][16:] = 0.0
     found = brought(variables)
@@ -189,8 +192,7 @@ def test_zeros_that_no_bpm_reads_are_not_measured(simulated, brought):  # noqa: 
     assert np.isnan(found.measurement.rf.orbit).sum(axis=0).tolist() == [0, 16]
 
 
-def test_weights_are_no_noise(simulated, brought):  # noqa: F811
-    variables = copy.deepcopy(simulated)
+def test_weights_are_no_noise(variables, brought):  # noqa: F811
     variables["LocoMeasData"]["BPMSTD"] = np.ones(32)
     found = brought(variables)
     assert found.measurement.noise is None
@@ -211,9 +213,8 @@ def cells(things):
 
 
 @pytest.mark.parametrize("at_iteration", [0, 1, 2])
-def test_every_parameter_of_a_fit_is_as_before_it(simulated, brought, at_iteration):  # noqa: F811
+def test_every_parameter_of_a_fit_is_as_before_it(variables, brought, at_iteration):  # noqa: F811
     """Gradients, rolls, and skew gradients of a later iteration; saved after any of them."""
-    variables = copy.deepcopy(simulated)
     lattice = variables["RINGData"]["Lattice"]
     for element in lattice:
         if element["FamName"] == "BEND":
@@ -249,8 +250,7 @@ def test_every_parameter_of_a_fit_is_as_before_it(simulated, brought, at_iterati
     assert fitted["qf::0"].k1 == pytest.approx(1 + 0.01 * at_iteration)
 
 
-def test_an_energy_that_no_file_states_is_assumed_and_can_be_named(simulated, brought):  # noqa: F811
-    variables = copy.deepcopy(simulated)
+def test_an_energy_that_no_file_states_is_assumed_and_can_be_named(variables, brought):  # noqa: F811
     energy_of_globval(variables)
     del variables["GLOBVAL"]
     found = brought(variables)
@@ -438,9 +438,8 @@ def test_a_linear_wiggler_focuses(with_change, read):
 
 
 @pytest.mark.parametrize("energy", [None, ENERGY])
-def test_a_lattice_in_a_file_of_its_own(tmp_path, simulated, energy):  # noqa: F811
+def test_a_lattice_in_a_file_of_its_own(tmp_path, variables, energy):
     """It states its energy, or the user does."""
-    variables = copy.deepcopy(simulated)
     own = variables.pop("RINGData")["Lattice"]
     if energy:
         del own[-2]["Energy"]

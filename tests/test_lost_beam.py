@@ -15,6 +15,8 @@ from tmlattice.importers import Options, bring_in
 from tmlattice.measurement import TurnByTurn
 from tmlattice.measurement.lost_beam import beam_lost
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 FAULT = Cause("quadrupole_gradient", "QD::5", -0.2)
 LOST = 20
 """BPMs that have a signal."""

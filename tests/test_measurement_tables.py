@@ -8,6 +8,8 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice.binary_files import turns
 from tmlattice.measurement import read_measurement, read_table, read_turn_by_turn, tables
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 
 @pytest.fixture
 def table(tmp_path):

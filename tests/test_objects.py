@@ -22,6 +22,8 @@ from tmlattice.errors import LatticeError, TmlatticeError, UnknownNameError
 from tmlattice.lattice import save_ring
 from tmlattice.optics import matrix_tunes
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 HERE = Path(__file__).parent / "lattices"
 SHIPPED = Path(machine_data.__file__).parent
 PACKAGES = ("AT", "OCELOT", "xtrack", "MAD-X")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tmlattice import Cause, diagnose, simulate
-from tmlattice.challenge.kinds import measure
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 
@@ -88,24 +87,6 @@ def test_the_check_states_which_plane_was_not_read(petra3, plane):
 def test_both_planes_are_read(small_ring):
     found = check_data(small_ring, simulate(small_ring, shots=3).measurement())
     assert [check.status for check in found.checks if check.name == "planes"] == ["fine"]
-
-
-# --- of a stored beam -----------------------------------------------------------------------------
-def blank(values, plane):
-    """Without the other plane."""
-    values = values.copy()
-    values[..., 1 - PLANES.index(plane)] = np.nan
-    return values
-
-
-def stored(kind, ring, causes, plane):
-    data = measure(kind, ring, causes, 1.0, 2, seed=1)
-    if kind == "turn_by_turn":
-        return replace(data, readings=blank(data.readings, plane))
-    if kind == "closed_orbit":
-        return replace(data, orbit=blank(data.orbit, plane))
-    steps = (replace(step, orbit=blank(step.orbit, plane)) for step in data.steps)
-    return replace(data, steps=tuple(steps))
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,8 @@ from tmlattice.importers.stated import Stated
 from tmlattice.machine_file import load_machine_file
 from tmlattice.measurement.lost_beam import beam_lost
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 
 @pytest.fixture(scope="module")
 def data(small_ring):
@@ -378,7 +380,7 @@ def test_readings_of_matlab(small_ring, data, tmp_path, form):
     same(bring_in([tmp_path / "a.mat"], Options(ring=small_ring)), data)
 
 
-@pytest.mark.parametrize("name", ["a.sdds", "ring.clo", "watch.w1", "a.txt"])
+@pytest.mark.parametrize("name", ["a.sdds", "ring.clo", "a.txt"])
 @pytest.mark.parametrize("mode", ["ascii", "binary"])
 def test_columns_of_sdds_are_refused_in_a_sentence(small_ring, tmp_path, name, mode):
     """By any name: elegant writes closed orbits, centroids and watch points so."""

@@ -4,13 +4,13 @@ import io
 import json
 import os
 import shutil
-import subprocess
 import sys
 import threading
 import warnings
 
 import numpy as np
 import pytest
+from command import printed
 from conftest import SMALL
 from scipy import stats
 
@@ -22,17 +22,9 @@ from tmlattice.maps import element_map, ring_maps
 
 
 def python(code, folder, *arguments, **environment):
-    """What a fresh interpreter prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        env={**os.environ, "TMLATTICE_CACHE": str(folder / "cache"), **environment},
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
+    """What a fresh interpreter prints, with a cache of its own."""
+    own = {"TMLATTICE_CACHE": folder / "cache", **environment}
+    return printed("-c", code, *arguments, cwd=folder, **own)
 
 
 @pytest.fixture

@@ -161,83 +161,61 @@ def test_impossible_records_are_errors_with_a_reason(make, words):
         make()
 
 
-def folder_of(tmp_path, document, table, name="readings.csv"):
+def folder_of(tmp_path, kind, more, table):
     there = tmp_path / "m"
     there.mkdir()
-    stated = {"format": "tmlattice-measurement", "version": 1, **document}
+    stated = {"format": "tmlattice-measurement", "version": 1, "kind": kind, **more}
     (there / "measurement.json").write_text(json.dumps(stated))
+    name = "tunes.csv" if kind == "tunes" else "readings.csv"
     (there / name).write_text("\n".join(table) + "\n")
     return there
 
 
-SHOT = [{"id": 0}]
+SHOT = {"shots": [{"id": 0}]}
 STEP = {"frequency_hz": 5e8, "harmonic": 100, "step_hz": 100.0}
+HEADERS = {
+    "turn_by_turn": "shot,turn,monitor,x,y",
+    "closed_orbit": "shot,monitor,x,y",
+    "dispersion": "step,monitor,x,y",
+    "tunes": "shot,quantity,value,error",
+}
+LAUNCHED = {"shots": [{"id": 0, "launch": {"x": 0.0}}]}
 
 
 @pytest.mark.parametrize(
-    ("document", "table", "words"),
+    ("kind", "more", "rows", "words"),
     [
-        ({"kind": "turn_by_turn"}, ["shot"], 'it has no "shots"'),
-        (
-            {"kind": "turn_by_turn", "shots": [{"id": 0, "launch": {"x": 0.0}}]}, ["shot"],
-            r'shots\[0\] has the key "launch"; known are id, settings',
-        ),
-        (
-            {"kind": "turn_by_turn", "shots": SHOT},
-            ["shot,turn,monitor,x,y", "0,0,a,0,0", "1,0,a,0,0"],
-            "line 3: shot 1 is not among the shots",
-        ),
-        (
-            {"kind": "turn_by_turn", "shots": SHOT}, ["shot,turn,monitor,x,y", "0,0,a,0,0"],
-            "measurement.json: 1 turns are no turn-by-turn measurement",
-        ),
-        (
-            {"kind": "closed_orbit", "shots": SHOT}, ["shot,turn,monitor,x,y", "0,0,a,0,0"],
-            "its first line is shot,monitor,x,y",
-        ),
-        (
-            {"kind": "closed_orbit", "shots": SHOT}, ["shot,monitor,x,y", "0,a,1.5,0"],
-            "line 2: x = 1.5 m is above 0.2 m",
-        ),
-        (
-            {"kind": "closed_orbit", "shots": SHOT}, ["shot,monitor,x,y", "0,a,0,0", "0,A,0,0"],
-            "line 3: shot 0, monitor a stands in the table already",
-        ),
-        ({"kind": "closed_orbit", "shots": [*SHOT, *SHOT]}, ["shot"], "shot 0 stands twice"),
-        (
-            {"kind": "dispersion", "steps": [STEP]}, ["step,monitor,x,y", "1,a,0,0"],
-            "line 2: step 1 is not among the steps",
-        ),
-        ({"kind": "dispersion"}, ["step"], 'it has no "steps"'),
-        (
-            {"kind": "dispersion", "steps": [{**STEP, "step_hz": 0.0}]},
-            ["step,monitor,x,y", "0,a,0,0"], "measurement.json: an RF step of 0 Hz",
-        ),
-        (
-            {"kind": "tunes", "shots": SHOT}, ["shot,quantity,value,error", "0,tune_z,0.1,"],
-            "line 2: no quantity 'tune_z'; did you mean 'tune_",
-        ),
-        (
-            {"kind": "tunes", "shots": SHOT}, ["shot,quantity,value,error", "0,tune_x,a,"],
-            "line 2: value is 'a'; it should be a number, or empty",
-        ),
-        (
-            {"kind": "tunes", "shots": SHOT}, ["shot,quantity,value,error", "0,tune_x,1.1,"],
-            "measurement.json: a tune of 1.1 is no fraction",
-        ),
+        ("turn_by_turn", {}, [], 'it has no "shots"'),
+        ("turn_by_turn", LAUNCHED, [], r'shots\[0\] has the key "launch"; known are id, settings'),
+        ("turn_by_turn", SHOT, ["0,0,a,0,0", "1,0,a,0,0"], "line 3: shot 1 is not among the shots"),
+        ("turn_by_turn", SHOT, ["0,0,a,0,0"], "json: 1 turns are no turn-by-turn measurement"),
+        ("closed_orbit", SHOT, ["0,a,1.5,0"], "line 2: x = 1.5 m is above 0.2 m"),
+        ("closed_orbit", SHOT, ["0,a,0,0", "0,A,0,0"],
+         "line 3: shot 0, monitor a stands in the table already"),
+        ("closed_orbit", {"shots": 2 * SHOT["shots"]}, [], "shot 0 stands twice"),
+        ("dispersion", {"steps": [STEP]}, ["1,a,0,0"], "line 2: step 1 is not among the steps"),
+        ("dispersion", {}, [], 'it has no "steps"'),
+        ("dispersion", {"steps": [{**STEP, "step_hz": 0.0}]}, ["0,a,0,0"],
+         "measurement.json: an RF step of 0 Hz"),
+        ("tunes", SHOT, ["0,tune_z,0.1,"], "line 2: no quantity 'tune_z'; did you mean 'tune_"),
+        ("tunes", SHOT, ["0,tune_x,a,"], "line 2: value is 'a'; it should be a number, or empty"),
+        ("tunes", SHOT, ["0,tune_x,1.1,"], "measurement.json: a tune of 1.1 is no fraction"),
     ],
 )  # fmt: skip
-def test_damaged_folder_names_its_place(tmp_path, document, table, words):
-    name = "tunes.csv" if document["kind"] == "tunes" else "readings.csv"
+def test_damaged_folder_names_its_place(tmp_path, kind, more, rows, words):
     with pytest.raises(MeasurementError, match=words):
-        read_measurement(folder_of(tmp_path, document, table, name))
+        read_measurement(folder_of(tmp_path, kind, more, [HEADERS[kind], *rows]))
+
+
+def test_the_header_of_another_kind_is_named(tmp_path):
+    table = [HEADERS["turn_by_turn"], "0,0,a,0,0"]
+    with pytest.raises(MeasurementError, match="its first line is shot,monitor,x,y"):
+        read_measurement(folder_of(tmp_path, "closed_orbit", SHOT, table))
 
 
 def test_chromaticity_may_be_larger_than_any_reading(tmp_path):
-    table = ["shot,quantity,value,error", "0,tune_x,0.25,1e-4", "0,chromaticity_y,-80,0.5"]
-    read = read_measurement(
-        folder_of(tmp_path, {"kind": "tunes", "shots": SHOT}, table, "tunes.csv")
-    )
+    table = [HEADERS["tunes"], "0,tune_x,0.25,1e-4", "0,chromaticity_y,-80,0.5"]
+    read = read_measurement(folder_of(tmp_path, "tunes", SHOT, table))
     np.testing.assert_array_equal(read.tune, [[0.25, np.nan]])
     np.testing.assert_array_equal(read.chromaticity, [[np.nan, -80.0]])
     np.testing.assert_array_equal(read.chromaticity_error, [[np.nan, 0.5]])
