@@ -128,7 +128,7 @@ def test_tunes_and_modes_with_rf_vs_at(request, which):
     state = at_orbit.closed(partial(engine.one_pass, with_rf), before, range(6))
     steps = np.diag(at_orbit.STEPS)
     moving = np.asfortranarray(np.vstack([state + steps, state - steps]).T)
-    seen = engine.run(with_rf, moving.T, 1, moving)[:, 0]
+    seen = engine.run(with_rf, moving, 1)[:, 0]
     ends = moving.T
     values, vectors = np.linalg.eig((ends[:6] - ends[6:]).T / (2 * at_orbit.STEPS))
     own = [int(np.abs(np.angle(values) / (2 * np.pi) % 1 - q).argmin()) for q in beam.tunes]

@@ -189,7 +189,7 @@ class AtEngine:
             line = self._set(changed)
             if turns > 1:
                 self._switch_on(line, frequency)
-            readings[shots] = self._run(line, np.asfortranarray(state[shots].T), turns)
+            readings[shots] = self.run(line, np.asfortranarray(state[shots].T), turns)
         return readings
 
     def closed_orbits(self, settings: Sequence[Settings]) -> Array:
@@ -247,7 +247,7 @@ class AtEngine:
 
         `known`: the line is that of AT's latest tracking, which takes most of the time to read it.
         """
-        return np.asarray(self._run(line, beam, 1, known=known)[0, 0])
+        return np.asarray(self.run(line, beam, 1, known=known)[0, 0])
 
     def _again(self, line: list[Any]) -> at_orbit.Turn:
         """Passes through one line, with no other tracking between them."""
@@ -259,7 +259,7 @@ class AtEngine:
         lost, [monitor] (beam: the particles, [6, particle]; they are moved)."""
         block = max(TURNS_AT_ONCE // (beam.shape[1] * len(self._monitors)), 1)
         for turn in range(0, turns, block):
-            seen = self._run(line, beam, min(block, turns - turn), turn)
+            seen = self.run(line, beam, min(block, turns - turn), turn)
             alive = np.isfinite(seen[..., 0]).mean(axis=0)
             mean = np.nansum(seen, axis=0) / np.maximum(alive * len(seen), 1)[..., None]
             yield from zip(mean, alive, strict=True)
@@ -317,7 +317,7 @@ class AtEngine:
         scale = self._bends if self._bends > 0 else 1.0
         return self.ring.energy * 1e9 * float(np.cbrt(scale))
 
-    def _run(
+    def run(
         self, line: list[Any], beam: Array, turns: int, first: int = 0, known: bool = False
     ) -> Array:
         """Return readings [shot, turn, monitor, 2] of states in AT's coordinates, [6, shot], which
