@@ -303,8 +303,9 @@ def _of_first_turns(ring: Ring, data: Measurement, known: Sequence[Cause]) -> li
         checks += _order(checked, passes, found)
     if any(check.status == "wrong" for check in checks):
         # noise and launches have no meaning before that is corrected, but the unit of the latter
-        if any(is_unit(name) for check in errors for name in check.assume):
-            checks += [own for own in [_launches(checked)] if own.status == "wrong"]
+        units = any(is_unit(name) for check in errors for name in check.assume)
+        if units and (size := _launches(checked)).status == "wrong":
+            checks.append(size)
         return checks
     return [*checks, _launches(checked), _noise(checked, passes, found)]
 

@@ -237,8 +237,8 @@ def _of_stored(
         if isinstance(problem, Stored):
             raise_if_wrong(options.ring, measured, problem)
         messages = problem.warnings if isinstance(problem, ManyTurns) else ()
-        other = held and make(options.ring, held, options.places)
-        return Part(label, kind, problem, other, messages=messages)
+        judges = held and make(options.ring, held, options.places)
+        return Part(label, kind, problem, judges, messages=messages)
 
     return made
 

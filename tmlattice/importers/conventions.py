@@ -64,8 +64,8 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
     """What the data confirm and what they contradict, given the design's response; a sentence each
     (ring: the design, with the measurement's names)."""
     try:
-        told = [check.sentence for check in check_data(ring, measured).reported]
-        told += _per_kick(OfResponse(ring, replace(measured, rf=None)))
+        contradicted = [check.sentence for check in check_data(ring, measured).reported]
+        contradicted += _per_kick(OfResponse(ring, replace(measured, rf=None)))
         model, flat = ResponseModel(ring), ResponseModel(ring, dimension=4)
     except UnstableRingError as error:
         return [], [f"the lattice has no closed orbit to compare with ({error})"]
@@ -74,7 +74,7 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
         own = _plane(model, measured, plane)
         if abs(np.median(own.columns())) < MOST:
             continue
-        told += _single(own)
+        contradicted += _single(own)
         if plane != "x":
             continue
         # with gains free: was the frequency or the momentum constant?
@@ -83,8 +83,8 @@ def compared(ring: Ring, measured: OrbitResponse) -> tuple[list[str], list[str]]
         if left < other / CLEARER:
             confirmed.append(f"the data agree that the frequency stood still: {what}")
         elif other < left / CLEARER:
-            told.append(f"the momentum stood still, and not the frequency: {what}")
-    return confirmed, told
+            contradicted.append(f"the momentum stood still, and not the frequency: {what}")
+    return confirmed, contradicted
 
 
 def _per_kick(checked: OfResponse) -> list[str]:

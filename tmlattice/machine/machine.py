@@ -157,13 +157,13 @@ class Machine:
         self.engine = engine
         self._made_of: dict[str, Any] = {"engine": engine, "radiation": radiation, "noise": noise}
         check_engine(engine)
-        track: Any  # imported where it is chosen: AT takes long
+        Engine: Any  # imported where it is chosen: AT takes long
         if engine == "at":
-            from tmlattice.machine.at_engine import AtEngine as track
+            from tmlattice.machine.at_engine import AtEngine as Engine
         else:
-            from tmlattice.machine.ocelot_engine import OcelotEngine as track
+            from tmlattice.machine.ocelot_engine import OcelotEngine as Engine
         scale = float(radiation)
-        self._engine = track(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
+        self._engine = Engine(ring, causes, radiation_bends=scale, radiation_wigglers=scale)
 
     def beam(
         self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None

@@ -4,7 +4,6 @@ table, and a writer of the table that completes the document.
 
 import csv
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -171,7 +170,7 @@ def _common(document: Document, read: Sequence[str], known: Known) -> dict[str, 
         "lattice": document.get("lattice"),
         "energy": document.get("energy_gev"),
     }
-    if any(field.name == "devices" for field in dataclass_fields(KINDS[document["kind"]].record)):
+    if "devices" in KINDS[document["kind"]].record.__dataclass_fields__:
         common["devices"] = document.get("devices") or {}
     return common
 

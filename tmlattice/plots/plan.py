@@ -134,10 +134,11 @@ def plot_plan(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
             ax.plot(*at.T, look.marker, color=look.colour, ms=1.5, zorder=3, label=plural(kind))
             continue
         arcs = [(plan.ends[i], plan.middle[i], plan.ends[i + 1]) for i in places]
-        width = 7 if kind in ("quadrupole", "sextupole") else 3  # ticks across the bends
+        short = kind in ("quadrupole", "sextupole")  # ticks across the bends
         lines = LineCollection(
-            arcs, colors=COLOURS[kind], linewidths=width, zorder=1 + width / 10, label=plural(kind)
-        )
+            arcs, colors=COLOURS[kind], linewidths=7 if short else 3, zorder=2 + 0.5 * short,
+            label=plural(kind),
+        )  # fmt: skip
         ax.add_collection(lines)
     for number, finding, place, lines_off in placed(diagnosis, plan):
         ax.plot(*place, "o", ms=16, mfc="none", mec=CULPRIT, mew=2.2, zorder=5)

@@ -116,11 +116,9 @@ def optics_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     if not any(isinstance(own, RingEffect) and not own.acts_on_settings for own in effects):
         return []
     beams = beam_with(diagnosis.ring, [c for c in diagnosis.causes if c.element is not None])
-    named = {(found.effect, found.element) for found in diagnosis.findings}
-    alone = [c for c in diagnosis.causes if (c.effect, c.element) in named]
-    moved = beam_with(diagnosis.ring, alone).found
-    orbit = moved is not None and max(moved.orbit_rms) > SETTLED.orbit_rms[0]
-    orbit |= "closed_orbit" in diagnosis.assessment.measured
+    named = [own.consequences.found for own in diagnosis.findings if own.consequences]
+    moved = any(beam and max(beam.orbit_rms) > SETTLED.orbit_rms[0] for beam in named)
+    orbit = moved or "closed_orbit" in diagnosis.assessment.measured
 
     def pair(values: Sequence[float] | None, factor: float, digits: int) -> str:
         if values is None:
