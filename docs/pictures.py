@@ -145,7 +145,7 @@ def real_ring():
 
     path = Path(os.environ["TMLATTICE_DATA"]) / "real_rings" / "soleil_2012-01-20.loco.mat"
     brought = bring_in([path])
-    figure = plt.figure(figsize=(11, 4.2), layout="constrained")
+    figure = plt.figure(figsize=(9, 3.5), layout="constrained")
     yield "real_ring", plot_left(tmlattice.diagnose(brought.ring, brought.measurement), figure)
 
 
