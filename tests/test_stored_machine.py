@@ -189,6 +189,26 @@ def test_dispersion_is_the_responses_own(tiny):
     assert default.step == rf.step
 
 
+def test_an_energy_offset_moves_orbit_dispersion_and_tunes(tiny):
+    """Referee: AT's optics at that energy. The third order of the dispersion is left."""
+    offset = 5e-4
+    beam = [Cause("energy_offset", None, offset)]
+    lattice = AtEngine(tiny, ()).lattice()
+    _, there, places = at.get_optics(lattice, at.Monitor, dp=offset, XYStep=3e-6)
+    orbit = places.closed_orbit
+    read = simulate_orbits(tiny, beam, noise=0.0).measured.orbit[0]
+    assert_allclose(read[:, 0], orbit[:, 0], rtol=0, atol=0.01 * np.abs(orbit[:, 0]).max())
+    design = simulate_dispersion(tiny, noise=0.0).measured.orbits[0]
+    at_offset = simulate_dispersion(tiny, beam, noise=0.0).measured.orbits[0]
+    assert np.abs(at_offset - design).max() > 1e-6  # D depends on the energy
+    tunes = simulate_tunes(tiny, beam, noise=(0.0, 0.0)).measured.tune[0]
+    assert_allclose(tunes, there.tune[:2], rtol=0, atol=2e-5)
+    turns = simulate_turns(tiny, beam, noise=0.0, turns=256, amplitude=1e-5).measured.readings
+    assert_allclose(turns[0].mean(axis=0)[:, 0], read[:, 0], rtol=0, atol=5e-6)
+    with pytest.raises(TmlatticeError, match="no energy offset"):
+        simulate_turns(tiny, beam, turns=16, engine="network")
+
+
 def test_tunes_and_chromaticities_are_ats(tiny):
     upright = UPRIGHT[:1]
     read = simulate_tunes(tiny, upright, noise=(0.0, 0.0)).measured

@@ -12,8 +12,8 @@ NODES = 5
 
 @register
 class EnergyOffset(LaunchEffect):
-    """The beam's energy differs from that of the magnets' settings. All shots arrive with it; in an
-    orbit response a stored beam has it, if the RF frequency does not match the circumference."""
+    """The beam's energy differs from that of the magnets' settings. All shots arrive with it; a
+    stored beam has it, if the RF frequency does not match the circumference."""
 
     name = "energy_offset"
     words = "energy deviation of the beam"
@@ -23,7 +23,7 @@ class EnergyOffset(LaunchEffect):
     energy = True
     shifts = 5
     unit = "relative"
-    sign = "p += amount: of the launch, common to all shots, or of a response's closed orbit"
+    sign = "p += amount: of the launch, common to all shots, or of the closed orbit"
     quantity = "energy deviation"
     recommended_action = "match the energy of the beam to the ring"
     to_check = (

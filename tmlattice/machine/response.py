@@ -119,17 +119,22 @@ class StoredMachine:
         scale = self.radiation
         return AtEngine(self.ring, self.every, radiation_bends=scale, radiation_wigglers=scale)
 
-    def orbits(
-        self, settings: Sequence[Settings], nodes: tuple[Array, Array] | None = None
-    ) -> Array:
-        """Return the centroid of the stored beam, [shot, monitor, 2]: orbits depend on the energy.
-        `nodes`: else those of `energies`."""
-        weights, frequencies = energies(self.ring, self.every) if nodes is None else nodes
-        each = [
-            self.engine.closed_orbits([_with_frequency(s, float(f)) for s in settings])
-            for f in frequencies
-        ]
-        return np.asarray(np.tensordot(weights, np.array(each), 1))
+    def orbits(self, settings: Sequence[Settings]) -> Array:
+        """Return the centroid of the stored beam, [shot, monitor, 2]: orbits depend on the
+        energy."""
+        each = [self.engine.closed_orbits(self.at(settings, f)) for f in self.energies[1]]
+        return np.asarray(np.tensordot(self.energies[0], np.array(each), 1))
+
+    @cached_property
+    def energies(self) -> tuple[Array, Array]:
+        """Weights, and equivalent RF frequencies, of the beam's energies."""
+        return energies(self.ring, self.every)
+
+    def at(self, settings: Sequence[Settings], frequency: float | None = None) -> list[Settings]:
+        """Return the settings of each shot with a change of the RF frequency (relative); None: that
+        of the beam's mean energy."""
+        mean = float(self.energies[0] @ self.energies[1]) if frequency is None else frequency
+        return [_with_frequency(own, float(mean)) for own in settings]
 
     def noisy(
         self, readings: Array, noise: float | Sequence[float], purpose: str
@@ -172,15 +177,13 @@ def _orbits(machine: StoredMachine, steps: Sequence[Step], engine: str) -> Itera
     """Orbits [2, monitor, 2] of the centroid below and above each step of a corrector, or of the
     RF (None)."""
     ring, causes = machine.ring, machine.every
-    weights, nodes = energies(ring, causes)
-    if offset := offset_of(causes):
-        nodes = nodes + offset / ResponseModel(apply(ring, causes)).rf_start[5]
+    weights, nodes = machine.energies
     if engine == "at":
         for name, *sides in steps:
             yield machine.orbits([
                 rf_setting(side) if name is None else {name: {"kick": ring[name].angle + side}}
                 for side in sides
-            ], (weights, nodes))  # fmt: skip
+            ])  # fmt: skip
         return
     each = [_map_orbits(ring, causes, steps, float(node)) for node in nodes]
     for orbits in zip(*each, strict=True):
@@ -211,14 +214,15 @@ def spread_of(causes: Sequence[Cause]) -> float:
 
 
 def energies(ring: Ring, causes: Sequence[Cause]) -> tuple[Array, Array]:
-    """Weights of three Gauss-Hermite nodes of the beam's energy, and the RF frequency (relative)
-    that is equivalent to each."""
-    spread = spread_of(causes)
-    if spread == 0:
+    """Weights of the Gauss-Hermite nodes of the beam's energy (three with an energy spread, else
+    one), and the RF frequency (relative) that is equivalent to each."""
+    spread, offset = spread_of(causes), offset_of(causes)
+    if spread == offset == 0:
         return np.ones(1), np.zeros(1)
+    nodes = np.array([-1, 0, 1]) if spread else np.zeros(1)
+    weights = np.array([1, 4, 1]) / 6 if spread else np.ones(1)
     per_energy = 1 / ResponseModel(apply(ring, causes)).rf_start[5]
-    nodes = np.sqrt(3) * spread * per_energy * np.array([-1, 0, 1])
-    return np.array([1, 4, 1]) / 6, nodes
+    return weights, per_energy * (offset + np.sqrt(3) * spread * nodes)
 
 
 def _map_orbits(

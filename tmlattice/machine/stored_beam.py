@@ -92,8 +92,9 @@ def simulate_turns(
     if radiation and engine == "network":
         raise EffectError("the network has no radiation; take the engine 'at'")
     tracker = machine.engine if engine == "at" else NetworkEngine(ring, machine.every)
+    moved = machine.at(each)  # by an energy offset
     passed = np.stack([
-        turns_of(tracker, kicked[i], further, each[i], beam, stream(seed, "particles", i))
+        turns_of(tracker, kicked[i], further, moved[i], beam, stream(seed, "particles", i))
         for i in range(shots)
     ])  # fmt: skip
     # before its kick the beam is on the closed orbit
@@ -200,7 +201,9 @@ def simulate_tunes(
     """
     machine = StoredMachine(ring, causes, background, seed, machine_seed)
     each = each_setting(settings, shots)
-    found = {key: tunes_of(machine.engine, s) for key, s in {repr(s): s for s in each}.items()}
+    unlike = {repr(s): s for s in each}
+    moved = machine.at(list(unlike.values()))  # by an energy offset
+    found = {key: tunes_of(machine.engine, s) for key, s in zip(unlike, moved, strict=True)}
     values = np.array([found[repr(s)] for s in each])  # [shot, tune or chromaticity, mode]
     add_noise(values, np.reshape(noise, (2, 1)), seed, "tunes")
     sigma = [np.full((shots, 2), rms) if rms > 0 else None for rms in noise]
