@@ -522,7 +522,7 @@ def test_kinds_that_make_no_sense_are_a_sentence(tmp_path):
         (("T",), {"kinds": ["tunes"]}, "tiers E, M and P"),
         (("M",), {"kinds": ["tunes"]}, "two of them"),
         (("P",), {"kinds": ["turns"]}, "no kind 'turns'"),
-        (("R",), {"known_rms": True}, "leave --known-rms out"),
+        (("R",), {"known_rms": True}, "leave known_rms out"),
     ]
     for (tier,), options, said in told:
         with pytest.raises(TmlatticeError, match=said):

@@ -148,7 +148,7 @@ def detection(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def confusion(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
-    """Return true effect -> column -> cases; further columns: equivalent, unknown, nothing."""
+    """Return true effect -> column -> cases; further columns: ambiguous, unknown, nothing."""
     table: dict[str, Counter[str]] = {}
     for row in rows:
         name = _effect(row)

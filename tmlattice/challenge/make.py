@@ -182,7 +182,7 @@ def _check(
         raise TmlatticeError("a reference is for tier B; leave --reference out")
     if learnt and (tier != "B" or reference or known_rms):
         raise TmlatticeError(
-            "--learnt is for tier B, without --reference or --known-rms; leave --learnt out"
+            "--learnt is for tier B, without --reference or known rms; leave --learnt out"
         )
     if background and tier != "B" and not kinds:
         raise TmlatticeError(
@@ -190,7 +190,7 @@ def _check(
         )
     if known_rms and "orbit_response" in kinds:
         raise TmlatticeError(
-            "an orbit response determines those rms by itself; leave --known-rms out"
+            "an orbit response determines those rms by itself; leave known_rms out"
         )
 
 

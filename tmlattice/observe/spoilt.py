@@ -89,6 +89,8 @@ def _unlike(search: OfTurns) -> list[int]:
     for shot in range(number):
         own = there & (passes.shot == shot)[:, None]
         left[shot] = np.sqrt(np.median(found.misfit[own])) if own.any() else np.nan
+    if not np.isfinite(left).any():
+        return []
     size = np.sqrt(np.nanmean(search.data.readings**2, axis=(1, 2, 3)))
     size = np.minimum(size, MISSTATED * np.nanmedian(size))
     unlike = [own > MISSTATED * np.nanmedian(own) for own in (left, left / size)]

@@ -30,7 +30,7 @@ def plot_confusion(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:
     ax.axvline(len(columns) - len(LAST) - 0.5, color="0.4", linewidth=0.8)
     ax.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
     ax.set_yticks(range(len(rows)), rows, fontsize=7)
-    ax.set_xlabel("stated first (equivalent: true effect in the stated class)")
+    ax.set_xlabel("stated first (ambiguous: true effect in the stated class)")
     ax.set_ylabel("true effect")
     ax.set_title(f"tier {result['tier']}: number of cases, shade by share of the row", fontsize=9)
     return ax

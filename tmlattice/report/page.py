@@ -62,7 +62,7 @@ def render(template: str, provenance: Mapping[str, Any], **context: Any) -> str:
 
 
 def _rounded(value: Any) -> Any:
-    """A copy of the provenance with times rounded to microseconds."""
+    """A value of the provenance, seconds to one digit."""
     return round(value, 1) if isinstance(value, float) else value
 
 
