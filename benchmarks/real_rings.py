@@ -148,8 +148,8 @@ def ring(name, files, data, place, options):
 
 
 def _kept(found):
-    """Families in the order in which they came in."""
-    return list(dict.fromkeys(step["effect"] for step in found["steps"] if step["effect"]))
+    """Families in the result."""
+    return [own["effect"] for own in found["families"] if own["kept"]]
 
 
 def _as_it_comes(found):
@@ -158,18 +158,21 @@ def _as_it_comes(found):
     if "error" in found:
         return f"{name}, seed {seed}: {found['error']}"
     last = found["steps"][-1]
-    rejected_steps = ", ".join(step["effect"] for step in found["refused"])
-    return (f"{name}, seed {seed}: {_figures(last)}, chi² {last['chi2']:.1f}, {found['verdict']}, "
+    rejected = ", ".join(own["effect"] for own in found["families"] if not own["kept"])
+    return (f"{name}, seed {seed}: {_figures(last)}, {found['verdict']}, "
             f"{found['seconds']:.0f} s; kept: {', '.join(_kept(found))}; "
-            f"refused: {rejected_steps or 'none'}")  # fmt: skip
+            f"rejected: {rejected or 'none'}")  # fmt: skip
 
 
 def _figures(step):
-    """In plane (with a jump) / across (with a roll) / RF."""
+    """In plane (with a jump) / across (with a roll) / RF, chi²."""
+    if step["in_plane"] is None:
+        return "nothing better than the model"
     jump = "" if step["with_jump"] is None else f" ({step['with_jump']:.2f})"
     roll = "" if step["with_roll"] is None else f" ({step['with_roll']:.2f})"
     rf = "-" if step["rf"] is None else f"{step['rf']:.1f}"
-    return f"{step['in_plane']:.2f}{jump} / {step['coupling']:.2f}{roll} / {rf}"
+    chi2 = f"chi² {step['chi2']:.1f}"
+    return f"{step['in_plane']:.2f}{jump} / {step['coupling']:.2f}{roll} / {rf}, {chi2}"
 
 
 def _diagnosed(source, seed, missing, pictures, name):
@@ -187,7 +190,7 @@ def _diagnosed(source, seed, missing, pictures, name):
         "seconds": seconds,
         "fit": MICRO * found.fit_after.rms,
         "steps": [_step(record_of(step)) for step in found.steps],
-        "refused": [_step(record_of(step)) for step in found.rejected_steps],
+        "families": [_step(record_of(own)) for own in found.families],
         "findings": [own.words or f"{own.effect} {own.element}" for own in found.findings],
         "hypotheses": [record_of(row) for row in found.hypotheses or ()],
         "warnings": list(found.warnings),
@@ -225,37 +228,41 @@ def picture(result, path):
 
 
 def _step(step):
+    def known(key, factor=1):
+        return None if step.get(key) is None or np.isnan(step[key]) else factor * step[key]
+
     def micro(key):
-        return None if step.get(key) is None or np.isnan(step[key]) else MICRO * step[key]
+        return known(key, MICRO)
 
     return {
         "effect": step["effect"],
+        "kept": step["kept"],
+        "log_evidence": known("log_evidence"),
         "parameters": step["parameters"],
         "in_plane": micro("heldout_rms_in_plane"),
         "coupling": micro("heldout_rms_coupling"),
         "with_roll": micro("heldout_rms_roll"),
         "with_jump": micro("heldout_rms_position"),
         "rf": micro("dispersion_rms"),
-        "chi2": step["heldout_chi2_per_dof"],
+        "chi2": known("heldout_chi2_per_dof"),
     }
 
 
 def table(rings):
     """The first seed of each ring, as Markdown."""
-    yield ("| ring | noise | lattice: in-plane (with jump) / coupling / RF | result: in-plane "
-           "(with jump) / coupling (with roll) / RF | chi² held out | fitted | experts' fit: "
+    yield ("| ring | noise | lattice: in-plane (with jump) / coupling / RF, chi² per reading | "
+           "result: in-plane (with jump) / coupling (with roll) / RF, chi² | fitted | experts: "
            "in-plane / coupling | verdict | s |")  # fmt: skip
-    yield "|" + "---|" * 9
+    yield "|" + "---|" * 8
     for found in rings:
         row = next((one for one in found if "error" not in one), found[0])
         if "error" in row:
-            yield f"| {row['ring']} | | {row['error']} | | | | | error | |"
+            yield f"| {row['ring']} | | {row['error']} | | | | error | |"
             continue
         first, last = row["steps"][0], row["steps"][-1]
         own = " / ".join(f"{v:.2f}" for v in row.get("experts", ()))
         yield (
             f"| {row['ring']} | {row['noise']:.2f} | {_figures(first)} | {_figures(last)} | "
-            f"{last['chi2']:.1f} | "
             f"{row['fit']:.2f} | {own} | {row['verdict']} | {row['seconds']:.0f} |"
         )
 
@@ -329,11 +336,11 @@ def scatter(found):
 
 
 def steps(row):
-    """Where the steps of a ring went."""
-    for what in ("steps", "refused"):
+    """Scores of the steps, and with the decision on each family reversed."""
+    for what in ("steps", "families"):
         for step in row.get(what, ()):
-            mark = "kept   " if what == "steps" else "refused"
-            yield (f"  {mark} {step['effect']}: {_figures(step)}, chi² {step['chi2']:.1f}, "
+            mark = "" if what == "steps" else "without " if step["kept"] else "with "
+            yield (f"  {mark}{step['effect']}: {_figures(step)}, "
                    f"{step['parameters']} parameters")  # fmt: skip
 
 

@@ -473,8 +473,8 @@ def tried(make: Callable[[], Case], seed: int, assumed: tuple[str, ...] = ()) ->
         "heldout": [MICRO * own for own in (
             last.heldout_rms_in_plane, last.heldout_rms_coupling, last.dispersion_rms
         )],
-        "steps": [step.effect for step in found.steps[1:]],
-        "refused": [step.effect for step in found.rejected_steps],
+        "steps": [own.effect for own in found.families if own.kept],
+        "refused": [own.effect for own in found.families if not own.kept],
         "bad": list(found.bad_monitors),
         "warnings": list(found.warnings),
     }  # fmt: skip

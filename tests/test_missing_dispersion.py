@@ -19,8 +19,8 @@ from tmlattice.diagnosis.families.dispersion import (
 )
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.state import begin
-from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
 from tmlattice.machine.response import simulate_response
@@ -60,7 +60,7 @@ def with_kicks(ring, measured, more):
 
 def state_of(ring, measured, fit):
     data, split = parted(ring, measured, 1)
-    return fit_steps(data, split, WITHOUT).state if fit else begin(data, split)
+    return fit_families(data, split, WITHOUT).state if fit else begin(data, split)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_gradients_are_not_drawn_astray_by_what_they_do_not_make(small_ring, mea
     missed, said = [], []
     for own, steps in ((plain, WITH), (kicked, WITH), (kicked, WITHOUT)):
         data = response_data(small_ring, own)
-        fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
         true = [amounts[name] for name in QuadrupoleGradient().places(data)]
         missed.append(np.std(fit.state.values["gradient"] - true))
         said.append(len(list(dispersion_by_kicks(fit.state.values, data))))

@@ -10,10 +10,10 @@ from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS
 from tmlattice.diagnosis.response.before_after import ANY
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
+from tmlattice.diagnosis.response.hierarchical import in_turn
 from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import begin
-from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import Cause, find
@@ -43,8 +43,8 @@ def before(small_ring):
 def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
     data, split = parted(small_ring, before)
-    *_, (_, state) = one_by_one(begin(data, split), STEPS)
-    return state
+    design = begin(data, split)
+    return in_turn(design, STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +64,8 @@ def crowded_change(small_ring, before, fitted):
     data = response_change(first, ring_alone, second)
     split = split_columns(data, 0.2, np.random.default_rng(0))
     state = begin(data, split)
-    for _, settled in one_by_one(replace(state, exploring=False, guessed=ANY), CHANGES):
-        state = settled
-    return settle(state)
+    state = replace(state, exploring=False, guessed=ANY)
+    return settle(in_turn(state, CHANGES))
 
 
 def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):
@@ -123,21 +122,22 @@ def test_numbers_that_nobody_asks_for_are_a_covariance_of_the_readings(fitted, r
 
 
 def test_what_is_open_of_a_ring_is_in_what_changed(small_ring, crowded_change):
-    """The less the ring is known, the less certain is a change of it."""
+    """The less the ring is known, the less certain is a change of it. (At 20 % instead of 3 % per
+    magnet, which no ring has, other supplies explain it as well.)"""
     places = find("quadrupole_gradient").places(small_ring)
     errors = tuple(("quadrupole_gradient", place) for place in places)
-    of_one, of_twenty = (
+    of_one, of_three = (
         changed_supplies(crowded_change, DEFAULT, Undetermined(errors, size * np.eye(len(places))))[
             0
         ]
-        for size in (0.01, 0.2)
+        for size in (0.01, 0.03)
     )
     assert {own.element for own in of_one} == set(CROWDED)
     known, _ = changed_supplies(crowded_change, DEFAULT)
     pulls = [(own.amount - CROWDED[own.element]) / own.amount_sigma for own in of_one]
     assert max(map(abs, pulls)) < 2.5
     most, sure, less = (
-        sum(own.detection.statistic for own in found) for found in (known, of_one, of_twenty)
+        sum(own.detection.statistic for own in found) for found in (known, of_one, of_three)
     )
     assert 0 < less < 0.75 * sure
     assert sure < most

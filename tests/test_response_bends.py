@@ -8,9 +8,9 @@ from shared import small_steps
 
 from tmlattice.diagnosis.families.fields import BendGradient, EdgeFocusing
 from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.state import allow
 from tmlattice.diagnosis.response.stated import fitted_causes
-from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.lattice.slices import stem
 from tmlattice.machine.response import simulate_response
@@ -50,8 +50,8 @@ def bent(combined):
 def test_gradients_of_bends_are_found(bent):
     """ESRF-EBS: 96 of its magnets had none to fit; they were made up for."""
     data, bends, wrong = bent
-    fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
-    assert "bend_gradient" in [step.effect for step in fit.steps]
+    fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
+    assert "bend_gradient" in [own.effect for own in fit.families if own.kept]
     assert all(error > 0 for _, error in fitted_causes(fit.state)[0])
     found = {(c.effect, c.element): c.amount for c, _ in fitted_causes(fit.state)[0]}
     mean = np.mean([found["bend_gradient", name] for name in bends]) / GRADIENT
@@ -68,7 +68,7 @@ def test_errors_know_that_a_family_that_was_left_out_may_be_there(bent):
     """ALS: which family is left out hangs on the seed, and the others make up for it."""
     data, _, _ = bent
     trials = [trial for trial in TRIALS if trial[0].name != "bend_gradient"]
-    state = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), trials).state
+    state = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), trials).state
 
     def pull(state):
         """rms over the quadrupoles, which make up for one number together: a single pull."""
@@ -90,8 +90,8 @@ def test_a_family_that_the_ring_has_no_places_of_is_not_told(small_ring):
     causes = [Cause("quadrupole_gradient", name, amount) for name, amount in WRONG.items()]
     measured = small_steps(small_ring, causes)
     data = response_data(small_ring, measured)
-    fit = fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
-    assert not any(step.effect == "bend_gradient" for step in (*fit.steps, *fit.rejected_steps))
+    fit = fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), TRIALS)
+    assert not any(own.effect == "bend_gradient" for own in fit.families)
 
 
 def test_the_scale_of_edges_is_that_of_a_rectangular_magnet(small_ring):

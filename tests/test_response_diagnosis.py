@@ -14,8 +14,8 @@ from shared import measured_data, parted, valid
 from tmlattice import diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.missing_effects import weigh
-from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import MeasurementError
@@ -48,7 +48,7 @@ def simulate_response(ring, causes=(), **options):
 
 def fitted(ring, measured, seed=1, steps=STEPS[:3]):
     data = response_data(ring, measured)
-    return fit_steps(data, split_columns(data, 0.2, np.random.default_rng(seed)), steps).state
+    return fit_families(data, split_columns(data, 0.2, np.random.default_rng(seed)), steps).state
 
 
 def test_the_only_corrector_of_a_plane_is_fitted(small_ring, measured):
@@ -129,7 +129,8 @@ def test_options_act_and_are_told(small_ring, measured):
     )  # fmt: skip
     (fault,) = found.findings
     design, family, alone = found.steps
-    assert (design.effect, family.kept) == ("design", True)
+    assert design.effect == "design"
+    assert [own.effect for own in found.families if own.kept] == [family.effect]
     assert alone.effect == f"{fault.effect} {fault.element}"
     options = found.as_json()["provenance"]["options"]
     assert options["effects"] == ["corrector_calibration", "monitor_gain_x", "quadrupole_gradient"]
@@ -296,7 +297,9 @@ def test_one_sided_steps_are_told_from_two_sided_ones(small_ring):
 
 def test_report_and_json(small_ring, result):
     document = valid(result.as_json(), "diagnosis")
-    assert [s["effect"] for s in document["steps"]] == [s.effect for s in result.steps]
+    for name in ("steps", "families"):
+        own = getattr(result, name)
+        assert [s["effect"] for s in document[name]] == [s.effect for s in own]
     text = report_text(result)
     assert "IDENTIFIED: 5 faults" in text  # and no small errors beside them
     assert "QD::5" in text
@@ -316,7 +319,7 @@ def test_more_energy_spread_than_a_beam_has_is_refused(small_ring):
     ).measured
     found = diagnose(small_ring, measured, seed=1, effects=["energy_spread"])
     assert [step.effect for step in found.steps] == ["design"]
-    assert [step.effect for step in found.rejected_steps] == ["energy_spread"]
+    assert [(own.effect, own.kept) for own in found.families] == [("energy_spread", False)]
     assert any("where radiation makes 0.11 %" in said for said in found.warnings)
 
 

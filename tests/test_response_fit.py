@@ -8,10 +8,10 @@ from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.fields import FocusingChange, VerticalFocusing
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response import rounds, stepwise
+from tmlattice.diagnosis.response import hierarchical, rounds
+from tmlattice.diagnosis.response.hierarchical import in_turn
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import begin
-from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.effects import Cause
 from tmlattice.inference import normal as blocks
 from tmlattice.inference.normal import Normal, Slopes, normal_equations, solve
@@ -150,8 +150,10 @@ def test_gains_of_little_information_come_in(small_ring):
     ]
     measured = small_steps(small_ring, causes, noise=4e-6, seed=3)
     data = response_data(small_ring, measured)
-    fit = stepwise.fit_steps(data, split_columns(data, 0.2, np.random.default_rng(0)), STEPS[:3])
-    assert {step.effect.split(",")[0] for step in fit.steps[1:]} == {
+    fit = hierarchical.fit_families(
+        data, split_columns(data, 0.2, np.random.default_rng(0)), STEPS[:3]
+    )
+    assert {own.effect.split(",")[0] for own in fit.families if own.kept} == {
         "monitor_gain_x", "quadrupole_gradient"
     }  # fmt: skip
     first, last = fit.steps[0], fit.steps[-1]
@@ -191,6 +193,7 @@ def test_a_device_focuses_and_a_change_of_one_may_do_less(small_ring):
             engine="ocelot", progress=False,
         ).measured  # fmt: skip
         data, split = parted(small_ring, measured, 1)
-        *_, (_, state) = one_by_one(begin(data, split), [STEPS[0], (family,)])
+        design = begin(data, split)
+        state = in_turn(design, [STEPS[0], (family,)])
         amounts.append(state.values["device"][family.places(data).index("d::95")])
     assert amounts == pytest.approx([0.0, -0.01, 0.01], rel=0.02, abs=0.0)

@@ -11,10 +11,10 @@ from tests.scenarios import ring_of
 from tmlattice import diagnose, load_ring
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.assumed import assumed_of
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.labels import reversed_ones
 from tmlattice.diagnosis.response.missing_effects import HYPOTHESES, control, weigh
 from tmlattice.diagnosis.response.outlier_readings import without_gross
-from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.response_data import response_data, split_columns
@@ -83,7 +83,7 @@ def test_reversed_monitors_and_correctors_are_fitted_and_named(small_ring, whole
     response[3] *= -1
     data = replace(whole, response=response, rf=replace(whole.rf, orbit=orbit))
     split = split_columns(response_data(small_ring, data), 0.2, np.random.default_rng(1))
-    fit = fit_steps(response_data(small_ring, data), split, STEPS[:3])
+    fit = fit_families(response_data(small_ring, data), split, STEPS[:3])
     assert fit.steps[-1].heldout_rms_in_plane < 3e-8
     assert reversed_ones(fit.state) == [
         "BPMs that read with the wrong sign: "
@@ -104,12 +104,12 @@ def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, mo
     calibrations = STEPS[0][:1]
     waves = HYPOTHESES["orbit_drift"]
     monkeypatch.setitem(HYPOTHESES, "random", lambda state: control(waves(state)))
-    lacking = fit_steps(data, split, [calibrations]).state
+    lacking = fit_families(data, split, [calibrations]).state
     none, own, random = weigh(lacking, ["orbit_drift", "random"])
     assert random.heldout_rms_in_plane < 0.9 * none.heldout_rms_in_plane
     assert random.judgement == "as random ones do"
     assert own.judgement == "helps"
-    fitted = fit_steps(data, split, [calibrations, *STEPS[1:3]]).state
+    fitted = fit_families(data, split, [calibrations, *STEPS[1:3]]).state
     none, own = weigh(fitted, ["orbit_drift"])
     assert own.judgement == "excluded"
     assert own.evidence < 0

@@ -8,9 +8,9 @@ from shared import parted, small_steps
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.hierarchical import fit_families, taken_back
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.stated import fitted_causes
-from tmlattice.diagnosis.response.stepwise import fit_steps, taken_back
 from tmlattice.effects import Cause
 from tmlattice.inference.normal import solve
 from tmlattice.observe.orbit_response import Errors, Predicted
@@ -29,7 +29,7 @@ def clean(small_ring):
 
 def fitted(ring, measured):
     data, split = parted(ring, measured, 1)
-    return fit_steps(data, split, [STEPS[0], STEPS[2]]).state
+    return fit_families(data, split, [STEPS[0], STEPS[2]]).state
 
 
 def error(state):
@@ -80,7 +80,7 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
 
     def found(response):
         data = response_data(ring, response)
-        return fit_steps(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
+        return fit_families(data, split_columns(data, 0.2, np.random.default_rng(1)), steps)
 
     still, told = found(measured), found(moved)
     assert still.state.jitter is None
@@ -96,7 +96,7 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     assert size == pytest.approx(np.sqrt(np.mean(amounts**2)) * times * noise, rel=0.4)
     assert error(told.state) < 1.3 * error(still.state)
     if times > 100:
-        monkeypatch.setattr("tmlattice.diagnosis.response.stepwise.sought", lambda state: None)
+        monkeypatch.setattr("tmlattice.diagnosis.response.hierarchical.sought", lambda state: None)
         assert error(found(moved).state) > 10 * error(told.state)
 
 

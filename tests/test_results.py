@@ -108,9 +108,11 @@ def test_tables_hold_every_amount_with_unit_error_and_place(diagnoses, small_rin
     np.testing.assert_array_equal(bpms.loc[gains.index, "monitor_gain_x"], gains.amount)
     np.testing.assert_array_equal(bpms.loc[gains.index, "monitor_gain_x_sigma"], gains.sigma)
     assert found.tables["correctors"].attrs["units"]["corrector_calibration"] == "relative"
-    steps = found.tables["steps"]
-    assert steps.kept.sum() == len(found.steps)
-    assert steps.effect[0] == "design"
+    assert list(found.tables["steps"].effect) == [step.effect for step in found.steps]
+    families = found.tables["families"].set_index("effect")
+    needed = families.loc["quadrupole_gradient"]
+    assert needed.kept
+    assert needed.heldout_rms_in_plane > 2 * found.steps[-1].heldout_rms_in_plane
 
 
 def test_the_optics_table_is_that_of_the_report(diagnoses, small_ring):
@@ -153,7 +155,8 @@ def test_a_table_that_is_not_there_is_a_sentence(diagnoses):
         diagnoses["none"].tables["error"]
     assert len(diagnoses["none"].tables["findings"]) == 0
     assert list(diagnoses["none"].tables) == [
-        "findings", "errors", "bpms", "correctors", "optics", "steps", "covariance"
+        "findings", "errors", "bpms", "correctors", "optics", "steps", "families",
+        "covariance",
     ]  # fmt: skip
 
 

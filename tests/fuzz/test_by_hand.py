@@ -23,7 +23,7 @@ from inputs import ring, write_all
 from tmlattice import batch, diagnose, load_ring, read_measurement
 from tmlattice.diagnosis.families.fields import VerticalFocusing
 from tmlattice.diagnosis.families.steps import MonitorGain
-from tmlattice.diagnosis.response.stepwise import fit_steps
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.importers import Options, bring_in
 from tmlattice.observe.response_data import response_data, split_columns
 
@@ -152,8 +152,8 @@ def test_what_a_ring_has_no_places_of_is_no_step_of_a_fit(whole):
     split = split_columns(data, 0.2, np.random.default_rng(1))
     straights = (VerticalFocusing(),)
     assert not straights[0].count(data)
-    found = fit_steps(data, split, (straights, (MonitorGain(),)))
-    tried = [step.effect for step in (*found.steps[1:], *found.rejected_steps)]
+    found = fit_families(data, split, (straights, (MonitorGain(),)))
+    tried = [own.effect for own in found.families]
     assert tried == [MonitorGain().title]
 
 

@@ -70,7 +70,7 @@ log = logging.getLogger(__name__)
     type=click.IntRange(1),
     default=None,
     help="Findings at most: 8 by default, 40 of a change between two responses. Of an "
-    "orbit response, steps that are kept at most: all.",
+    "orbit response, families of errors at most: all.",
 )
 @click.option(
     "--effects",
@@ -139,7 +139,7 @@ def diagnose(
     measurements of one machine are diagnosed together. The verdict is one of identified, ambiguous
     (several explanations fit alike), localised (an error that the catalogue does not explain),
     distributed (no single place) and none; the exit code is 0 for each of them. The diagnosis of
-    an orbit response alone has a step for each family of errors; options about launches do not
+    an orbit response alone fits all families of errors together; options about launches do not
     apply to it.
     """
     from tmlattice.correction.result import FILES
@@ -357,7 +357,7 @@ def _save_rings(
         ring = ring if known is None else replace(ring, model=ESTIMATED)
         written[str(lattice_out)] = save_ring(ring, lattice_out)
         beside = calibration_beside(lattice_out)
-        if result.calibration or result.by_steps:
+        if result.calibration or result.by_families:
             amounts = zip(result.causes, result.errors, strict=True)
             errors = {(c.effect, c.element): e for c, e in amounts if isfinite(e)}
             own = (result.calibration, result.dispersion, result.rejected_channels, errors)

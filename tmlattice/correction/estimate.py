@@ -123,7 +123,7 @@ def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) ->
     """
     known = known or known_of(diagnosis) or _each_alone(diagnosis)
     found = Estimate(diagnosis.as_found, diagnosis.ring, known)
-    if not diagnosis.by_steps or diagnosis.since_reference:
+    if not diagnosis.by_families or diagnosis.since_reference:
         return found  # in first turns the energy is the injected beam's
     pairs = zip(diagnosis.causes, diagnosis.errors, strict=True)
     energies = [(c.amount, s) for c, s in pairs if c.effect == "energy_offset"]

@@ -225,8 +225,8 @@ class Diagnosis(Speaks):
         causes: of ring, beam, correctors and monitors.
         errors: standard error of each one's amount, the same length.
         view: what figures need, with what was measured.
-        steps: of a hierarchical fit, those accepted, from the design to the result.
-        rejected_steps: families that were rejected, with the residuals with them.
+        steps: scores of the design, of the hierarchical fit, and of those given faults.
+        families: of a hierarchical fit, the scores with the decision on each family reversed.
         bad_monitors: names of the rejected BPMs.
         priors: rms of distributed errors, learnt or stated, by family.
         prior_errors: relative error of those that were learnt; above one half the readings hardly
@@ -271,7 +271,7 @@ class Diagnosis(Speaks):
     )
     outliers: tuple[dict[str, Any], ...] = ()
     steps: "tuple[Step, ...]" = ()
-    rejected_steps: "tuple[Step, ...]" = ()
+    families: "tuple[Step, ...]" = ()
     bad_monitors: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
     prior_errors: Mapping[str, float] = field(default_factory=dict)
@@ -330,13 +330,13 @@ class Diagnosis(Speaks):
             self.verdict,
             self.compared,
             self.heldout,
-            amounts=len(self.steps) > 1 if self.by_steps else bool(self.causes or self.priors),
+            amounts=len(self.steps) > 1 if self.by_families else bool(self.causes or self.priors),
             findings=bool(self.findings),
             places=self.unexplained["places"],
             noise_estimated=self.noise_estimated,
-            families=self.by_steps,
-            rejected=[step.effect for step in self.rejected_steps],
-            small_errors=bool(self.priors) and not self.by_steps,
+            families=self.by_families,
+            rejected=[own.effect for own in self.families if not own.kept],
+            small_errors=bool(self.priors) and not self.by_families,
             reference=bool(options.get("reference")),
             change=self.since_reference,
             measured=self.measured,
@@ -371,8 +371,8 @@ class Diagnosis(Speaks):
         return "trajectory" if isinstance(self.view, TrajectoryView) else "orbit_response"
 
     @property
-    def by_steps(self) -> bool:
-        """Whether families of errors were fitted step by step, as to an orbit response."""
+    def by_families(self) -> bool:
+        """Whether families of errors were fitted together, as to an orbit response."""
         return self.kind == "orbit_response"
 
     @property
@@ -450,7 +450,7 @@ class Diagnosis(Speaks):
         own = [c for c in self.causes if c.effect in CALIBRATES]
         # a hierarchical fit is of readings with swapped planes corrected
         swaps = (Cause(f.effect, f.element, 1.0) for f in self.findings
-                 if f.effect == "monitor_swap" and self.by_steps)  # fmt: skip
+                 if f.effect == "monitor_swap" and self.by_families)  # fmt: skip
         return (*own, *swaps, *bad)
 
     def support(self, effect: str, element: str | None) -> Support:
@@ -513,7 +513,7 @@ class Diagnosis(Speaks):
             heldout = {
                 **both(gap.misfits[gap.baseline], gap.misfits[-1]),
                 "shots": list(self.heldout_shots),
-                "monitors": "half" if self.by_steps else "odd",
+                "monitors": "half" if self.by_families else "odd",
                 "steps": [dict(vars(m)) for m in gap.misfits],
                 "since": gap.baseline,
                 "readings": gap.readings,

@@ -16,6 +16,11 @@ from tmlattice.errors import MeasurementError, UnstableRingError, unknown_name
 Diagnosis = Any
 """A `Diagnosis`, which knows this file."""
 
+SCORES = [
+    "effect", "parameters", "heldout_rms_in_plane", "heldout_rms_position",
+    "heldout_rms_coupling", "heldout_rms_roll", "heldout_chi2_per_dof", "dispersion_rms",
+]  # fmt: skip
+"""Columns of a `Step`."""
 _KINDS = {"bpms": ("monitor",), "correctors": ("hcorrector", "vcorrector")}
 
 
@@ -31,7 +36,9 @@ class Tables(Mapping[str, Any]):
       units.
     - `optics`: beta, dispersion and closed orbit of the design and of the estimated ring at the
       start and at the exit of each magnet; `attrs["tunes"]` has the fractional tunes of both.
-    - `steps`: a row a family of errors that was tried, of an orbit response; else empty.
+    - `steps`: a row for the design, the fit, and the fit given faults, of an orbit response.
+    - `families`: a row a family of errors, with the decision on it reversed, of an orbit response;
+      else empty.
     - `covariance`: of the errors' amounts, by (effect, element).
     """
 
@@ -152,16 +159,12 @@ def _optics(diagnosis: Diagnosis) -> Any:
 
 
 def _steps(diagnosis: Diagnosis) -> Any:
-    rows = [
-        record_of(step) | {"kept": kept}
-        for kept, steps in ((True, diagnosis.steps), (False, diagnosis.rejected_steps))
-        for step in steps
-    ]
-    columns = [
-        "effect", "parameters", "kept", "heldout_rms_in_plane", "heldout_rms_position",
-        "heldout_rms_coupling", "heldout_rms_roll", "heldout_chi2_per_dof", "dispersion_rms",
-    ]  # fmt: skip
-    return _frame(rows, columns)
+    return _frame([record_of(step) for step in diagnosis.steps], SCORES)
+
+
+def _families(diagnosis: Diagnosis) -> Any:
+    rows = [record_of(own) for own in diagnosis.families]
+    return _frame(rows, ["effect", "kept", "log_evidence", *SCORES[1:]])
 
 
 def _covariance(diagnosis: Diagnosis) -> Any:
@@ -182,5 +185,6 @@ _TABLES = {
     "correctors": lambda diagnosis: _of_kind(diagnosis, "correctors"),
     "optics": _optics,
     "steps": _steps,
+    "families": _families,
     "covariance": _covariance,
 }

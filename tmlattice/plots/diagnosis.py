@@ -46,7 +46,7 @@ def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     _, ax = plt.subplots(figsize=(6.5, 6.5), layout="constrained")
     plot_plan(diagnosis, ax)
     yield "plan", "The ring from above, with the findings.", _figure(ax)
-    yield from (response_figures if diagnosis.by_steps else _searched_figures)(diagnosis)
+    yield from (response_figures if diagnosis.by_families else _searched_figures)(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         if len(finding.recommended_actions) > 1:
             height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)

@@ -161,7 +161,7 @@ def plot_parts(diagnosis: Diagnosis) -> Figure:
         ax.plot(s[order], before, ".-", color=BEFORE, lw=0.8, ms=4, label=diagnosis.starting_model)
         ax.plot(s[order], after, ".-", color=AFTER, lw=0.8, ms=4, label="with the findings")
         ax.axhline(1.0, color="k", linestyle="--", linewidth=1)
-        plain_log(ax)
+        plain_log(ax.yaxis)
         ax.set_ylabel("residual / noise")
         ax.set_title(part.label, loc="left", fontsize="medium")
         ax.grid(alpha=0.25)

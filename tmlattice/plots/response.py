@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from textwrap import wrap
+from typing import cast
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -23,9 +24,10 @@ RESIDUALS = (
 
 
 def step_labels(result: Diagnosis) -> list[list[str]]:
-    """What each step adds, in lines that fit under its place."""
-    names = (s.effect.replace("monitor_", "BPM_").replace("_", " ") for s in result.steps)
-    return [wrap(name, 16) for name in names]
+    """What is fitted in each step, and in each reversed decision, in lines."""
+    steps = [result.starting_model, *(step.effect for step in result.steps[1:])]
+    names = [*steps, *(own.reversed_decision for own in result.families)]
+    return [wrap(name.replace("monitor_", "BPM_").replace("_", " "), 44) for name in names]
 
 
 def gradient_errors(result: Diagnosis) -> list[tuple[Element, float, float]]:
@@ -46,9 +48,12 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
             f"residuals of the {result.starting_model} and the result. Grey: rejected or held out.",
             plot_maps(result),
         )
-    figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
-    plot_steps(result, ax)
-    yield "steps", "The gap on held-out readings, before and after.", figure
+    yield (
+        "steps",
+        "The gap on held-out readings before and after, and with the decision on one family of "
+        "errors reversed; vertical lines: of the hierarchical fit.",
+        cast(Figure, plot_steps(result).figure),
+    )
     if any(cause.effect == "quadrupole_gradient" for cause in result.causes):
         yield (
             "gradients",
@@ -121,19 +126,24 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
 
 
 def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
-    """Held-out rms after each step that was kept."""
+    """Held-out rms of each step, and with the decision on each family reversed; thin lines: of the
+    fit with the decisions as they are."""
+    steps = (*result.steps, *result.families)
     if ax is None:
-        ax = plt.subplots(figsize=(9, 4))[1]
-    steps = result.steps
-    at = np.arange(len(steps))
+        ax = plt.subplots(figsize=(9, 1.5 + 0.25 * len(steps)), layout="constrained")[1]
     for name, label, colour, marker in RESIDUALS:
         values = [1e6 * getattr(step, name) for step in steps]
-        ax.plot(at, values, f"{marker}-", color=colour, ms=5, label=label)
+        ax.plot(values, np.arange(len(steps)), marker, color=colour, ms=5, label=label)
+        if result.families:
+            fit = result.steps[min(1, len(result.steps) - 1)]
+            ax.axvline(1e6 * getattr(fit, name), color=colour, linewidth=0.5)
     sigma = 1e6 * result.gap["noise"]
-    ax.axhline(sigma, color="0.5", linestyle=":", label="noise of a reading")
-    plain_log(ax)
-    ax.set_ylabel("held-out rms [µm]")
-    ax.set_xticks(at, ["\n".join(lines) for lines in step_labels(result)], fontsize=7)
+    ax.axvline(sigma, color="0.5", linestyle=":", label="noise of a reading")
+    plain_log(ax.xaxis)
+    ax.set_xlabel("held-out rms [µm]")
+    ax.set_yticks(range(len(steps)), ["\n".join(own) for own in step_labels(result)], fontsize=7)
+    ax.axhline(len(result.steps) - 0.5, color="0.4", linewidth=0.8)
+    ax.invert_yaxis()
     ax.grid(alpha=0.25)
     ax.legend(frameon=False, fontsize=8)
     return ax

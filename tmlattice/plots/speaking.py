@@ -49,7 +49,7 @@ def plot_diagnosis(diagnosis: Diagnosis, name: str | None = None) -> Figure:
         ChoiceError: no such figure; names those that there are.
     """
     found: dict[str, Figure] = {}
-    wanted = name or ("maps" if diagnosis.by_steps else "scan")
+    wanted = name or ("maps" if diagnosis.by_families else "scan")
     for own, _, figure in figures(diagnosis):
         found[own] = figure
         if own == wanted:

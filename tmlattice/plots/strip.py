@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -41,11 +42,7 @@ def lattice_strip(ring: Ring, ax: Axes) -> Axes:
     widest = ring.length / 600  # so that a short magnet is still seen on a whole ring
     for kind, colour in COLOURS.items():
         boxes = []
-        for element in ring.elements:
-            if element.kind != kind or (
-                kind in ("quadrupole", "sextupole") and _sign(element) == 0
-            ):
-                continue
+        for element in (e for e in ring.elements if e.kind == kind and shown(e)):
             width = max(element.length, widest)
             bottom, top = extent(element)
             boxes.append(Rectangle((element.s - width / 2, bottom), width, top - bottom))
@@ -60,6 +57,11 @@ def lattice_strip(ring: Ring, ax: Axes) -> Axes:
     return ax
 
 
+def shown(element: Element) -> bool:
+    """Whether a magnet is drawn: no quadrupole or sextupole of zero strength."""
+    return element.kind not in ("quadrupole", "sextupole") or _sign(element) != 0
+
+
 def extent(element: Element) -> tuple[float, float]:
     """From where to where a magnet is drawn: what focuses in x above the axis."""
     if element.kind not in ("quadrupole", "sextupole"):
@@ -71,9 +73,9 @@ def _sign(element: Element) -> float:
     return element.k1 if element.kind == "quadrupole" else element.k2
 
 
-def plain_log(ax: Axes) -> None:
-    """A logarithmic axis upwards with labels 1, 2, 5, 10 instead of powers."""
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter(NullFormatter())
+def plain_log(axis: Axis) -> None:
+    """A logarithmic scale with labels 1, 2, 5, 10 instead of powers."""
+    axis.axes.set(**{"xscale" if axis is axis.axes.xaxis else "yscale": "log"})
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())

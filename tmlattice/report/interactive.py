@@ -52,7 +52,7 @@ MOST = 4000
 def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """Figure functions by the name of the picture in `plots.diagnosis.figures`."""
     made = {"plan": plan(diagnosis)}
-    if not diagnosis.by_steps:
+    if not diagnosis.by_families:
         if not diagnosis.stored:
             made |= _of_readings(diagnosis)
         if diagnosis.heldout is not None:
@@ -164,7 +164,7 @@ def strip(ring: Ring) -> list[Figure]:
     traces = []
     widest = ring.length / 600
     for kind, colour in strip_view.COLOURS.items():
-        own = [e for e in ring.elements if e.kind == kind]
+        own = [e for e in ring.elements if e.kind == kind and strip_view.shown(e)]
         if not own:
             continue
         xs: list[float | None] = []
@@ -391,24 +391,30 @@ _ONE_TWO_FIVE = [float(f"{m}e{e}") for e in range(-3, 6) for m in (1, 2, 5)]
 
 
 def steps(diagnosis: Diagnosis) -> Figure:
-    """Held-out rms after each accepted step."""
-    kept = diagnosis.steps
-    at = list(range(len(kept)))
+    """Held-out rms of each step, and with the decision on each family reversed."""
+    shown = (*diagnosis.steps, *diagnosis.families)
+    at = list(range(len(shown)))
+    names = ["\n".join(lines) for lines in step_labels(diagnosis)]
     traces = []
     for name, label, colour, marker in RESIDUALS:
-        values = [1e6 * getattr(step, name) for step in kept]
+        values = [1e6 * getattr(step, name) for step in shown]
         traces.append(
-            _trace(at, values, label, colour, mode="lines+markers", marker=marker,
-                   text=[step.effect for step in kept], hover=f"<br>{label} %{{y:.3g}} µm")
+            _trace(values, at, label, colour, mode="markers", size=7, marker=marker,
+                   text=names, hover=f"<br>{label} %{{x:.3g}} µm")
         )  # fmt: skip
+        if diagnosis.families:
+            fit = values[min(1, len(diagnosis.steps) - 1)]
+            traces.append(_trace([fit, fit], [0, len(shown) - 1], label, colour, size=0.5,
+                                 showlegend=False))  # fmt: skip
     noise = 1e6 * diagnosis.gap["noise"]
     traces.append(
-        _trace([0, len(kept) - 1], [noise, noise], f"noise {noise:.2g} µm", "@faint", dash="dot")
+        _trace([noise, noise], [0, len(shown) - 1], f"noise {noise:.2g} µm", "@faint", dash="dot")
     )
-    names = [as_plain("\n".join(lines)) for lines in step_labels(diagnosis)]
     layout = _layout(
-        400, xaxis={"tickvals": at, "ticktext": names, "automargin": True, "zeroline": False},
-        yaxis=_axis("held-out rms [µm]", type="log", tickvals=_ONE_TWO_FIVE),
+        160 + 24 * len(shown),
+        xaxis=_axis("held-out rms [µm]", type="log", tickvals=_ONE_TWO_FIVE),
+        yaxis={"tickvals": at, "ticktext": [as_plain(name) for name in names],
+               "automargin": True, "zeroline": False, "autorange": "reversed"},
     )  # fmt: skip
     return {"data": traces, "layout": layout}
 

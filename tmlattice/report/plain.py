@@ -119,7 +119,7 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
 
 def _gap_table(diagnosis: Diagnosis, width: int) -> list[str]:
     before, after = tune_texts(diagnosis)
-    name = "tunes without orbit errors" if diagnosis.by_steps else "fractional tunes Qx, Qy"
+    name = "tunes without orbit errors" if diagnosis.by_families else "fractional tunes Qx, Qy"
     rows = [*gap_rows(diagnosis), (name, before, after)]
     noise = noise_text(diagnosis)
     lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows, width)

@@ -20,28 +20,42 @@ PULLS = 4
 
 
 def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
-    """Head and rows of the table of steps: effect (in the first step the model), parameters,
+    """Head and rows of the table of steps: what is fitted (first the model alone), parameters,
     held-out rms in µm."""
-    head = ("step", "amounts", "in-plane", "jump", "coupling", "roll", "RF", "chi²")
-    rows: list[tuple[str, ...]] = [
-        (
-            (model if step.effect == "design" else "") or step.effect,
-            str(step.parameters),
-            three_digits(step.heldout_rms_in_plane),
-            three_digits(step.heldout_rms_position),
-            three_digits(step.heldout_rms_coupling),
-            three_digits(step.heldout_rms_roll),
-            three_digits(step.dispersion_rms),
-            f"{step.heldout_chi2_per_dof:.3g}",
-        )
-        for step in steps
-    ]
-    return [head, *rows]
+    rows = [((model if s.effect == "design" else "") or s.effect, *_scores(s)) for s in steps]
+    return [("fitted", *SCORES), *rows]
+
+
+SCORES = ("amounts", "in-plane", "jump", "coupling", "roll", "RF", "chi²")
+
+
+def _scores(step: Step) -> tuple[str, ...]:
+    return (
+        str(step.parameters),
+        three_digits(step.heldout_rms_in_plane),
+        three_digits(step.heldout_rms_position),
+        three_digits(step.heldout_rms_coupling),
+        three_digits(step.heldout_rms_roll),
+        three_digits(step.dispersion_rms),
+        known(step.heldout_chi2_per_dof),
+    )
+
+
+def family_rows(families: Iterable[Step]) -> list[tuple[str, ...]]:
+    """Head and rows of the table of families, with the decision on each reversed: log evidence for
+    it, parameters, held-out rms in µm."""
+    rows = [(f.reversed_decision, known(f.log_evidence), *_scores(f)) for f in families]
+    return [("reversed decision", "log evidence", *SCORES), *rows]
 
 
 def three_digits(metres: float) -> str:
     """A length in µm with three digits; empty where nothing was read."""
-    return f"{1e6 * metres:.3g}" if np.isfinite(metres) else ""
+    return known(1e6 * metres)
+
+
+def known(value: float) -> str:
+    """A number with three digits; empty where it is NaN."""
+    return f"{value:.3g}" if np.isfinite(value) else ""
 
 
 OUT = "excluded"
@@ -191,7 +205,12 @@ def common_factors_sentence(result: Diagnosis) -> str:
 
 INSTEAD = "Alternative common factors of the same gradients:"
 MISSING = "Missing effects: held-out rms in µm, each alone, and on top of those that improve:"
-REJECTED = "Rejected, because they increase the held-out residual or their amount is implausible:"
+FAMILIES = (
+    "The same with the decision on one family of errors reversed, after one further round of the "
+    "fit (empty: it diverges). A family is rejected if its log evidence (natural) is below 5, if "
+    "it increases the residual of the validation correctors, if its amount is implausible, or "
+    "beyond --max-effects:"
+)
 
 
 def instead_texts(result: Diagnosis) -> list[str]:
@@ -257,9 +276,9 @@ def steps_text(result: Diagnosis, width: int) -> list[str]:
     """The section of the plain text, as lines."""
     lines = wrapped("Held-out correctors, rms in µm (chi² per reading):", "", width)
     lines += columns(step_rows(result.steps, result.starting_model), width, right=True)
-    if result.rejected_steps:
-        lines += ["", *wrapped(REJECTED, "", width)]
-        lines += columns(step_rows(result.rejected_steps), width, right=True)
+    if result.families:
+        lines += ["", *wrapped(FAMILIES, "", width)]
+        lines += columns(family_rows(result.families), width, right=True)
     lines += ["", *wrapped(bad_monitors_text(result), "", width)]
     if result.common_factors is not None:
         lines += ["", "Common factors of the gradients:"]

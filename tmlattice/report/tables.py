@@ -168,7 +168,7 @@ LARGE = 3.0
 
 def large_text(diagnosis: Diagnosis) -> str:
     """A sentence about distributed errors that are large enough to hide single faults."""
-    if diagnosis.by_steps:
+    if diagnosis.by_families:
         return ""
     large = []
     for name in diagnosis.priors:

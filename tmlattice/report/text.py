@@ -66,7 +66,7 @@ def small_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     one)."""
     rows = []
     for name, rms in diagnosis.priors.items():
-        if name in CATALOGUE and not diagnosis.by_steps:
+        if name in CATALOGUE and not diagnosis.by_families:
             times = times_usual(diagnosis, name)
             ratio = ", not determined by these readings"
             if name not in diagnosis.prior_errors:
@@ -121,7 +121,7 @@ def _located_sentence(diagnosis: Diagnosis) -> str:
 
 
 def _errors_in_steps(diagnosis: Diagnosis) -> bool:
-    """Whether accepted steps are errors of the ring, not drifts since a reference."""
+    """Whether accepted families are errors of the ring, not drifts since a reference."""
     return len(diagnosis.steps) > 1 and not diagnosis.since_reference
 
 
@@ -190,7 +190,7 @@ def _after_families(diagnosis: Diagnosis) -> str:
 def advice(diagnosis: Diagnosis) -> str:
     """What to do next if the result is open and no shot was proposed."""
     everywhere = _after_families(diagnosis)
-    if diagnosis.verdict == "distributed" and diagnosis.by_steps:
+    if diagnosis.verdict == "distributed" and diagnosis.by_families:
         return everywhere
     if text := diagnosis.assessment.sentence("reference"):
         return text
@@ -294,7 +294,7 @@ def gap_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     model, gap = diagnosis.starting_model, diagnosis.heldout
     if gap is not None and gap.baseline and not diagnosis.since_reference:
         model = f"{model} with distributed errors" if diagnosis.priors else "before"
-    what = "correctors" if diagnosis.by_steps else "readings" if diagnosis.parts else "shots"
+    what = "correctors" if diagnosis.by_families else "readings" if diagnosis.parts else "shots"
     rows = [(f"{what} of the fit", diagnosis.fit_before, diagnosis.fit_after)]
     if len(diagnosis.parts) > 1:
         rows = [(part.label, part.before, part.after) for part in diagnosis.parts]
@@ -317,7 +317,7 @@ def heldout_text(diagnosis: Diagnosis) -> str:
     """The held-out readings."""
     if diagnosis.kind == "trajectory":
         return f"shots {', '.join(map(str, diagnosis.heldout_shots))}"
-    if not diagnosis.by_steps:
+    if not diagnosis.by_families:
         return "at half of the BPMs"
     return f"{diagnosis.correctors_held_out} correctors"
 

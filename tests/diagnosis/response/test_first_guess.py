@@ -9,8 +9,8 @@ from shared import small_steps
 from tmlattice.diagnosis.data_checks import check_data
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response import first_guess
+from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.state import begin, bend
-from tmlattice.diagnosis.response.stepwise import fit_steps
 from tmlattice.effects import Cause
 from tmlattice.errors import UnstableRingError
 from tmlattice.observe.compared import ANOTHER, OfResponse
@@ -41,7 +41,7 @@ def test_a_far_design_is_fitted_from_where_it_resembles_the_readings(small_ring)
     (values,) = first_guess.first_guess(design).values.values()
     own = [e.k1 > 0 for e in small_ring.elements if e.kind == "quadrupole"]
     assert (values[own] < 0).all()  # of several that resemble the readings the best one
-    fit = fit_steps(design.data, design.split, STEPS[:3])
+    fit = fit_families(design.data, design.split, STEPS[:3])
     assert fit.steps[0].heldout_rms_in_plane > 20 * NOISE
     assert fit.steps[-1].heldout_rms_in_plane < 1.5 * NOISE
     gradients = fit.state.values["gradient"]

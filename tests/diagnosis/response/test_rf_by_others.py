@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose
 from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.steps import STEPS
+from tmlattice.diagnosis.response.hierarchical import in_turn
 from tmlattice.diagnosis.response.linear import linear, rf_by_others
 from tmlattice.diagnosis.response.state import begin
-from tmlattice.diagnosis.response.stepwise import one_by_one
 from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference.normal import solve
 from tmlattice.observe.orbit_response import Predicted
@@ -22,8 +22,8 @@ def settled(small_ring):
     causes = gradients(small_ring, 3e-3, rng)
     measured = small_steps(small_ring, causes, seed=1)
     data, split = parted(small_ring, measured, 1)
-    *_, (_, state) = one_by_one(begin(data, split), STEPS[:3])
-    return state
+    design = begin(data, split)
+    return in_turn(design, STEPS[:3])
 
 
 def told(state):

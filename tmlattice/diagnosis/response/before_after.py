@@ -39,6 +39,15 @@ from tmlattice.diagnosis.findings import (
 )
 from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
+from tmlattice.diagnosis.response.hierarchical import (
+    HierarchicalFit,
+    decisions,
+    fit_families,
+    in_turn,
+    readable,
+    reversed_decisions,
+    steps_of,
+)
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
@@ -46,7 +55,6 @@ from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin, bend, jump
 from tmlattice.diagnosis.response.stated import unwidened, with_support
-from tmlattice.diagnosis.response.stepwise import StepwiseFit, fit_steps, one_by_one
 from tmlattice.diagnosis.response.undetermined import Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.response.weights import LEAST
@@ -228,7 +236,7 @@ def _reference(
     if not steps:
         return nothing, []
     try:
-        fit = fit_steps(data, split, steps, len(steps), progress)
+        fit = fit_families(data, split, steps, len(steps), progress)
         return settle(bend(jump(_all_columns(fit.state), beyond=1.0))), list(fit.messages)
     except (TmlatticeError, np.linalg.LinAlgError):
         return nothing, ["its fit diverged; the change is relative to the design"]
@@ -267,22 +275,16 @@ def _by_good_monitors(
 
 def _fit_change(
     data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
-) -> StepwiseFit:
+) -> HierarchicalFit:
     """The fit of all possible changes, with the estimated noise of the difference."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
-    steps = [score(design, "reference")]
-    state = design
-    for trial, settled in one_by_one(design, trials, progress):
-        state = settled
-        count = sum(family.count(data) for family in trial)
-        title = ", ".join(family.title for family in trial)
-        steps.append(score(state, title, count))
-    state = settle(bend(jump(state)))
+    trials = readable(design, trials)
+    state = settle(bend(jump(in_turn(design, trials, progress))))
     state = settle(_learnt_noise(state))
-    steps[-1] = score(state, steps[-1].effect, steps[-1].parameters)
     design = _with_noise(design, state.data.noise)
-    steps[0] = score(design, "reference")
-    return StepwiseFit(design, state, tuple(steps), ())
+    steps = steps_of(score(design, "reference"), state, trials)
+    fit = HierarchicalFit(design, state, steps, decisions(data, trials, trials, {}))
+    return reversed_decisions(fit, progress)
 
 
 def _learnt_noise(state: State) -> State:
@@ -360,7 +362,7 @@ def _sparse_or_all(
     seed: int,
     progress: Callable[[str], Any],
     open_: Undetermined,
-) -> SparseFit | StepwiseFit:
+) -> SparseFit | HierarchicalFit:
     """The sparse solution of a change, or the fit of all possible changes."""
     asked = changes() if effects is None else effects
     sparse = sparse_fit(
@@ -380,7 +382,7 @@ def _verdict(state: State) -> str:
 
 
 def _messages(
-    data: ResponseData, fit: StepwiseFit, state: State, scatter: Mapping[str, float]
+    data: ResponseData, fit: HierarchicalFit, state: State, scatter: Mapping[str, float]
 ) -> list[str]:
     """Messages on the agreement of two measurements, and the scatter of magnets and supplies."""
     left = data.pick(state.at.left)[:-1][:, state.good]

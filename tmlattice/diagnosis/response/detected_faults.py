@@ -44,12 +44,12 @@ from tmlattice.diagnosis.families.steps import (
 )
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
+from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, fit_chi2
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.rounds import LEARN, evidence_of, settle
 from tmlattice.diagnosis.response.state import Candidate, State, allow, begin, bend, jump
 from tmlattice.diagnosis.response.stated import doubt
-from tmlattice.diagnosis.response.stepwise import ROUGH, StepwiseFit, fit_chi2
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.response.weights import weighed, weight
 from tmlattice.diagnosis.result import Finding
@@ -651,7 +651,7 @@ def _stepped(state: State) -> State:
     return replace(state, groups=groups).moved(values)
 
 
-def given_faults(fit: StepwiseFit, apart: Sequence[Candidate]) -> StepwiseFit:
+def given_faults(fit: HierarchicalFit, apart: Sequence[Candidate]) -> HierarchicalFit:
     """Return the hierarchical fit with the faults' numbers free of their families, as a further
     step; unchanged where held-out residuals grow."""
     state = fit.state

@@ -1,6 +1,6 @@
 """Effects missing from a fitted orbit response: each hypothesis is scored on held-out readings.
 
->>> fit = fit_steps(data, split)
+>>> fit = fit_families(data, split)
 >>> for row in weigh(fit.state): print(row.effect, row.amount, row.amount_sigma, row.judgement)
 
 A hypothesis is a set of patterns, the derivatives of the readings by its parameters. They are

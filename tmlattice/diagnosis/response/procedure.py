@@ -40,6 +40,12 @@ from tmlattice.diagnosis.response.assumed import assumed_of
 from tmlattice.diagnosis.response.common_factors import explain_gradients
 from tmlattice.diagnosis.response.detected_faults import detected_faults, given_faults
 from tmlattice.diagnosis.response.first_guess import FAR, first_guess, strange
+from tmlattice.diagnosis.response.hierarchical import (
+    HierarchicalFit,
+    fit_chi2,
+    fit_families,
+    reversed_decisions,
+)
 from tmlattice.diagnosis.response.inconsistencies import inconsistencies
 from tmlattice.diagnosis.response.labels import (
     Label,
@@ -56,11 +62,6 @@ from tmlattice.diagnosis.response.outlier_readings import outlier_readings, with
 from tmlattice.diagnosis.response.sparse import outperforms, sparse_fit
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.stated import fitted_causes
-from tmlattice.diagnosis.response.stepwise import (
-    StepwiseFit,
-    fit_chi2,
-    fit_steps,
-)
 from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.suspects import outliers
 from tmlattice.diagnosis.views import ResponseView
@@ -104,7 +105,7 @@ def diagnose_response(
         measured: with an RF step, if possible, and with its noise, else that is estimated.
         holdout: share of the correctors that is never fitted.
         effects: names of effects whose families are tried; None: all.
-        max_effects: most accepted steps.
+        max_effects: most accepted families.
         false_alarm: probability of a finding in readings of a faultless ring.
         missing: score effects that may be missing from the result, too.
         assume: what is recorded wrongly everywhere, see `measurement.assume`.
@@ -135,6 +136,7 @@ def diagnose_response(
     rejected: tuple[tuple[str, str | None], ...] = ()
     if sparse is None:
         fit, measured, labels = whole
+        fit = reversed_decisions(fit, progress)
         notes += [*label_messages(own for own in labels if own not in fit.labels), *fit.messages]
         notes += [] if measured.response.size <= LARGE else [TOO_LARGE]
         rejected = tuple((own.elements[0], own.plane) for own in labels if "rejected" in own.kind)
@@ -181,7 +183,7 @@ def _families(
     most: int,
     seed: int,
     progress: Callable[[str], Any],
-) -> tuple[StepwiseFit, OrbitResponse, list[Label]]:
+) -> tuple[HierarchicalFit, OrbitResponse, list[Label]]:
     """The hierarchical fit of the corrected measurement, that measurement, and all labels.
 
     Swaps are corrected, and rejected channels are removed, by the design, then by the fit, until
@@ -192,7 +194,7 @@ def _families(
         split = split_columns(data, holdout, np.random.default_rng(seed))
         found = _wrong(begin(data, split), known, of_design=True)
         if not found:
-            fit = fit_steps(data, split, trials, most, progress)
+            fit = fit_families(data, split, trials, most, progress)
             swapped = [own for own in fit.labels if own.kind == "swapped correctors"]
             found = [*new(swapped, known), *_wrong(fit.state, known)]
             if not found:
@@ -214,13 +216,13 @@ def _wrong(state: State, known: Sequence[Label], of_design: bool = False) -> lis
 
 
 def _faults(
-    fit: StepwiseFit,
+    fit: HierarchicalFit,
     labels: Sequence[Label],
     effects: Sequence[str] | None,
     most: int,
     judgement: Judgement,
     progress: Callable[[str], Any],
-) -> tuple[StepwiseFit, tuple[Finding, ...]]:
+) -> tuple[HierarchicalFit, tuple[Finding, ...]]:
     """The fit given detected single faults, and the findings."""
     state = fit.state
     ring = state.data.ring
@@ -241,7 +243,7 @@ def _faults(
 
 def as_diagnosis(
     ring: Ring,
-    fit: StepwiseFit,
+    fit: HierarchicalFit,
     within: Sequence[Cause],
     found: Sequence[StatedCause],
     **fields: Any,
@@ -286,7 +288,7 @@ def as_diagnosis(
         suspects=outliers(ring, causes, errors, named),
         view=_view(fit),
         steps=fit.steps,
-        rejected_steps=fit.rejected_steps,
+        families=fit.families,
         bad_monitors=tuple(data.measured.monitors[i] for i in np.flatnonzero(~good)),
         priors={
             name: group.rms
@@ -298,7 +300,7 @@ def as_diagnosis(
     )
 
 
-def _view(fit: StepwiseFit) -> ResponseView:
+def _view(fit: HierarchicalFit) -> ResponseView:
     state, data = fit.state, fit.state.data
     design, model = fit.design.at.read, state.at.read
     return ResponseView(data.measured, data.orbits, design, model, state.split.held, state.good)
@@ -338,7 +340,7 @@ def trials_of(effects: Sequence[str] | None, steps: Sequence[Trial] = STEPS) -> 
     return [trial for trial in kept if trial]
 
 
-def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
+def _verdict(fit: HierarchicalFit, false_alarm: float) -> str:
     """`none` if the design's residual is noise, of fitted and held-out readings, in-plane, coupling
     and RF; else `distributed`."""
     blocks = (*fit_chi2(fit.design), *fit.steps[0].compared)
@@ -346,14 +348,14 @@ def _verdict(fit: StepwiseFit, false_alarm: float) -> str:
     return "none" if min(chances) > false_alarm / len(chances) else "distributed"
 
 
-def _warnings(fit: StepwiseFit) -> tuple[str, ...]:
+def _warnings(fit: HierarchicalFit) -> tuple[str, ...]:
     """Warnings about the closed orbit's effects and outliers."""
     of_orbit = (orbits_in_sextupoles, dispersion_by_kicks)
     messages = (one for make in of_orbit for one in make(fit.state.values, fit.state.data))
     return (*messages, *outlier_readings(fit.state))
 
 
-def _misfit(fit: StepwiseFit, read: Array) -> Misfit:
+def _misfit(fit: HierarchicalFit, read: Array) -> Misfit:
     """The misfit of the fitted correctors' readings in their own plane."""
     data, good = fit.state.data, fit.state.good
     rows = np.flatnonzero(~fit.state.split.held[:-1])
@@ -362,7 +364,7 @@ def _misfit(fit: StepwiseFit, read: Array) -> Misfit:
     return Misfit(float(np.sqrt(np.nanmean(miss**2))), float(np.nanmean(pull**2)))
 
 
-def _gap(fit: StepwiseFit) -> Gap:
+def _gap(fit: HierarchicalFit) -> Gap:
     misfits = tuple(Misfit(s.heldout_rms_in_plane, s.heldout_chi2_per_dof) for s in fit.steps)
     # in units of each reading's noise: the planes differ in it
     before, after = (max(m.chi2_per_dof - 1, 0.0) for m in (misfits[0], misfits[-1]))
@@ -372,7 +374,7 @@ def _gap(fit: StepwiseFit) -> Gap:
     return Gap(misfits, np.zeros((0, 0, 0)), explained, None, 0, int(seen.freedom))
 
 
-def _patterns(fit: StepwiseFit) -> dict[str, Any]:
+def _patterns(fit: HierarchicalFit) -> dict[str, Any]:
     """The residual of the fitted correctors: chi-square per reading, and the share of the strongest
     patterns in each plane."""
     state, data = fit.state, fit.state.data

@@ -14,9 +14,9 @@ from tmlattice.arrays import AT_ONCE, Array, Flags
 from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
+from tmlattice.diagnosis.response.hierarchical import HierarchicalFit
 from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.state import begin
-from tmlattice.diagnosis.response.stepwise import StepwiseFit
 from tmlattice.diagnosis.response.undetermined import Blur, SingleChange, Undetermined
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Finding
@@ -72,7 +72,7 @@ class SparseFit:
             its blocks.
     """
 
-    fit: StepwiseFit
+    fit: HierarchicalFit
     findings: tuple[Finding, ...]
     verdict: str
     fitted_causes: list[StatedCause]
@@ -139,7 +139,7 @@ def sparse_fit(
     return _result(data, split, base, found, count, most, judgement)
 
 
-def outperforms(fit: StepwiseFit, sparse: SparseFit, judgement: Judgement) -> bool:
+def outperforms(fit: HierarchicalFit, sparse: SparseFit, judgement: Judgement) -> bool:
     """Return whether the hierarchical fit explains more than the sparse solution: it alone leaves
     noise, or it predicts held-out readings better, at the BPMs that it does not reject, in the
     planes that were read."""
@@ -310,8 +310,8 @@ def _result(
         steps.append(score(state, name, 1))
     covariance = found.fit.covariance
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    stepwise = StepwiseFit(design, state, tuple(steps), ())
+    fit = HierarchicalFit(design, state, tuple(steps))
     fitted_causes = list(zip(causes, errors, strict=True))
     expected = judgement.noise[1] <= p_value <= 1 - judgement.noise[1]
-    noise = expected and stepwise.p_value >= judgement.noise[0]
-    return SparseFit(stepwise, findings[:most], verdict, fitted_causes, covariance, messages, noise)
+    noise = expected and fit.p_value >= judgement.noise[0]
+    return SparseFit(fit, findings[:most], verdict, fitted_causes, covariance, messages, noise)

@@ -40,10 +40,10 @@ WORTH = 0.05
 
 @dataclass(frozen=True)
 class Step:
-    """The scores with the families accepted so far.
+    """The scores of a fit.
 
     Attributes:
-        effect: the families of the step; the first is "design".
+        effect: what is fitted; "design": the model alone.
         parameters: their number.
         heldout_rms_in_plane, heldout_rms_coupling: of held-out correctors, m.
         heldout_rms_position: in-plane, with a position jump of each held-out corrector, m.
@@ -51,20 +51,28 @@ class Step:
             determine its kick, m; NaN before rolls are fitted.
         heldout_chi2_per_dof: in-plane, by the readings' noise.
         dispersion_rms: residual of the RF's orbit in x at BPMs that are not fitted, m.
-        kept: whether it was accepted; the scores of a rejected step are its own.
+        kept: whether a family is in the result.
+        log_evidence: for a family, when it was tested; NaN for a step and for an implausible
+            family.
         compared: held-out readings in-plane, coupling and RF, by their noise.
     """
 
     effect: str
     parameters: int
-    heldout_rms_in_plane: float
-    heldout_rms_coupling: float
-    heldout_chi2_per_dof: float
-    dispersion_rms: float
+    heldout_rms_in_plane: float = float("nan")
+    heldout_rms_coupling: float = float("nan")
+    heldout_chi2_per_dof: float = float("nan")
+    dispersion_rms: float = float("nan")
     heldout_rms_position: float = float("nan")
     heldout_rms_roll: float = float("nan")
-    kept: bool = field(default=True, metadata=HIDDEN)
+    kept: bool = True
+    log_evidence: float = float("nan")
     compared: tuple[Block, ...] = field(default=(), metadata=HIDDEN)
+
+    @property
+    def reversed_decision(self) -> str:
+        """The decision on a family, reversed, in words."""
+        return f"{'without' if self.kept else 'with'} {self.effect}"
 
 
 class _Missed(NamedTuple):

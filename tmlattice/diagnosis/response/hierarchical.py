@@ -1,15 +1,15 @@
 """The hierarchical fit of an orbit response: families of errors, validated on held-out readings.
 
->>> fit = fit_steps(data, split)
+>>> fit = fit_families(data, split)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in fit.steps]
 
-Families are added one by one. Gradients and skew gradients are fitted together, because skew
-gradients move the tunes.
+Families are added one by one, then all are fitted together, and each is tested by the loss without
+it.
 """
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +42,7 @@ from tmlattice.diagnosis.response.state import (
     bend,
     forbid,
     jump,
+    projected,
 )
 from tmlattice.diagnosis.response.validation import (
     WORTH,
@@ -62,7 +63,7 @@ from tmlattice.observe.response_data import ResponseData, Split
 log = logging.getLogger(__name__)
 
 LEAST = 5.0
-"""Log evidence required for a step."""
+"""Log evidence required for a family."""
 SPOILT, ENOUGH = 0.05, 3
 """Largest rise of the validation score with all families together, and fewest correctors for this
 test: a single one may be near the design by chance."""
@@ -74,6 +75,8 @@ SURE = 100.0
 FIRST, ROUGH = 4, 0.03
 """Rounds of each block after a family is added or removed, and the relative fall of the cost
 required for another one."""
+DIVERGED = 2.0
+"""Ratio of the held-out rms to the design's above which one round has diverged."""
 
 
 def fit_chi2(state: State) -> tuple[Block, ...]:
@@ -90,13 +93,13 @@ def fit_chi2(state: State) -> tuple[Block, ...]:
 
 # --- the steps ------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
-class StepwiseFit:
-    """The steps and the fitted state.
+class HierarchicalFit:
+    """A hierarchical fit: its scores and its state.
 
     Attributes:
         design, state: before and after.
-        steps: accepted; the first is the design's, the last the result's.
-        rejected_steps: did not improve the fit.
+        steps: the design's scores, and the result's; then those given faults.
+        decisions: on each trial, with its log evidence; scores: see `reversed_decisions`.
         messages: about rejected readings, implausible families and beam jitter.
         labels: of rejected steps.
     """
@@ -104,9 +107,14 @@ class StepwiseFit:
     design: State
     state: State
     steps: tuple[Step, ...]
-    rejected_steps: tuple[Step, ...]
+    decisions: Mapping[Trial, Step] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     labels: tuple[Label, ...] = ()
+
+    @property
+    def families(self) -> tuple[Step, ...]:
+        """The decisions."""
+        return tuple(self.decisions.values())
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -119,33 +127,35 @@ class StepwiseFit:
         return combined_p_value(self.blocks)
 
 
-def fit_steps(
+def fit_families(
     data: ResponseData,
     split: Split,
     trials: Sequence[Trial] = STEPS,
     most: int = len(STEPS),
     progress: Callable[[str], Any] = lambda stage: None,
-) -> StepwiseFit:
+) -> HierarchicalFit:
     """Return the fit of all families that are needed, to all correctors except the held-out ones.
 
-    Families need one another: BPM gains improve nothing before the gradients, for example. So all
+    Families need one another: BPM gains improve nothing without the gradients, for example. So all
     are fitted together, without outliers, and each is tested by the loss without it.
 
     Args:
         data, split: the data, and the validation split.
-        trials: families, in the order in which they are added.
-        most: most accepted steps.
-        progress: called with each step's name.
+        trials: families.
+        most: most accepted trials.
+        progress: called with what is done.
     """
     design = begin(data, split)
-    stages, state = _in_turn(design, trials, progress)
+    trials = readable(design, trials)
+    state = in_turn(begun(design, trials), trials, progress)
     single, labels = _outliers(state)
     if single.any():  # they have biased the families, and the residuals of steps
-        stages, state = _in_turn(without_readings(design, single), trials, progress)
+        cleaned = without_readings(design, single)
+        state = in_turn(begun(cleaned, trials), trials, progress)
         more, labels = _outliers(state)
         single = single | more
-    progress("all together")
-    state, notes = _together(without_readings(state, single | rejected(state, labels)), stages)
+    progress("all families without outliers")
+    state, notes = _together(without_readings(state, single | rejected(state, labels)), trials)
     log.info("effective sample size per reading: %s", state.independent)
     more, later = _outliers(state)  # typical residuals are smaller now
     single, labels = single | more, [*labels, *later]
@@ -154,25 +164,14 @@ def fit_steps(
     notes = [*told_gross(data, single, "the fit"), *label_messages(labels), *notes]
     state, moving = _beside_jitter(state, progress)
     before = score(design, "design")
-    steps = {
-        trial: score(
-            without_readings(own, odd),
-            _title(trial),
-            sum(family.count(state.data) for family in trial),
-        )
-        for trial, own in stages.items()
-    }
-    stages.clear()  # of many readings, they are large
-    state, gone, others = _needed(state, steps, most, progress)
-    rejected_steps = [replace(steps.pop(own), kept=False) for own in gone]
+    state, gone, others, evidence = _needed(state, trials, most, progress)
     notes += others
     validated = inner(state)
     enough = int(np.sum(validated.columns[:, 0, 1] > 0)) >= ENOUGH
     worse = -lost(inner(replace(design, jitter=state.jitter)), validated)[0]
-    nothing = StepwiseFit(
-        design, design, (before,),
-        (*rejected_steps, *(replace(step, kept=False) for step in steps.values())),
-        tuple(notes), tuple(labels),
+    nothing = HierarchicalFit(
+        design, design, (before,), decisions(data, trials, (), evidence), tuple(notes),
+        tuple(labels),
     )  # fmt: skip
     if enough and worse > SPOILT:  # together they worsen the validation
         return nothing
@@ -183,10 +182,11 @@ def fit_steps(
         moving = sought(state, moving.planes) or moving
         state = replace(state, jitter=moving.orbits)
     state = taken_back(settle(replace(state, robust=True)))
-    for trial in [own for own in steps if _doubts(state, own)]:  # it has moved since
+    kept = [own for own in trials if own not in gone]
+    for trial in [own for own in kept if _doubts(state, own)]:  # it has moved since
         notes += _doubts(state, trial)
         state = _without(state, trial)
-        rejected_steps.append(replace(steps.pop(trial), kept=False))
+        kept.remove(trial)
     then = replace(design, good=state.good, exploring=False)
     if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
         diverged = (
@@ -194,12 +194,11 @@ def fit_steps(
             "lattice may be too far from the ring, and no effect is reported"
         )
         return replace(nothing, messages=(*nothing.messages, diverged))
-    kept = [before, *steps.values()]
-    kept[-1] = score(state, kept[-1].effect, kept[-1].parameters)
     notes += [] if moving is None else [moving.sentence]
-    return StepwiseFit(
-        design, state, tuple(kept), tuple(rejected_steps), tuple(notes), tuple(labels)
-    )
+    return HierarchicalFit(
+        design, state, steps_of(before, state, kept), decisions(data, trials, kept, evidence),
+        tuple(notes), tuple(labels),
+    )  # fmt: skip
 
 
 def _outliers(state: State) -> tuple[Flags, list[Label]]:
@@ -214,9 +213,9 @@ def _outliers(state: State) -> tuple[Flags, list[Label]]:
 
 def _needed(
     state: State, trials: Collection[Trial], most: int, progress: Callable[[str], Any]
-) -> tuple[State, list[Trial], list[str]]:
-    """The state with the needed families alone, `most` trials at most; the rejected trials; and
-    messages about implausible ones.
+) -> tuple[State, list[Trial], list[str], dict[Trial, float]]:
+    """The state with the needed families alone, `most` trials at most; the rejected trials;
+    messages about implausible ones; and the log evidence of each plausible trial.
 
     The least needed one by the linearised evidence is tested first. Once one is removed, those that
     were not tested are linearised again."""
@@ -225,10 +224,13 @@ def _needed(
     gone = [own for own in trials if own not in untested]
     doubts: list[str] = []
     worth: dict[Trial, float] = {}
+    evidence: dict[Trial, float] = {}
     removed = True
     while untested:
         if removed:
             linear_worth, rejected = _quickly(state, untested, progress)
+            evidence |= {own: linear_worth[own] + LEAST for own in untested
+                         if np.isfinite(linear_worth[own])}  # fmt: skip
             sure = [own for own in untested if linear_worth[own] > SURE and not rejected[own]]
             worth |= {own: linear_worth[own] for own in sure}
             untested = sorted(
@@ -239,7 +241,8 @@ def _needed(
             whole = evidence_of(state, state.good, state.independent)
         least = untested.pop(0)
         progress(f"without {_title(least)}")
-        worth[least], without = _tested(state, least, linear_worth[least], whole)
+        worth[least], refitted, without = _tested(state, least, linear_worth[least], whole)
+        evidence |= {} if refitted is None else {least: refitted + LEAST}
         removed = without is not None and worth[least] <= 0
         if without is not None and removed:
             doubts += _doubts(state, least)
@@ -249,18 +252,69 @@ def _needed(
     for least in sorted(worth, key=lambda own: worth[own])[: max(len(worth) - most, 0)]:
         state = _without(state, least)
         gone.append(least)
-    return state, gone, doubts
+    return state, gone, doubts, evidence
 
 
-def _in_turn(
-    design: State, trials: Sequence[Trial], progress: Callable[[str], Any]
-) -> tuple[dict[Trial, State], State]:
-    """The state after each trial that has places and readings, and the last of them."""
-    stages: dict[Trial, State] = {}
-    state = design
-    for trial, state in one_by_one(begun(design, trials), trials, progress):
-        stages[trial] = replace(state, kept={})
-    return stages, state
+def readable(state: State, trials: Iterable[Trial]) -> list[Trial]:
+    """Return the trials with their families that have places in the ring, and readings."""
+    own = [tuple(f for f in trial if state.reads(f.block) and f.size(state.data))
+           for trial in trials]  # fmt: skip
+    return [trial for trial in own if any(family.count(state.data) for family in trial)]
+
+
+def steps_of(before: Step, state: State, trials: Sequence[Trial]) -> tuple[Step, ...]:
+    """Return the scores before and with the fitted trials; those before alone without any."""
+    if not trials:
+        return (before,)
+    title = _title(trials[0]) if len(trials) == 1 else f"{len(trials)} families of errors"
+    count = sum(family.count(state.data) for trial in trials for family in trial)
+    return before, score(state, title, count)
+
+
+def in_turn(
+    state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
+) -> State:
+    """Return the rough fit of all families, added one by one: all at once they converge slowly from
+    a design that is far from the ring, as PETRA III's is."""
+    for trial in readable(state, trials):
+        progress(_title(trial))
+        state = settle(jump(allow(state, trial)), _blocks(trial), FIRST, ROUGH)
+    return state
+
+
+def decisions(
+    data: ResponseData,
+    trials: Iterable[Trial],
+    kept: Collection[Trial],
+    evidence: Mapping[Trial, float],
+) -> dict[Trial, Step]:
+    """Return the decision on each trial, without scores."""
+    return {
+        own: Step(
+            _title(own), sum(family.count(data) for family in own), kept=own in kept,
+            log_evidence=evidence.get(own, np.nan),
+        )
+        for own in trials
+    }  # fmt: skip
+
+
+def reversed_decisions(
+    fit: HierarchicalFit, progress: Callable[[str], Any] = lambda stage: None
+) -> HierarchicalFit:
+    """Return the fit with the scores that each decision would have if it were reversed, after one
+    round in which the other families are fitted again; none if that round diverges."""
+    scored = {}
+    for trial, step in fit.decisions.items():
+        progress(step.reversed_decision)
+        try:
+            other = projected(forbid(fit.state, trial)) if step.kept else allow(fit.state, trial)
+            scores = score(settle(jump(other), _blocks(trial), 1), step.effect)
+        except (TmlatticeError, np.linalg.LinAlgError):
+            continue
+        if scores.heldout_rms_in_plane < DIVERGED * fit.steps[0].heldout_rms_in_plane:
+            scored[trial] = replace(scores, parameters=step.parameters, kept=step.kept,
+                                    log_evidence=step.log_evidence)  # fmt: skip
+    return replace(fit, decisions={**fit.decisions, **scored})
 
 
 def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
@@ -320,23 +374,6 @@ def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State,
     return (state, None) if against(messages, WORTH) else (with_it, moving)
 
 
-def one_by_one(
-    state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
-) -> Iterator[tuple[Trial, State]]:
-    """Yield each trial, and the state with its families fitted together with those before. Families
-    without places in the ring, or without readings, are omitted."""
-    for given in trials:
-        trial = tuple(
-            family for family in given
-            if state.reads(family.block) and family.size(state.data)
-        )  # fmt: skip
-        if not any(family.count(state.data) for family in trial):
-            continue
-        progress(_title(trial))
-        state = settle(jump(allow(state, trial)), _blocks(trial), FIRST, ROUGH)
-        yield trial, state
-
-
 def _title(trial: Trial) -> str:
     return ", ".join(family.title for family in trial)
 
@@ -348,9 +385,9 @@ def _blocks(trial: Trial) -> list[int]:
 
 def _tested(
     state: State, trial: Trial, linear_worth: float, whole: Evidence
-) -> tuple[float, State | None]:
-    """Log evidence beyond `LEAST` of a trial (0 or less: not needed), and the state without it;
-    None if no beam is stored without it.
+) -> tuple[float, float | None, State | None]:
+    """Worth of a trial: its log evidence beyond `LEAST`, or less by validation (0 or less: not
+    needed); that evidence; and the state without it, None if no beam is stored without it.
 
     Validation has a veto, because the evidence assumes independent readings, and model discrepancy
     is not. Where validation and the linearised evidence both favour a family, the latter decides,
@@ -359,14 +396,14 @@ def _tested(
     try:
         without = _without(state, trial)
     except TmlatticeError:  # no closed orbit without it
-        return np.inf, None
+        return np.inf, None, None
     if linear_worth == -np.inf:
-        return linear_worth, without
+        return linear_worth, None, without
     good = state.good & without.good
     shares = state.independent
     with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
     other = evidence_of(without, good, shares)
-    gained = with_it.log - other.log - LEAST
+    refitted = gained = with_it.log - other.log - LEAST
     messages = lost(
         inner(replace(without, good=good), _of_rf(other)),
         inner(replace(state, good=good), _of_rf(with_it)),
@@ -378,7 +415,7 @@ def _tested(
         gained = min(gained, messages[0])
     elif _asked(trial) and in_favour(messages) and linear_worth > gained > -unsure:
         gained = linear_worth
-    return gained, without
+    return gained, refitted, without
 
 
 def _doubts(state: State, trial: Trial) -> list[str]:
@@ -419,7 +456,8 @@ def _quickly(
     validated = inner(state, of_rf)
     for trial in trials:
         progress(f"is {_title(trial)} needed")
-        at_zero = not any(state.values[family.variable].any() for family in trial)
+        own = (state.values[f.variable] for f in trial if state.allows(f.name))
+        at_zero = not any(values.any() for values in own)
         if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
             worth[trial], unwanted[trial] = -np.inf, False
             continue
