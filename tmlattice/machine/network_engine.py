@@ -43,9 +43,7 @@ class NetworkEngine:
     def stored_line(self, settings: Settings) -> tuple[Any, Any, float]:
         """See `AtEngine.stored_line`; a line is whether the RF is on; TmlatticeError: settings."""
         if settings:
-            raise TmlatticeError(
-                "the network has no settings and no energy offset; take the engine 'at'"
-            )
+            raise TmlatticeError("the network has no settings; take the engine 'at'")
         return False, bool(self._rf[0]), 0.0
 
     def one_pass(self, rf: Any, beam: Array) -> Array:

@@ -133,8 +133,8 @@ class StoredMachine:
     def at(self, settings: Sequence[Settings], frequency: float | None = None) -> list[Settings]:
         """Return the settings of each shot with a change of the RF frequency (relative); None: that
         of the beam's mean energy."""
-        mean = float(self.energies[0] @ self.energies[1]) if frequency is None else frequency
-        return [_with_frequency(own, float(mean)) for own in settings]
+        change = self.energies[0] @ self.energies[1] if frequency is None else frequency
+        return [_with_frequency(own, float(change)) for own in settings]
 
     def noisy(
         self, readings: Array, noise: float | Sequence[float], purpose: str

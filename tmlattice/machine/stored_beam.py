@@ -22,6 +22,7 @@ from tmlattice.machine.network_engine import NetworkEngine
 from tmlattice.machine.response import NOISE, StoredMachine, rf_setting, rf_step_of, spread_of
 from tmlattice.machine.shots import draw_shots, each_setting, stream
 from tmlattice.measurement import ClosedOrbit, Dispersion, RfStep, TuneReading, TurnByTurn
+from tmlattice.observe.calibration import offset_of
 
 Noise = float | Sequence[float]
 
@@ -91,6 +92,8 @@ def simulate_turns(
     check_engine(engine, ("at", "network"))
     if radiation and engine == "network":
         raise EffectError("the network has no radiation; take the engine 'at'")
+    if offset_of(machine.every) and engine == "network":
+        raise EffectError("the network has no energy offset; take the engine 'at'")
     tracker = machine.engine if engine == "at" else NetworkEngine(ring, machine.every)
     moved = machine.at(each)  # by an energy offset
     passed = np.stack([

@@ -283,8 +283,7 @@ def _fit_change(
     state = settle(_learnt_noise(state))
     design = _with_noise(design, state.data.noise)
     steps = steps_of(score(design, "reference"), state, trials)
-    fit = HierarchicalFit(design, state, steps, decisions(data, trials, trials, {}))
-    return reversed_decisions(fit, progress)
+    return HierarchicalFit(design, state, steps, decisions(data, trials, trials, {}))
 
 
 def _learnt_noise(state: State) -> State:
@@ -373,7 +372,9 @@ def _sparse_or_all(
     if sparse is not None and sparse.noise:
         return sparse
     fit = _fit_change(data, split, trials, progress)
-    return fit if sparse is None or outperforms(fit, sparse, judgement) else sparse
+    if sparse is None or outperforms(fit, sparse, judgement):
+        return reversed_decisions(fit, progress)
+    return sparse
 
 
 def _verdict(state: State) -> str:

@@ -242,7 +242,8 @@ def _needed(
         least = untested.pop(0)
         progress(f"without {_title(least)}")
         worth[least], refitted, without = _tested(state, least, linear_worth[least], whole)
-        evidence |= {} if refitted is None else {least: refitted + LEAST}
+        if refitted is not None:
+            evidence[least] = refitted + LEAST
         removed = without is not None and worth[least] <= 0
         if without is not None and removed:
             doubts += _doubts(state, least)
