@@ -161,6 +161,35 @@ def test_gains_of_little_information_come_in(small_ring):
     assert last.heldout_chi2_per_dof < first.heldout_chi2_per_dof
 
 
+def test_a_reversed_decision_is_felt_in_its_own_plane(small_ring, rng):
+    """Gradients act in plane, rolls of BPMs across; what the machine lacks changes nothing."""
+    causes = gradients(small_ring, 6e-3, rng)
+    causes += [Cause("monitor_roll", own.name, 0.02 * float(rng.standard_normal()))
+               for own in small_ring.monitors]  # fmt: skip
+    data, split = parted(small_ring, small_steps(small_ring, causes, seed=3))
+    trials = [own for own in STEPS if own[0].name in ("quadrupole_gradient", "monitor_roll",
+                                                      "corrector_position")]  # fmt: skip
+    fit = hierarchical.reversed_decisions(hierarchical.fit_families(data, split, trials))
+    last = fit.steps[-1]
+    rows = {own.effect.split(",")[0]: own for own in fit.families}
+    ratio = {
+        name: (own.heldout_rms_in_plane / last.heldout_rms_in_plane,
+               own.heldout_rms_coupling / last.heldout_rms_coupling)
+        for name, own in rows.items()
+    }  # fmt: skip
+    assert rows["quadrupole_gradient"].kept
+    assert rows["monitor_roll"].kept
+    assert ratio["quadrupole_gradient"][0] > 5
+    assert ratio["quadrupole_gradient"][1] < 2
+    assert ratio["monitor_roll"][0] < 1.2
+    assert ratio["monitor_roll"][1] > 5
+    assert min(rows[name].log_evidence for name in ("quadrupole_gradient", "monitor_roll")) > 100
+    idle = rows["corrector_position"]
+    assert not idle.kept
+    assert idle.log_evidence < hierarchical.LEAST
+    assert ratio["corrector_position"] == pytest.approx((1, 1), abs=0.1)
+
+
 def test_numbers_that_have_a_lowest_value_vs_bounded_least_squares(rng):
     """Two that pull against one another: to hold the one that went too low is not enough."""
     size = 8
