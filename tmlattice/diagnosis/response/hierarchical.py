@@ -149,11 +149,6 @@ def fit_families(
     trials = readable(design, trials)
     state = in_turn(begun(design, trials), trials, progress)
     single, labels = _outliers(state)
-    if single.any():  # they have biased the families, and the residuals of steps
-        cleaned = without_readings(design, single)
-        state = in_turn(begun(cleaned, trials), trials, progress)
-        more, labels = _outliers(state)
-        single = single | more
     progress("all families without outliers")
     state, notes = _together(without_readings(state, single | rejected(state, labels)), trials)
     log.info("effective sample size per reading: %s", state.independent)
