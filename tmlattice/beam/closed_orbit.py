@@ -116,8 +116,10 @@ class ResponseModel:
             UnstableRingError: no closed orbit.
         """
         other = copy(self)
+        # near the new orbit, which is its fixed point to second order in the step
+        near = self.state + (frequency - self.frequency) * self.rf_start
         other._forget()
-        other._close(frequency)
+        other._close(frequency, near)
         return other
 
     def at_energy(self, deviation: float) -> "ResponseModel":
@@ -172,7 +174,7 @@ class ResponseModel:
         for name in ("closing", "inverse", "rf_start"):
             self.__dict__.pop(name, None)
 
-    def _close(self, frequency: float) -> None:
+    def _close(self, frequency: float, near: Array | None = None) -> None:
         dimension = self.dimension
         if frequency and dimension != 6:
             raise ValueError("the RF moves the energy, which four coordinates do not have")
@@ -181,7 +183,7 @@ class ResponseModel:
         if dimension == 6:
             self._turn[4] = self.slip * frequency / (1 + frequency)
         self.path, self.tangents = self._chain.closed_orbit(
-            free=self.free, turn=self._turn, tolerance=1e-15
+            near, free=self.free, turn=self._turn, tolerance=1e-15
         )
         self.state = self.path[0]
         self._solve = closing(self.tangents[-1], self.free, np.arange(len(self.free)))

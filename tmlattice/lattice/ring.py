@@ -113,6 +113,10 @@ class Source:
         return source_of(*json.loads(self.text))
 
 
+PHYSICS = "_physics"
+"""Of an element: a key of its source's numbers, remembered by the maps with the element."""
+
+
 @dataclass(frozen=True)
 class Element:
     """One place in the ring.
@@ -181,7 +185,9 @@ class Element:
         known: dict[str, Any] = {
             k: v for k, v in attributes.items() if k in ("k1", "k2", "angle", "tilt")
         }
-        return _copy(self, source=source, **known)
+        other = _copy(self, source=source, **known)
+        vars(other).pop(PHYSICS, None)
+        return other
 
     def with_errors(self, **amounts: float | Slopes) -> "Element":
         """A copy with these amounts added to its `errors`."""

@@ -10,6 +10,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -155,14 +156,11 @@ class LayerMaps:
         other.memory = {}
         moving = [i for i in places if not _both_at_rest(own[i], ring.elements[i])]
         self.maps([ring.elements[i] for i in moving])  # together
-        touched: set[int] = set()
-        other._ways = self._ways.copy()
-        for i in moving:
-            k = int(self.layer_of[i])
-            touched.add(k)
-            if not own[i].is_magnet:
-                other._ways.pop(k, None)
-        return other, sorted(touched)
+        # a changed way is like no other
+        changed = {int(self.layer_of[i]) for i in moving if not own[i].is_magnet}
+        ways = {k: other._composed(ring.elements[i] for i in self._ahead(k)) for k in changed}
+        other._ways = {**self._ways, **ways}
+        return other, sorted({int(self.layer_of[i]) for i in moving})
 
     @staticmethod
     def physics(element: Element) -> tuple[Hashable, Hashable]:
@@ -246,16 +244,21 @@ class LayerMaps:
         return self._between(k)[1]
 
     def _composed(self, elements: Iterable[Element]) -> tuple[Quadratic, list[Weights]]:
+        at = self.dimension, self.ring.map_energy
         way = identity(self.dimension)
         readouts = []
-        for element in elements:
-            if element.kind == "monitor":  # read in its middle; nearly all are thin
-                half = element.length / 2
-                here = drift(half, self.dimension).after(way) if half else way
-                W0, W1, W2 = here.reduced()
-                readouts.append((W0[:3:2], W1[:3:2], W2[:3:2]))
-            if _moves(element):
-                way = self.map(element).after(way)
+        for drifts, run in groupby(elements, _drifts):
+            if drifts:  # decks cut some straight sections into hundreds
+                length = sum(element.length for element in run)
+                way = drift(length, *at).after(way)
+            for element in () if drifts else run:
+                if element.kind == "monitor":  # read in its middle; nearly all are thin
+                    half = element.length / 2
+                    here = drift(half, *at).after(way) if half else way
+                    W0, W1, W2 = here.reduced()
+                    readouts.append((W0[:3:2], W1[:3:2], W2[:3:2]))
+                if _moves(element):
+                    way = self.map(element).after(way)
         return way, readouts
 
 
@@ -268,6 +271,11 @@ def _both_at_rest(one: Element, other: Element) -> bool:
         and (one.data or one.source) is (other.data or other.source)
         and all(e == Errors(ds=e.ds, roll=e.roll) for e in (one.errors, other.errors))
     )
+
+
+def _drifts(element: Element) -> bool:
+    """Whether an element is a drift alone."""
+    return element.kind == "drift" and element.errors == NO_ERRORS
 
 
 def _moves(element: Element) -> bool:

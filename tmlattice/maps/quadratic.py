@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tmlattice.arrays import Array
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import NO_ERRORS, Element, Errors
+from tmlattice.lattice.ring import NO_ERRORS, PHYSICS, Element, Errors
 
 Weights = tuple[Array, Array, Array]
 Made = TypeVar("Made")
@@ -70,8 +70,9 @@ class Quadratic:
         """The maps of a stack."""
         if self.T is None:
             return [Quadratic(B, R, None) for B, R in zip(self.B, self.R, strict=True)]
-        return [Quadratic(B, R, T if T.any() else None)
-                for B, R, T in zip(self.B, self.R, self.T, strict=True)]  # fmt: skip
+        bent = self.T.any(axis=(-3, -2, -1)).tolist()
+        return [Quadratic(B, R, T if some else None)
+                for B, R, T, some in zip(self.B, self.R, self.T, bent, strict=True)]  # fmt: skip
 
 
 def stacked(maps: Sequence[Quadratic], n: int) -> Quadratic:
@@ -140,15 +141,17 @@ def _remembered(
 def physics_of(element: Element) -> Hashable:
     """Key that is equal for elements with equal maps, without their errors: the class and every
     attribute of the source except labels."""
-    if element.data is not None:
-        return element.data
+    known: Hashable = vars(element).get(PHYSICS) or element.data
+    if known is not None:
+        return known
     source = element.source
     values = vars(source.element)
     physics = tuple([values[k] for k in values if k not in _FOR_PEOPLE])
     numbers = _PLAIN.issuperset(map(type, physics)) or all(isinstance(v, _NUMBERS) for v in physics)
-    if numbers and not values.get("params"):
-        return (type(source), physics)
-    return id(source)  # not only numbers: a matrix, a field map
+    if not numbers or values.get("params"):
+        return id(source)  # a matrix, a field map; not remembered, because a copy has another
+    vars(element)[PHYSICS] = key = (type(source), physics)
+    return key
 
 
 _NUMBERS = (int, float, type(None))
@@ -209,13 +212,15 @@ def _with_errors(elements: Sequence[Element], energy: float, n: int) -> Quadrati
     ratio_x, ratio_y = np.array([_in_the_middle(element) for element in elements]).T
     kicks = e["kick_x"] * ratio_x, e["kick_y"] * ratio_y
     none = np.zeros(len(elements))
+    moved = e["ds"].any()
+    along, back = (drift(way, n, energy) if moved else None for way in (e["ds"], -e["ds"]))
     return composed([
-        _way(n, e["ds"], energy),
+        along,
         _thin(n, none, none, e["entrance_k1l"], none, e["entrance"]),
         _shift(n, -e["dx"], -e["dy"]), _turn(n, e["roll"]), first,
         _thin(n, *kicks, e["k1l"], e["k1sl"], e["middle"]),
         _loss(n, e["loss"], elements), second, _turn(n, -e["roll"]),
-        _shift(n, e["dx"], e["dy"]), _way(n, -e["ds"], energy),
+        _shift(n, e["dx"], e["dy"]), back,
     ])  # fmt: skip
 
 
@@ -291,13 +296,17 @@ def _shift(n: int, dx: Array, dy: Array) -> Quadratic | None:
     return _linear(n, (dx, dy), {0: dx, 2: dy}, {})
 
 
-def _way(n: int, length: Array, energy: float) -> Quadratic | None:
-    """Drifts, forwards or backwards."""
-    if not length.any():
-        return None
-    metre, eye, some = _metre(n, energy), np.eye(n), length[:, None, None]
+def drift(length: float | Array, n: int, energy: float) -> Quadratic:
+    """Return a drift, or a stack of drifts, also backwards.
+
+    Args:
+        length: m, or [map].
+        n: number of coordinates.
+        energy: GeV.
+    """
+    metre, eye, some = _metre(n, energy), np.eye(n), np.asarray(length)[..., None, None]
     bent = None if metre.T is None else some[..., None] * metre.T
-    return Quadratic(length[:, None] * metre.B, eye + some * (metre.R - eye), bent)
+    return Quadratic(some[..., 0] * metre.B, eye + some * (metre.R - eye), bent)
 
 
 @functools.cache
@@ -327,10 +336,3 @@ def _loss(n: int, loss: Array, elements: Sequence[Element]) -> Quadratic | None:
         )
     kept = 1 - loss
     return _linear(n, (loss,), {5: -loss}, {(5, 5): 1 - 2 * loss, (1, 1): kept, (3, 3): kept})
-
-
-def drift(length: float, n: int) -> Quadratic:
-    """Return a drift at the nominal energy, length in m."""
-    matrix = np.eye(n)
-    matrix[0, 1] = matrix[2, 3] = length
-    return Quadratic(np.zeros(n), matrix, None)
