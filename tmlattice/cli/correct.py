@@ -131,14 +131,11 @@ def correct(
         if folder:
             write_correction(found, folder)
         write(found.as_json())
-    screen = console()
-    print_report(screen, found)
-    for sentence in warnings:
-        screen.print(f"\nNote: {sentence}.", soft_wrap=True)
+    after = [line for sentence in warnings for line in ("", f"Note: {sentence}.")]
     written = [f"{out}/: report.html, settings.csv, ..."] if out else []
     written += [str(json_file)] if json_file else []
-    if written:
-        screen.print(f"\nwritten: {'; '.join(written)}", soft_wrap=True)
+    after += ["", f"written: {'; '.join(written)}"] if written else []
+    print_report(console(), found, after)
 
 
 def _first_turns(folders: tuple[Path, ...]) -> list["Measurement"]:

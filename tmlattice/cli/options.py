@@ -413,8 +413,18 @@ def outputs(
 
     with ExitStack() as files:
         made = files.enter_context(output_folder(folder, replaced)) if folder else None
-        path = files.enter_context(output_file(json_file)) if json_file else None
+        path = None
+        if json_file:
+            place = made / json_file.name if made and is_in(json_file, folder) else json_file
+            path = files.enter_context(output_file(place))
         yield made, lambda result: write_json(path, result) if path else None
+
+
+def is_in(path: Path, folder: Path | None) -> bool:
+    """Whether a file is one of a folder, which need not exist."""
+    if folder is None:
+        return False
+    return os.path.dirname(os.path.abspath(path)) == os.path.abspath(folder)
 
 
 def read_data(
@@ -477,14 +487,22 @@ def console() -> "Console":
     return Screen(**look, width=min(wide.width, 120) if wide.is_terminal else 100)
 
 
-LINES = 34
-"""Of a report on a terminal; with what is written where, and a correction, 40."""
+LINES = 40
+"""Of a terminal, in all."""
 
 
-def print_report(screen: "Console", found: "Diagnosis | Correction | Differences") -> None:
-    """Print a report; on a terminal, which scrolls, its most important lines."""
-    most = LINES if screen.is_terminal else None
-    screen.print(found.report(screen.width, most), soft_wrap=True)
+def print_report(
+    screen: "Console",
+    found: "Diagnosis | Correction | Differences",
+    after: Sequence[str] = (),
+    before: Sequence[str] = (),
+) -> None:
+    """Print a report and the lines after it; on a terminal, which scrolls, its most important
+    lines, so many that `LINES` hold all (before: what is printed already)."""
+    others = sum(max(1, -(-len(line) // screen.width)) for line in (*before, *after))
+    most = LINES - others if screen.is_terminal else None
+    for text in (found.report(screen.width, most), *after):
+        screen.print(text, soft_wrap=True)
 
 
 def table(*columns: str) -> "Table":

@@ -22,10 +22,8 @@ def report(result: Path, out: Path | None) -> None:
     from tmlattice.report.speaking import render
 
     found = render(result, out)
-    screen = console()
-    print_report(screen, found)
     place = out or (result if result.is_dir() else result.parent)
-    screen.print(f"\nwritten: {place / 'report.html'}", soft_wrap=True)
+    print_report(console(), found, ("", f"written: {place / 'report.html'}"))
 
 
 @click.command("compare", cls=Careful)
@@ -45,7 +43,4 @@ def compare(first: str, second: str, json_file: Path | None) -> None:
     with outputs(None, json_file) as (_, write):
         found = run(first, second)
         write(found.as_json())
-    screen = console()
-    print_report(screen, found)
-    if json_file:
-        screen.print(f"written: {json_file}")
+    print_report(console(), found, [f"written: {json_file}"] if json_file else [])

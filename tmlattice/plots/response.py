@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.effects import with_labels
 from tmlattice.lattice import Element
 from tmlattice.optics import twiss
 from tmlattice.plots.strip import above_strip, plain_log
@@ -25,9 +26,9 @@ RESIDUALS = (
 
 def step_labels(result: Diagnosis) -> list[list[str]]:
     """What is fitted in each step, and in each reversed decision, in lines."""
-    steps = [result.starting_model, *(step.effect for step in result.steps[1:])]
+    steps = [result.starting_model, *(with_labels(step.effect) for step in result.steps[1:])]
     names = [*steps, *(own.reversed_decision for own in result.families)]
-    return [wrap(name.replace("monitor_", "BPM_").replace("_", " "), 44) for name in names]
+    return [wrap(name, 44) for name in names]
 
 
 def gradient_errors(result: Diagnosis) -> list[tuple[Element, float, float]]:

@@ -9,7 +9,7 @@ from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import numbers
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, with_labels
 from tmlattice.report.amounts import all_of, amount_text, degenerate_text, labelled, words
 from tmlattice.report.text import columns, wrapped
 
@@ -22,7 +22,8 @@ PULLS = 4
 def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
     """Head and rows of the table of steps: what is fitted (first the model alone), parameters,
     held-out rms in µm."""
-    rows = [((model if s.effect == "design" else "") or s.effect, *_scores(s)) for s in steps]
+    rows = [(model if model and s.effect == "design" else with_labels(s.effect), *_scores(s))
+            for s in steps]  # fmt: skip
     return [("fitted", *SCORES), *rows]
 
 
