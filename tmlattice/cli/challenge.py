@@ -48,9 +48,7 @@ code_option = click.option(
 
 @challenge.command("make")
 @click.argument(
-    "tier",
-    metavar="A|B|C|D|E|R|T|P|M",
-    type=click.Choice(list("ABCDERTPM"), case_sensitive=False),
+    "tier", metavar="A|B|C|D|E|R|T|P|M", type=click.Choice(list("ABCDERTPM"), case_sensitive=False)
 )
 @click.option("--cases", type=click.IntRange(1), default=300, help="How many.")
 @seed_option("Of all that is drawn.")
@@ -72,10 +70,7 @@ code_option = click.option(
     help="Tiers E, M and P: of measurement (repeat); M draws two or three of them for a case.",
 )
 @click.option(
-    "--shots",
-    type=click.IntRange(1),
-    default=4,
-    help="Of the fit; two more are held out.",
+    "--shots", type=click.IntRange(1), default=4, help="Of the fit; two more are held out."
 )
 @click.option("--effect", "effects", multiple=True, help="Draw from these alone (repeat).")
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
@@ -111,12 +106,7 @@ def make(
 @code_option
 @jobs_option
 @click.pass_context
-def run(
-    context: click.Context,
-    folder: Path,
-    workers: dict[str, Any],
-    lattice: str | None,
-) -> None:
+def run(context: click.Context, folder: Path, workers: dict[str, Any], lattice: str | None) -> None:
     """Diagnose every case in FOLDER that has no result yet; the truth is not read.
 
     The exit code is 1 where a case failed.

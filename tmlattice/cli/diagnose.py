@@ -316,9 +316,7 @@ def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
 
 
 def _correction(
-    result: "Diagnosis",
-    known: "DistributedErrors | None",
-    asked: "Sequence[tuple[Knob, float]]",
+    result: "Diagnosis", known: "DistributedErrors | None", asked: "Sequence[tuple[Knob, float]]"
 ) -> "Correction | None":
     """Settings of supplies that bring the estimated ring to the design, where the covariance of its
     errors is known and they have an expected gain; some supplies have applied settings."""

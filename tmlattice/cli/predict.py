@@ -4,13 +4,7 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import (
-    FILE,
-    OfMachine,
-    console,
-    lattice_argument,
-    open_ring,
-)
+from tmlattice.cli.options import FILE, OfMachine, console, lattice_argument, open_ring
 
 
 @click.command("predict", cls=OfMachine)
@@ -32,11 +26,7 @@ from tmlattice.cli.options import (
 @click.option("--kick", type=float, default=1e-4, help="Of each, rad.")
 @click.option("--out", type=FILE, required=True, metavar="FILE", help="A table: .csv.")
 def predict(
-    lattice: str,
-    calibration: Path | None,
-    correctors: tuple[str, ...],
-    kick: float,
-    out: Path,
+    lattice: str, calibration: Path | None, correctors: tuple[str, ...], kick: float, out: Path
 ) -> None:
     """Predict how the stored beam's orbit answers a kick of each corrector, at fixed RF frequency.
 

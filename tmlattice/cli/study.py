@@ -38,10 +38,7 @@ NUMBER = Word("all|N", _number, "'{0}' is no number of magnets; give 'all' or 1,
 @study.command("tune-fit", cls=Careful)
 @click.argument("lattice", default="petra3")
 @click.option(
-    "--magnets",
-    type=NUMBER,
-    default="40",
-    help="Powered magnets, evenly spread over the ring.",
+    "--magnets", type=NUMBER, default="40", help="Powered magnets, evenly spread over the ring."
 )
 @click.option(
     "--methods",
@@ -58,19 +55,12 @@ NUMBER = Word("all|N", _number, "'{0}' is no number of magnets; give 'all' or 1,
     help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",
 )
 @click.option(
-    "--change",
-    type=float,
-    default=-0.2,
-    help="Relative change of the magnet's strength.",
+    "--change", type=float, default=-0.2, help="Relative change of the magnet's strength."
 )
 @epochs_option
 @jobs_option
 def tune_fit(
-    lattice: str,
-    methods: str,
-    out: Path,
-    workers: dict[str, Any],
-    **options: Any,
+    lattice: str, methods: str, out: Path, workers: dict[str, Any], **options: Any
 ) -> None:
     """Tune errors of fine-tuning over many magnets, each changed in turn."""
     from tmlattice import __version__

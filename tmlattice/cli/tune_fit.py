@@ -87,12 +87,7 @@ LAUNCH = Word(
     default="1e-3,0,1e-3,0",
     help="State at the start of the ring, m and rad.",
 )
-@click.option(
-    "--noise",
-    type=click.FloatRange(0),
-    default=2e-5,
-    help="Rms of one reading, m.",
-)
+@click.option("--noise", type=click.FloatRange(0), default=2e-5, help="Rms of one reading, m.")
 @epochs_option
 @seed_option("Of the readings' noise.")
 @json_option

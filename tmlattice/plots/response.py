@@ -62,11 +62,7 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
             "Gradient error of each quadrupole along the ring, with its posterior rms.",
             plot_gradients(result),
         )
-        yield (
-            "beta-beat",
-            "Beta of the result relative to the design's.",
-            plot_beta_beat(result),
-        )
+        yield ("beta-beat", "Beta of the result relative to the design's.", plot_beta_beat(result))
 
 
 def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:

@@ -10,12 +10,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
 from tmlattice.report.action_texts import next_text
 from tmlattice.report.response_text import steps_text
-from tmlattice.report.tables import (
-    LARGE_TITLE,
-    large_text,
-    number_rows,
-    optics_rows,
-)
+from tmlattice.report.tables import LARGE_TITLE, large_text, number_rows, optics_rows
 from tmlattice.report.text import (
     CORRELATED,
     SUSPECTS,
