@@ -437,14 +437,10 @@ def _weights(
 
 
 def _write_weights(reading: "WeightReading", folder: Path) -> None:
-    import matplotlib.pyplot as plt
-
     from tmlattice.files import write_json
-    from tmlattice.plots import plot_weights
+    from tmlattice.plots import plot_weights, save_figure
 
-    figure = plot_weights(reading)
-    figure.savefig(folder / "weights.png", dpi=150)
-    plt.close(figure)
+    save_figure(plot_weights(reading), folder / "weights.png")
     write_json(folder / "weights.json", reading.as_json())
 
 

@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import stat
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -505,7 +505,7 @@ def print_report(
         screen.print(text, soft_wrap=True)
 
 
-def table(*columns: str) -> "Table":
+def table(*columns: str, rows: Iterable[Sequence[str]] = ()) -> "Table":
     """A table with its first column left, the others right."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
@@ -513,4 +513,6 @@ def table(*columns: str) -> "Table":
     made = Table(box=SIMPLE_HEAD, pad_edge=False)
     for i, column in enumerate(columns):
         made.add_column(column, justify="right" if i else "left")
+    for row in rows:
+        made.add_row(*row)
     return made

@@ -40,14 +40,13 @@ def reproduce(systems: tuple[str, ...], out: Path, small: bool) -> None:
     chosen = [name for name in SYSTEMS if name in systems] or SYSTEMS
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out))
-        import matplotlib.pyplot as plt
+        from tmlattice.plots import save_figure
 
         entries = []
         for name in chosen:
             begin = perf_counter()
             rows, figure = _RUN[name](small, not is_quiet())
-            figure.savefig(folder / f"{name}.png", dpi=150)
-            plt.close(figure)
+            save_figure(figure, folder / f"{name}.png")
             entries.append({
                 "system": name,
                 "figure": f"{name}.png",

@@ -264,15 +264,19 @@ def _check_options(context: click.Context, kind: str) -> None:
 def _print_causes(ring: Any, causes: list[Any]) -> None:
     from tmlattice.effects import find
 
-    if not causes:
-        return
-    shown = table("effect", "element", "s [m]", "amount", "unit")
     places = {element.name: f"{element.s:.2f}" for element in ring.elements}
-    for cause in causes:
-        place = cause.element or "-"
-        unit = find(cause.effect).unit
-        shown.add_row(cause.effect, place, places.get(place, "-"), f"{cause.amount:g}", unit)
-    console().print(shown)
+    rows = [
+        (
+            c.effect,
+            c.element or "-",
+            places.get(c.element, "-"),
+            f"{c.amount:g}",
+            find(c.effect).unit,
+        )
+        for c in causes
+    ]
+    if rows:
+        console().print(table("effect", "element", "s [m]", "amount", "unit", rows=rows))
 
 
 def _check_apart(truth: Path, out: Path) -> None:

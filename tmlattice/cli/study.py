@@ -66,6 +66,7 @@ def tune_fit(
     from tmlattice import __version__
     from tmlattice.files import output_file, write_json
     from tmlattice.fitting.study import study_tune_fit, summarise
+    from tmlattice.plots import plot_study, save_figure
 
     chosen = tuple(name.strip() for name in methods.split(","))
     cases = study_tune_fit(
@@ -98,21 +99,9 @@ def tune_fit(
     }
     with output_file(out / "study.json") as own:
         write_json(own, summary)
-    _draw(lattice, cases, out)
-    _print(summary)
-
-
-def _draw(lattice: str, cases: list[Any], out: Path) -> None:
-    import matplotlib.pyplot as plt
-
-    from tmlattice.files import output_file
-    from tmlattice.plots import plot_study
-
-    ring = checked_ring(lattice, {})
-    figure = plot_study(ring, cases)
     with output_file(out / "study.png") as path:
-        figure.savefig(path, dpi=150, format="png")
-    plt.close(figure)
+        save_figure(plot_study(checked_ring(lattice, {}), cases), path)
+    _print(summary)
 
 
 def _print(summary: dict[str, Any]) -> None:

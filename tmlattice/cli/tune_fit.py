@@ -162,7 +162,7 @@ def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
     """The figures, and their names; a loss there is where the recipe was asked for."""
     import matplotlib.pyplot as plt
 
-    from tmlattice.plots import plot_loss, plot_orbit_fit, plot_tune_fit_spectrum
+    from tmlattice.plots import plot_loss, plot_orbit_fit, plot_tune_fit_spectrum, save_figure
 
     figures = {"orbit": plot_orbit_fit(outcome)}
     figures["spectrum"], axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True,
@@ -180,8 +180,7 @@ def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
         orbits = "one orbit" if outcome.shots == 1 else f"{outcome.shots} orbits"
         ax.set_title(f"Fine-tuning on {orbits} of {monitors} BPMs")
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.png", dpi=150)
-        plt.close(figure)
+        save_figure(figure, folder / f"{name}.png")
     return [f"{name}.png" for name in figures]
 
 
@@ -224,9 +223,8 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
         if method.problem:
             screen.print(f"{method.method}: {method.problem}")
     screen.print(f"\n{outcome.advice}\n")
-    stages = table("stage", *outcome.seconds)
-    stages.add_row("seconds", *(f"{stage:.2f}" for stage in outcome.seconds.values()))
-    screen.print(stages)
+    seconds = ("seconds", *(f"{stage:.2f}" for stage in outcome.seconds.values()))
+    screen.print(table("stage", *outcome.seconds, rows=[seconds]))
     if outcome.methods[0].method == "adam":
         fit = outcome.fit
         how = "patience ran out" if fit.stopped_early else "all epochs"

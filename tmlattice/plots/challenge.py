@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from tmlattice.plots.strip import GRID
+from tmlattice.plots.strip import GRID, save_figure
 
 LAST = ("ambiguous", "unknown", "none")
 
@@ -98,5 +98,4 @@ def save_challenge(result: Mapping[str, Any], folder: Path) -> None:
         if result.get(name):
             figure = plot(result).get_figure(root=True)
             assert figure is not None
-            figure.savefig(folder / f"{name}.png", dpi=150)
-            plt.close(figure)
+            save_figure(figure, folder / f"{name}.png")

@@ -1,6 +1,7 @@
 """The lattice strip under anything that is plotted against s."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -39,6 +40,12 @@ def above_strip(
     for ax in axes:
         ax.grid(alpha=GRID)
     return figure, axes
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, and close it."""
+    figure.savefig(path, dpi=150, format="png")
+    plt.close(figure)
 
 
 def legend_above(ax: Axes, columns: int, **look: Any) -> None:

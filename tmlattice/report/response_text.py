@@ -12,6 +12,7 @@ from tmlattice.diagnosis.suspects import numbers
 from tmlattice.effects import Cause, with_labels
 from tmlattice.report.amounts import all_of, amount_text, degenerate_text, labelled, words
 from tmlattice.report.text import columns, wrapped
+from tmlattice.speaks import listed
 
 SHOWN = 8
 """Largest errors of each effect that are listed."""
@@ -111,13 +112,8 @@ def undetermined(result: Diagnosis, effect: str) -> str:
         if not (own := supports[places[0].element]).determined:
             name = all_of([place.element for place in places], result.devices)
             by_reason.setdefault(degenerate_text(effect, own), []).append(name)
-    said = [
-        f"{', '.join(names[:SHOWN])}{f' and {len(names) - SHOWN} more' * (len(names) > SHOWN)} "
-        f"({reason})"
-        for reason, names in by_reason.items()
-    ]
-    more = f"; and {len(said) - SHOWN} more" if len(said) > SHOWN else ""
-    return f"{NOT_DETERMINED}: {'; '.join(said[:SHOWN])}{more}" if said else ""
+    said = [f"{listed(names, SHOWN)} ({reason})" for reason, names in by_reason.items()]
+    return f"{NOT_DETERMINED}: {listed(said, SHOWN, '; ')}" if said else ""
 
 
 NOT_DETERMINED = "not determined by the data"

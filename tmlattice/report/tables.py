@@ -17,6 +17,7 @@ from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.action_texts import SETTLED
 from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
 from tmlattice.report.text import times_usual
+from tmlattice.speaks import listed
 
 TITLES = {"monitors": "BPMs", "correctors": "Correctors"}
 """Titles by the group of an effect; all other elements are magnets."""
@@ -201,8 +202,7 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
             + ("" if row.get("shot") is None else f" (shot {row['shot']}, turn {row['turn']})")
             for row in diagnosis.outliers
         ]
-        more = f" and {len(places) - MOST} more" if len(places) > MOST else ""
-        yield "outliers", ", ".join(places[:MOST]) + more
+        yield "outliers", listed(places, MOST)
     for name in diagnosis.provenance["options"].get("assume", ()):
         yield "assumed of the data", f"{name}: {ASSUMPTIONS[name].words}"
     for said in provenance.get("assumed_of_files", ()):
