@@ -14,6 +14,7 @@ from tmlattice.cli.options import (
     jobs_option,
     json_option,
     outputs,
+    path_option,
     seed_option,
     table,
 )
@@ -52,7 +53,7 @@ code_option = click.option(
 )
 @click.option("--cases", type=click.IntRange(1), default=300, help="How many.")
 @seed_option("Of all that is drawn.")
-@click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
+@path_option("--out", "folder", metavar="PATH", required=True, help="Folder of the challenge.")
 @click.option("--lattice", default="petra3", help="Built-in name or path.")
 @click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
 @click.option(
@@ -125,7 +126,7 @@ def run(context: click.Context, folder: Path, workers: dict[str, Any], lattice: 
 
 @challenge.command("score", cls=Careful)
 @click.argument("folder", type=FILE)
-@click.option("--out", type=FILE, metavar="DIR", help="Figures: confusion, calibration, detection.")
+@path_option("--out", metavar="DIR", help="Figures: confusion, calibration, detection.")
 @click.option(
     "--oracle/--no-oracle",
     default=True,

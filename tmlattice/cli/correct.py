@@ -17,6 +17,7 @@ from tmlattice.cli.options import (
     named_number,
     open_ring,
     outputs,
+    path_option,
     print_report,
     require,
 )
@@ -64,17 +65,10 @@ TARGET = Word("NAME[=TOLERANCE]", _target, "'{2}' is no tolerance; give for exam
     "closed_orbit, with the rms error that is tolerated; or first_turn alone, which threads a beam "
     "that is not stored. Else the optics.",
 )
-@click.option(
-    "--example",
-    "example_file",
-    type=FILE,
-    metavar="FILE",
-    help="Write the table of the knobs, and end.",
-)
+@path_option("--example", "example_file", help="Write the table of the knobs, and end.")
 @json_option
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     metavar="DIR",
     help="Folder for settings.csv, statements of MAD-X, AT and elegant, report.html.",
 )

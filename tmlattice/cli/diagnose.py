@@ -23,6 +23,7 @@ from tmlattice.cli.options import (
     named_data,
     open_ring,
     outputs,
+    path_option,
     print_report,
     radiation_option,
     read_data,
@@ -45,20 +46,17 @@ log = logging.getLogger(__name__)
 @click.command("diagnose", cls=OfMachine)
 @lattice_argument
 @click.argument("measurements", metavar="MEASUREMENT...", type=FILE, nargs=-1)
-@click.option(
+@path_option(
     "--reference",
     "references",
-    type=FILE,
     metavar="DIR",
     multiple=True,
     help="A measurement of the same machine and kind before the fault: static errors cancel, and "
     "the diagnosis reports what changed. Repeat it if several are diagnosed together.",
 )
-@click.option(
+@path_option(
     "--settings",
     "settings_file",
-    type=FILE,
-    metavar="FILE",
     help="settings.csv of the last correction, applied before this measurement: the next "
     "correction starts from them. With the --reference before them the calibration of each "
     "device, measured over asked change, is printed instead.",
@@ -78,11 +76,8 @@ log = logging.getLogger(__name__)
     help="Look for these alone, or of an orbit response fit families of these alone; else for all "
     "usual ones (`tmlattice effects`).",
 )
-@click.option(
-    "--network",
-    type=FILE,
-    metavar="FILE",
-    help="network.pt of `tune-fit`: read what its weights changed as physics.",
+@path_option(
+    "--network", help="network.pt of `tune-fit`: read what its weights changed as physics."
 )
 @click.option(
     "--missing",
@@ -91,26 +86,21 @@ log = logging.getLogger(__name__)
 )
 @radiation_option
 @seed_option("Of the split, the threshold's simulation and the bootstrap.")
-@click.option(
+@path_option(
     "--lattice-out",
-    type=FILE,
-    metavar="FILE",
     help="The estimated ring, with its errors: .json (the package's own), .at.json (AT), "
     ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json next to it "
     "holds the calibration of BPMs and correctors (`tmlattice predict`).",
 )
-@click.option(
+@path_option(
     "--corrected-out",
-    type=FILE,
-    metavar="FILE",
     help="The corrected ring, in the same formats: the design with the settings that, loaded into "
     "the real machine, restore the design (a quadrupole that gives 20 % less is set 25 % higher). "
     "Errors that no setting corrects are printed.",
 )
 @json_option
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     metavar="DIR",
     help="Folder for diagnosis.json, report.html, report.txt, the figures, and the estimated ring, "
     "for `tmlattice correct DIR`.",

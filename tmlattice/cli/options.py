@@ -110,6 +110,13 @@ def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[...
     )
 
 
+def path_option(
+    *names: str, help: str, metavar: str = "FILE", **more: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """An option whose value is a path."""
+    return click.option(*names, type=FILE, metavar=metavar, help=help, **more)
+
+
 def seed_option(purpose: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """`--seed N`."""
     return click.option("--seed", type=click.IntRange(0), default=0, help=purpose)
@@ -394,9 +401,7 @@ assume_option = click.option(
 radiation_option = click.option(
     "--radiation", is_flag=True, help="The model radiates in bends and wigglers."
 )
-json_option = click.option(
-    "--json", "json_file", type=FILE, metavar="FILE", help="Write the result as JSON."
-)
+json_option = path_option("--json", "json_file", help="Write the result as JSON.")
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, console, is_quiet, table
+from tmlattice.cli.options import console, is_quiet, path_option, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,7 +23,7 @@ SYSTEMS = ["free-fall", "lotka-volterra", "pendulum", "magnets", "cavitation"]
 
 @click.command("reproduce")
 @click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
-@click.option("--out", type=FILE, default="reproduce", metavar="DIR",
+@path_option("--out", default="reproduce", metavar="DIR",
               help="Folder for the figures and reproduction.json.")  # fmt: skip
 @click.option("--small", is_flag=True,
               help="Fewer networks, a gentler collapse: seconds, not minutes.")  # fmt: skip

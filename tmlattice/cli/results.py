@@ -4,14 +4,20 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, console, json_option, outputs, print_report
+from tmlattice.cli.options import (
+    FILE,
+    Careful,
+    console,
+    json_option,
+    outputs,
+    path_option,
+    print_report,
+)
 
 
 @click.command("report", cls=Careful)
 @click.argument("result", metavar="FOLDER", type=FILE)
-@click.option(
-    "--out", type=FILE, metavar="DIR", help="Folder to write to; where none is named, FOLDER."
-)
+@path_option("--out", metavar="DIR", help="Folder to write to; where none is named, FOLDER.")
 def report(result: Path, out: Path | None) -> None:
     """Render report.html and report.txt again from the diagnosis.json of FOLDER.
 

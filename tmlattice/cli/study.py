@@ -6,7 +6,6 @@ from typing import Any
 import click
 
 from tmlattice.cli.options import (
-    FILE,
     Careful,
     Word,
     checked_ring,
@@ -14,6 +13,7 @@ from tmlattice.cli.options import (
     epochs_option,
     is_quiet,
     jobs_option,
+    path_option,
     require,
     table,
 )
@@ -47,9 +47,8 @@ NUMBER = Word("all|N", _number, "'{0}' is no number of magnets; give 'all' or 1,
     help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, known (sparse with "
     "the known magnet).",
 )
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     default="study-tune-fit",
     metavar="DIR",
     help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",

@@ -8,7 +8,6 @@ import click
 from click.core import ParameterSource
 
 from tmlattice.cli.options import (
-    FILE,
     WithDefault,
     Word,
     console,
@@ -19,6 +18,7 @@ from tmlattice.cli.options import (
     named_data,
     open_ring,
     outputs,
+    path_option,
     read_data,
     require,
     seed_option,
@@ -54,16 +54,14 @@ LAUNCH = Word(
     help="Quadrupole or sextupole to change; else the defocusing quadrupole in the "
     "middle of the first arc.",
 )
-@click.option(
+@path_option(
     "--measurement",
-    type=FILE,
     metavar="DIR",
     help="Fit these data, a measurement folder or a file of readings, and change no magnet; all "
     "shots together.",
 )
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     default="tune-fit",
     metavar="DIR",
     help="Folder for the figures, tune-fit.json and network.pt.",
