@@ -13,7 +13,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.views import PartView
 from tmlattice.effects import RingEffect, find
 from tmlattice.inference.newton import fit
-from tmlattice.plots.strip import above_strip, legend_above, plain_log
+from tmlattice.plots.strip import above_strip, legend_above, plain_log, text_at_top
 
 BEFORE, AFTER = "C0", "C3"
 
@@ -115,12 +115,8 @@ def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
         orbit.set_ylabel(f"{name} [mm]")
         residual.set_ylabel(f"residual {name} [mm]")
         after = f"; with the findings {texts[1]}" if len(texts) > 1 else ""
-        residual.annotate(
-            f"rms in µm: {design} {texts[0]}{after}; noise {1e3 * sigma:.1f} (grey: 2 rms)",
-            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
-        )  # fmt: skip
-        low, high = residual.get_ylim()
-        residual.set_ylim(low, high + 0.3 * (high - low))  # space for the text
+        text = f"rms in µm: {design} {texts[0]}{after}; noise {1e3 * sigma:.1f} (grey: 2 rms)"
+        text_at_top(residual, text, 0.3)
         for ax in (orbit, residual):
             mark(ax, diagnosis)
     legend_above(grid[0], 4, fontsize="small")

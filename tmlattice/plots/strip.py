@@ -48,6 +48,13 @@ def save_figure(figure: Figure, path: Path) -> None:
     plt.close(figure)
 
 
+def text_at_top(ax: Axes, text: str, room: float) -> None:
+    """A text in the upper left corner, the limits raised by this share of their span for it."""
+    ax.annotate(text, (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small")
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + room * (high - low))
+
+
 def legend_above(ax: Axes, columns: int, **look: Any) -> None:
     """A legend without a frame above an axes, at its right."""
     ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, frameon=False, **look)

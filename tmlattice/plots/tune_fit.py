@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from tmlattice.harmonics import levelled, normalised
 from tmlattice.optics import Optics, one_turn_optics
-from tmlattice.plots.strip import GRID, METHOD_COLOURS, above_strip, legend_above
+from tmlattice.plots.strip import GRID, METHOD_COLOURS, above_strip, legend_above, text_at_top
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,12 +57,7 @@ def plot_orbit_fit(outcome: "TuneFit") -> Figure:
                 rms.append(f"{what} {1e6 * np.sqrt(np.nanmean(left**2)):.1f} µm")
             residual.plot(outcome.s, 1e3 * left, color=colour, linewidth=0.8)
         residual.set_ylabel(f"residual {name} [mm]")
-        residual.annotate(
-            f"rms {', '.join(rms) or '-'}{noise}",
-            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
-        )  # fmt: skip
-        low, high = residual.get_ylim()
-        residual.set_ylim(low, high + 0.25 * (high - low))  # space for the text
+        text_at_top(residual, f"rms {', '.join(rms) or '-'}{noise}", 0.25)
         for ax in (orbit, residual):
             if magnet is not None:
                 ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
