@@ -661,12 +661,22 @@ def with_a_wrong_supply(ring, folder, **amounts):
         write_measurement(folder / name, data.measured)
 
 
-def test_diagnose_states_the_correction(small_ring, tmp_path):
-    """A wrong supply: the terminal, the page and the table say how to set it."""
+def test_diagnose_states_the_correction(small_ring, tmp_path, monkeypatch):
+    """A wrong supply: the terminal, the page and the table say how to set it; the files of the
+    estimated ring may be in the new folder, and a terminal shows all that is printed."""
     with_a_wrong_supply(small_ring, tmp_path, day=("QD", 0.01))
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal
+    monkeypatch.setenv("COLUMNS", "90")
     done = run("diagnose", "design.json", "day", "--effects", "quadrupole_gradient",
-               "--lattice-out", "found.json", "--out", "out", cwd=tmp_path, check=0)  # fmt: skip
+               "--lattice-out", "out/found.json", "--corrected-out", "out/set.madx", "--json",
+               "out/found_again.json", "--out", "out", cwd=tmp_path, check=0)  # fmt: skip
+    monkeypatch.undo()
     assert "Correction: The " in done.stdout
+    assert "More in report.txt" in done.stdout
+    assert sum(-(-max(len(line), 1) // 90) for line in done.stdout.splitlines()) <= 40
+    assert "out/found.json.known.json; out/set.madx" in done.stdout
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"found.json", "found.json.known.json", "set.madx", "found_again.json"} <= written
     run("report", "out", "--out", "redrawn", cwd=tmp_path, check=0)
     for folder in ("out", "redrawn"):
         assert '<h2 id="correction">' in (tmp_path / folder / "report.html").read_text()
@@ -706,8 +716,9 @@ def test_an_energy_is_as_uncertain_in_the_files_as_in_the_diagnosis(small_ring, 
     errors = {("energy_offset", None): 2e-4}
     calibration = Calibration([energy], errors=errors)
     write_calibration(tmp_path / "found.json.calibration.json", calibration)
-    estimate, _ = read_estimate(path, small_ring, small_ring)
+    estimate, (said,) = read_estimate(path, small_ring, small_ring)
     assert (estimate.energy, estimate.energy_error) == (1e-3, 2e-4)
+    assert f"there is no '{path}.known.json'" in said
 
 
 def test_applied_settings_have_a_calibration(small_ring, tmp_path):

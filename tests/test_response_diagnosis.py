@@ -17,7 +17,7 @@ from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.hierarchical import fit_families
 from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.validation import score
-from tmlattice.effects import Cause, apply
+from tmlattice.effects import Cause, apply, with_labels
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import load_ring
 from tmlattice.machine.at_engine import AtEngine
@@ -29,6 +29,7 @@ from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.optics import ring_tunes, twiss
 from tmlattice.report.plain import report_text
+from tmlattice.report.response_text import family_rows, step_rows
 
 CAUSES = [
     Cause("quadrupole_gradient", "QD::5", 0.01),
@@ -119,6 +120,14 @@ def test_what_the_fit_may_not_mend_is_warned_about(small_ring):
     assert {cause.effect for cause in found.causes} <= {"monitor_gain_x", "monitor_gain_y"}
     assert found.assessment.remainder == "effect_missing"
     assert "fitted, in-plane" in [block.name for block in found.assessment.significant]
+
+
+def test_a_report_shows_families_by_their_labels(result):
+    rows = [row[0] for row in (*step_rows(result.steps), *family_rows(result.families))]
+    assert "without quadrupole gradient" in rows
+    assert "quadrupole_gradient" in [own.effect for own in result.families]
+    assert not any("_" in name for name in rows)
+    assert with_labels("monitor_roll end_3, new_effect") == "BPM roll end_3, new_effect"
 
 
 def test_options_act_and_are_told(small_ring, measured):
@@ -366,14 +375,20 @@ def test_options_that_have_no_meaning(tmp_path, measured):
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("ring.mat", "names no format; end it in .json"), ("nowhere/ring.json", "cannot write")],
+    [
+        ("ring.mat", "names no format; end it in .json"),
+        ("nowhere/ring.json", "cannot write"),
+        ("D/nowhere/ring.json", "cannot write"),
+        ("D/diagnosis.json", "is a file of --out"),
+    ],
 )
 def test_the_lattice_s_place_is_checked_before_the_work(
     tmp_path, measured, monkeypatch, name, said
 ):
     write_measurement(tmp_path / "m", measured)
     monkeypatch.setattr("tmlattice.diagnosis.diagnose", None)  # the work would fail
-    done = tmlattice("diagnose", SMALL, "m", "--lattice-out", name, cwd=tmp_path, check=2)
+    words = ("--lattice-out", name, "--out", "D")
+    done = tmlattice("diagnose", SMALL, "m", *words, cwd=tmp_path, check=2)
     assert said in done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"m"}
 

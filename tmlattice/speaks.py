@@ -1,6 +1,6 @@
 """What an object shows of itself: a line for `repr`, a small table for a notebook."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from html import escape
 from pathlib import PurePath
 
@@ -40,10 +40,10 @@ def counted(number: int, word: str) -> str:
     return f"{number} {word}" + ("" if number == 1 else "s")
 
 
-def shown(names: Iterable[str], most: int = 3) -> str:
-    """The first few names."""
-    every = list(names)
-    return ", ".join([*every[:most], *(["..."] if len(every) > most else [])])
+def listed(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """The first names, and how many more there are."""
+    more = f"{between.lstrip(',')}and {len(names) - most} more" if len(names) > most else ""
+    return between.join(names[:most]) + more
 
 
 def micrometres(metres: float) -> str:

@@ -44,16 +44,10 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     }
     if tier == "E":
         # distributed errors are no false alarm if there are some
-        out["false_alarms"] = rate(
-            [
-                row["answers"]["tool"]["detected"] if row["small"] else row["verdict"] != "none"
-                for row in rows
-            ]
-        )
-        out["oracle_false_alarms"] = rate(
-            [row["answers"]["oracle"]["detected"] for row in rows if "oracle" in row["answers"]]
-        )
-        return out
+        alarms = [row["answers"]["tool"]["detected"] if row["small"] else row["verdict"] != "none"
+                  for row in rows]  # fmt: skip
+        oracle = [answer["detected"] for answer in _answers(rows, "oracle")]
+        return out | {"false_alarms": rate(alarms), "oracle_false_alarms": rate(oracle)}
     out["detection"] = detection(rows)
     if tier == "C":
         out["exact"] = _exact(rows)
@@ -63,14 +57,12 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     if tier == "D":
         return out | _unknowns(rows)
     clear = [row for row in rows if (row["signal_to_noise"] or np.inf) >= 10]
+    strong = _between(rows, 20)
     out["methods"] = methods(clear)
     out["bands"] = {
-        f"{low:g}-{round(high):g}": methods(
-            [r for r in rows if low <= (r["signal_to_noise"] or 0) < high]
-        )
-        for low, high in BANDS
+        f"{low:g}-{round(high):g}": methods(_between(rows, low, high)) for low, high in BANDS
     }
-    out["bands"]["above 20"] = methods([r for r in rows if (r["signal_to_noise"] or 0) >= 20])
+    out["bands"]["above 20"] = methods(strong)
     effects = [name for name in CATALOGUE if any(_effect(row) == name for row in rows)]
     out["effects"] = {
         name: methods([row for row in clear if _effect(row) == name]) for name in effects
@@ -78,9 +70,8 @@ def summary(rows: Sequence[Row], tier: str) -> dict[str, Any]:
     out["confusion"] = confusion(rows)
     out["calibration"] = calibration(rows)
     out["coverage"] = coverage(clear)
-    out["pulls"] = pulls([row["answers"]["tool"]["pull"] for row in rows])
+    out["pulls"] = pulls([answer["pull"] for answer in _answers(rows, "tool")])
     out["clean_gap_closed"] = _explained(clear)
-    strong = [row for row in rows if (row["signal_to_noise"] or 0) >= 20]
     out["clean_gap_closed_above_20"] = _explained(strong)
     for name in ("one_action", "oracle_one_action"):
         out[name] = _known_share(clear, name)
@@ -105,6 +96,16 @@ def together(rows: Sequence[Row]) -> dict[str, Any]:
     return {"of_found_alone": rate(split[True]), "of_none_alone": rate(split[False])}
 
 
+def _between(rows: Sequence[Row], low: float, high: float = np.inf) -> list[Row]:
+    """Rows with a signal to noise in this interval."""
+    return [row for row in rows if low <= (row["signal_to_noise"] or 0) < high]
+
+
+def _answers(rows: Sequence[Row], method: str) -> list[dict[str, Any]]:
+    """Answers of a method, of the rows that have one."""
+    return [row["answers"][method] for row in rows if method in row["answers"]]
+
+
 def _known_share(rows: Sequence[Row], name: str) -> dict[str, Any]:
     """Rate over the cases in which this flag is known."""
     flags = [row.get(name) for row in rows]
@@ -125,10 +126,7 @@ def methods(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Return every rate, by method."""
     found = dict.fromkeys(name for row in rows for name in row["answers"])
     return {
-        name: {
-            key: rate([row["answers"][name][key] for row in rows if name in row["answers"]])
-            for key in RATES
-        }
+        name: {key: rate([answer[key] for answer in _answers(rows, name)]) for key in RATES}
         for name in found
     }
 
@@ -138,12 +136,10 @@ def detection(rows: Sequence[Row]) -> list[dict[str, Any]]:
     edges = np.geomspace(5, 100, 8)
     out = []
     for low, high in pairwise(edges.tolist()):
-        some = [r for r in rows if low <= (r["signal_to_noise"] or 0) < high * (1 + 1e-9)]
-        entry: dict[str, Any] = {"from": float(low), "to": float(high)}
-        for name in ("tool", "oracle"):
-            flags = [r["answers"][name]["detected"] for r in some if name in r["answers"]]
-            entry[name] = rate(flags)
-        out.append(entry)
+        some = _between(rows, low, high * (1 + 1e-9))
+        found = {name: rate([answer["detected"] for answer in _answers(some, name)])
+                 for name in ("tool", "oracle")}  # fmt: skip
+        out.append({"from": float(low), "to": float(high), **found})
     return out
 
 
@@ -170,12 +166,8 @@ def calibration(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 def coverage(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the share of credible sets that contain the truth, and their stated mass."""
-    named = [r["answers"]["tool"] for r in rows if r["answers"]["tool"]["mass"]]
-    strong = [
-        r["answers"]["tool"]
-        for r in rows
-        if r["answers"]["tool"]["mass"] and (r["signal_to_noise"] or 0) >= 20
-    ]
+    named = [answer for answer in _answers(rows, "tool") if answer["mass"]]
+    strong = [answer for answer in _answers(_between(rows, 20), "tool") if answer["mass"]]
     oracle = [
         (r["answers"]["tool"]["members"], r["answers"]["oracle"]["members"])
         for r in rows
@@ -201,9 +193,7 @@ def classes(rows: Sequence[Row]) -> list[dict[str, Any]]:
             "effects": list(effects),
             "cases": len(some),
             "elements": float(np.median([one["elements"] for one in some])),
-            "by_setting": rate(
-                [one["by_setting"] for one in some if one["by_setting"] is not None]
-            ),
+            "by_setting": _known_share(some, "by_setting"),
             "separation_sigma": _quantiles([one["separation_sigma"] for one in some])["median"],
         }
         for effects, some in sorted(found.items(), key=lambda item: -len(item[1]))
@@ -246,13 +236,7 @@ def _explained(rows: Sequence[Row]) -> dict[str, Any]:
         "ratio": _quantiles(ratios),
         "of_the_floor": _quantiles(floors),
         "chi2_per_dof": _quantiles([r["heldout_chi2_per_dof"] for r in rows if r["findings"]]),
-        "as_noise": rate(
-            [
-                r["heldout_as_noise"]
-                for r in rows
-                if r["findings"] and r["heldout_as_noise"] is not None
-            ]
-        ),
+        "as_noise": _known_share([r for r in rows if r["findings"]], "heldout_as_noise"),
     }
 
 
@@ -271,8 +255,7 @@ def _unknowns(rows: Sequence[Row]) -> dict[str, Any]:
 
     def placed(some: Sequence[Row]) -> dict[str, dict[str, Any]]:
         found = dict.fromkeys(name for row in some for name in row["answers"])
-        rows = {n: [r["answers"][n] for r in some if n in r["answers"]] for n in found}
-        return {n: rate([row.get("place", False) for row in rows[n]]) for n in found}
+        return {n: rate([own.get("place", False) for own in _answers(some, n)]) for n in found}
 
     kinds = dict.fromkeys(kind(row) for row in rows)
     return {

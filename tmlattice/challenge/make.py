@@ -34,15 +34,7 @@ from tmlattice.challenge.kinds import (
     quiet_problem,
 )
 from tmlattice.challenge.unknown import DISCRETE, LARGEST, Unknown, clean_readings
-from tmlattice.effects import (
-    Cause,
-    Settings,
-    background_rms,
-    find,
-    modelled,
-    monitors_with,
-    names,
-)
+from tmlattice.effects import Cause, Settings, background_rms, find, modelled, monitors_with, names
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
 from tmlattice.input_files import json_of

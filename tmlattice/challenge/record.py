@@ -122,9 +122,7 @@ def oracle_one_action(evaluated: Mapping[str, Any], cause: Cause, ring: Ring) ->
     members = [m for m in oracle["posterior"] if m["probability"]]
     causes = [Cause(m["effect"], m["element"], m["amount"]) for m in members]
     actions = recommended_actions(ring, causes, [m["probability"] for m in members])
-    first = max(
-        actions, key=lambda recommended_action: recommended_action.probability, default=None
-    )
+    first = max(actions, key=lambda action: action.probability, default=None)
     if not oracle["detected"] or first is None or first.probability < DEFAULT.mass:
         return False
     true = leading(ring, cause)

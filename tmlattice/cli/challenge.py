@@ -14,6 +14,7 @@ from tmlattice.cli.options import (
     jobs_option,
     json_option,
     outputs,
+    path_option,
     seed_option,
     table,
 )
@@ -48,13 +49,11 @@ code_option = click.option(
 
 @challenge.command("make")
 @click.argument(
-    "tier",
-    metavar="A|B|C|D|E|R|T|P|M",
-    type=click.Choice(list("ABCDERTPM"), case_sensitive=False),
+    "tier", metavar="A|B|C|D|E|R|T|P|M", type=click.Choice(list("ABCDERTPM"), case_sensitive=False)
 )
 @click.option("--cases", type=click.IntRange(1), default=300, help="How many.")
 @seed_option("Of all that is drawn.")
-@click.option("--out", "folder", type=FILE, required=True, help="Folder of the challenge.")
+@path_option("--out", "folder", metavar="PATH", required=True, help="Folder of the challenge.")
 @click.option("--lattice", default="petra3", help="Built-in name or path.")
 @click.option("--reference", is_flag=True, help="Tier B: with a measurement before the fault.")
 @click.option(
@@ -72,10 +71,7 @@ code_option = click.option(
     help="Tiers E, M and P: of measurement (repeat); M draws two or three of them for a case.",
 )
 @click.option(
-    "--shots",
-    type=click.IntRange(1),
-    default=4,
-    help="Of the fit; two more are held out.",
+    "--shots", type=click.IntRange(1), default=4, help="Of the fit; two more are held out."
 )
 @click.option("--effect", "effects", multiple=True, help="Draw from these alone (repeat).")
 @click.option("--amount", type=float, help="Of the effect, instead of a drawn signal to noise.")
@@ -111,12 +107,7 @@ def make(
 @code_option
 @jobs_option
 @click.pass_context
-def run(
-    context: click.Context,
-    folder: Path,
-    workers: dict[str, Any],
-    lattice: str | None,
-) -> None:
+def run(context: click.Context, folder: Path, workers: dict[str, Any], lattice: str | None) -> None:
     """Diagnose every case in FOLDER that has no result yet; the truth is not read.
 
     The exit code is 1 where a case failed.
@@ -135,7 +126,7 @@ def run(
 
 @challenge.command("score", cls=Careful)
 @click.argument("folder", type=FILE)
-@click.option("--out", type=FILE, metavar="DIR", help="Figures: confusion, calibration, detection.")
+@path_option("--out", metavar="DIR", help="Figures: confusion, calibration, detection.")
 @click.option(
     "--oracle/--no-oracle",
     default=True,
@@ -200,11 +191,14 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
         if key in result:
             screen.print(f"{title}: {_share(result[key])} of {result[key]['cases']}")
     if "exact" in result:
-        shown = table("all causes found, up to equivalence", "all cases", "each above 10")
-        for name in (name for name in METHODS if name in result["exact"]):
-            above = result["exact_above_10"].get(name)
-            shown.add_row(METHODS[name], _share(result["exact"][name]), _share(above))
-        screen.print(shown)
+        exact, above = result["exact"], result["exact_above_10"]
+        rows = ((METHODS[n], _share(exact[n]), _share(above.get(n))) for n in METHODS if n in exact)
+        head: tuple[str, ...] = (
+            "all causes found, up to equivalence",
+            "all cases",
+            "each above 10",
+        )
+        screen.print(table(*head, rows=rows))
     if "methods" in result:
         _print_methods(screen, "signal to noise >= 10", result["methods"])
         for name, methods in result["bands"].items():
@@ -215,38 +209,37 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
             screen.print(f"found together where {title} alone finds it: {_share(rate)} of "
                          f"{rate['cases']}")  # fmt: skip
     if "detection" in result:
-        shown = table("signal to noise", "detected", "oracle", "cases")
-        for entry in result["detection"]:
-            span = f"{entry['from']:.0f} to {entry['to']:.0f}"
-            shown.add_row(span, _share(entry["tool"]), _share(entry["oracle"]),
-                          str(entry["tool"]["cases"]))  # fmt: skip
-        screen.print(shown)
+        screen.print(table("signal to noise", "detected", "oracle", "cases", rows=(
+            (f"{entry['from']:.0f} to {entry['to']:.0f}", _share(entry["tool"]),
+             _share(entry["oracle"]), str(entry["tool"]["cases"]))
+            for entry in result["detection"]
+        )))  # fmt: skip
     if "effects" in result:
         keys = ("place", "element_first", "element_in_set", "effect_first", "effect_in_set")
-        shown = table("effect, signal to noise >= 10", *(key.replace("_", " ") for key in keys))
-        for name, methods in result["effects"].items():
-            if "tool" in methods:
-                shown.add_row(name, *(_plain(methods["tool"][key]) for key in keys))
-        screen.print(shown)
+        head = ("effect, signal to noise >= 10", *(key.replace("_", " ") for key in keys))
+        screen.print(table(*head, rows=(
+            (name, *(_plain(methods["tool"][key]) for key in keys))
+            for name, methods in result["effects"].items() if "tool" in methods
+        )))  # fmt: skip
     if result.get("classes"):
-        shown = table("stay together", "cases", "elements", "next shot parts by, sigma", "settings")
-        for entry in result["classes"][:12]:
-            shown.add_row(", ".join(entry["effects"]), str(entry["cases"]),
-                          _number(entry["elements"]), _number(entry["separation_sigma"]),
-                          _plain(entry["by_setting"]))  # fmt: skip
-        screen.print(shown)
+        head = ("stay together", "cases", "elements", "next shot parts by, sigma", "settings")
+        screen.print(table(*head, rows=(
+            (", ".join(entry["effects"]), str(entry["cases"]), _number(entry["elements"]),
+             _number(entry["separation_sigma"]), _plain(entry["by_setting"]))
+            for entry in result["classes"][:12]
+        )))  # fmt: skip
     if "coverage" in result:
         _print_sets(screen, result)
     if "kinds" in result:
-        shown = table("unknown, not aliased", "refused", "place", "aliased", "cases")
-        for name, entry in {"all": result["unknown"], **result["kinds"]}.items():
-            shown.add_row(name, _share(entry["refused"]), _share(entry["place"]),
-                          _plain(entry["aliased"]), str(entry["aliased"]["cases"]))  # fmt: skip
-        screen.print(shown)
-        shown = table("not aliased, within one BPM gap", "place")
-        for name in (name for name in METHODS if name in result["place_by_method"]):
-            shown.add_row(METHODS[name], _share(result["place_by_method"][name]))
-        screen.print(shown)
+        screen.print(table("unknown, not aliased", "refused", "place", "aliased", "cases", rows=(
+            (name, _share(entry["refused"]), _share(entry["place"]), _plain(entry["aliased"]),
+             str(entry["aliased"]["cases"]))
+            for name, entry in {"all": result["unknown"], **result["kinds"]}.items()
+        )))  # fmt: skip
+        places = result["place_by_method"]
+        screen.print(table("not aliased, within one BPM gap", "place", rows=(
+            (METHODS[name], _share(places[name])) for name in METHODS if name in places
+        )))  # fmt: skip
 
 
 def _plain(rate: dict[str, Any]) -> str:
@@ -258,12 +251,10 @@ def _print_methods(screen: "Console", title: str, methods: dict[str, Any]) -> No
         return
     names = [name for name in METHODS if name in methods]
     names += [name for name in methods if name not in METHODS]  # each kind alone
-    shown = table(title, *(METHODS.get(name, name) for name in names))
-    for key in methods[names[0]]:
-        shown.add_row(
-            key.replace("_", " "), *(_number(methods[n][key]["share"], "{:.1%}") for n in names)
-        )
-    screen.print(shown)
+    screen.print(table(title, *(METHODS.get(name, name) for name in names), rows=(
+        (key.replace("_", " "), *(_number(methods[n][key]["share"], "{:.1%}") for n in names))
+        for key in methods[names[0]]
+    )))  # fmt: skip
 
 
 def _print_sets(screen: "Console", result: dict[str, Any]) -> None:

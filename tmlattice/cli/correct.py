@@ -17,6 +17,7 @@ from tmlattice.cli.options import (
     named_number,
     open_ring,
     outputs,
+    path_option,
     print_report,
     require,
 )
@@ -64,17 +65,10 @@ TARGET = Word("NAME[=TOLERANCE]", _target, "'{2}' is no tolerance; give for exam
     "closed_orbit, with the rms error that is tolerated; or first_turn alone, which threads a beam "
     "that is not stored. Else the optics.",
 )
-@click.option(
-    "--example",
-    "example_file",
-    type=FILE,
-    metavar="FILE",
-    help="Write the table of the knobs, and end.",
-)
+@path_option("--example", "example_file", help="Write the table of the knobs, and end.")
 @json_option
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     metavar="DIR",
     help="Folder for settings.csv, statements of MAD-X, AT and elegant, report.html.",
 )
@@ -131,14 +125,11 @@ def correct(
         if folder:
             write_correction(found, folder)
         write(found.as_json())
-    screen = console()
-    print_report(screen, found)
-    for sentence in warnings:
-        screen.print(f"\nNote: {sentence}.", soft_wrap=True)
+    after = [line for sentence in warnings for line in ("", f"Note: {sentence}.")]
     written = [f"{out}/: report.html, settings.csv, ..."] if out else []
     written += [str(json_file)] if json_file else []
-    if written:
-        screen.print(f"\nwritten: {'; '.join(written)}", soft_wrap=True)
+    after += ["", f"written: {'; '.join(written)}"] if written else []
+    print_report(console(), found, after)
 
 
 def _first_turns(folders: tuple[Path, ...]) -> list["Measurement"]:

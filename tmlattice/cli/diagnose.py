@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import isfinite
 from pathlib import Path
@@ -16,11 +17,13 @@ from tmlattice.cli.options import (
     assume_option,
     background_option,
     console,
+    is_in,
     json_option,
     lattice_argument,
     named_data,
     open_ring,
     outputs,
+    path_option,
     print_report,
     radiation_option,
     read_data,
@@ -29,8 +32,6 @@ from tmlattice.cli.options import (
 from tmlattice.cli.progress import tell
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from tmlattice.correction import Correction, Knob
     from tmlattice.diagnosis import Diagnosis
     from tmlattice.diagnosis.kinds import Measured
@@ -45,20 +46,17 @@ log = logging.getLogger(__name__)
 @click.command("diagnose", cls=OfMachine)
 @lattice_argument
 @click.argument("measurements", metavar="MEASUREMENT...", type=FILE, nargs=-1)
-@click.option(
+@path_option(
     "--reference",
     "references",
-    type=FILE,
     metavar="DIR",
     multiple=True,
     help="A measurement of the same machine and kind before the fault: static errors cancel, and "
     "the diagnosis reports what changed. Repeat it if several are diagnosed together.",
 )
-@click.option(
+@path_option(
     "--settings",
     "settings_file",
-    type=FILE,
-    metavar="FILE",
     help="settings.csv of the last correction, applied before this measurement: the next "
     "correction starts from them. With the --reference before them the calibration of each "
     "device, measured over asked change, is printed instead.",
@@ -78,11 +76,8 @@ log = logging.getLogger(__name__)
     help="Look for these alone, or of an orbit response fit families of these alone; else for all "
     "usual ones (`tmlattice effects`).",
 )
-@click.option(
-    "--network",
-    type=FILE,
-    metavar="FILE",
-    help="network.pt of `tune-fit`: read what its weights changed as physics.",
+@path_option(
+    "--network", help="network.pt of `tune-fit`: read what its weights changed as physics."
 )
 @click.option(
     "--missing",
@@ -91,26 +86,21 @@ log = logging.getLogger(__name__)
 )
 @radiation_option
 @seed_option("Of the split, the threshold's simulation and the bootstrap.")
-@click.option(
+@path_option(
     "--lattice-out",
-    type=FILE,
-    metavar="FILE",
     help="The estimated ring, with its errors: .json (the package's own), .at.json (AT), "
     ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT). FILE.calibration.json next to it "
     "holds the calibration of BPMs and correctors (`tmlattice predict`).",
 )
-@click.option(
+@path_option(
     "--corrected-out",
-    type=FILE,
-    metavar="FILE",
     help="The corrected ring, in the same formats: the design with the settings that, loaded into "
     "the real machine, restore the design (a quadrupole that gives 20 % less is set 25 % higher). "
     "Errors that no setting corrects are printed.",
 )
 @json_option
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     metavar="DIR",
     help="Folder for diagnosis.json, report.html, report.txt, the figures, and the estimated ring, "
     "for `tmlattice correct DIR`.",
@@ -146,9 +136,13 @@ def diagnose(
     from tmlattice.diagnosis.load import ESTIMATED_FILE
     from tmlattice.diagnosis.twin import knowledge_file, known_of
     from tmlattice.errors import LatticeError
+    from tmlattice.report.text import wrapped
 
-    kept = Path(ESTIMATED_FILE)
-    replaced = (*FILES, *map(str, (kept, calibration_beside(kept), knowledge_file(kept))))
+    kept = [Path(ESTIMATED_FILE)]
+    if lattice_out and is_in(lattice_out, out):
+        kept.append(Path(lattice_out.name))
+    with_companions = [(own, calibration_beside(own), knowledge_file(own)) for own in kept]
+    replaced = [*FILES, *(str(own) for files in with_companions for own in files)]
     with outputs(out, json_file, replaced) as (folder, write):
         from tmlattice.correction.applied import applied
         from tmlattice.correction.applied import sentence as of_device
@@ -168,7 +162,11 @@ def diagnose(
                 "changed; give the one before"
             )
         asked = read_settings(settings_file, ring) if settings_file else []
-        (data, said), (before, _) = (_read(p, ring, assumed) for p in (measurements, references))
+        (data, said), (before, more_said) = (
+            _read(p, ring, assumed) for p in (measurements, references)
+        )
+        files = [str(path) for path in (*measurements, *references) if path.is_file()]
+        printed = [*said, *more_said, *2 * files]  # of a file also what it is, and a blank line
         (first, *more) = data.values()
         response = isinstance(first, OrbitResponse) and not more
         turns = isinstance(first, Measurement) and not more
@@ -196,9 +194,14 @@ def diagnose(
             del options["max_effects"]
         if lattice_out and lattice_out == corrected_out:
             raise click.UsageError(f"--lattice-out and --corrected-out are both '{lattice_out}'")
+
+        def place(path: Path) -> Path:
+            """Where it is written: a file of --out while that folder is filled."""
+            return folder / path.name if folder and is_in(path, out) else path
+
         for option, path in (("lattice", lattice_out), ("corrected", corrected_out)):
             if path:
-                _check_out(ring, f"--{option}-out", path)
+                _check_out(ring, f"--{option}-out", path, place)
         with named_data(" or ".join(str(path) for path in (*measurements, *references))):
             result = run(ring, data, effects=effects, assume=assumed, progress=tell, **options)
         reading = None
@@ -210,7 +213,8 @@ def diagnose(
         if said:
             source["assumed_of_files"] = said
         if lattice_out:
-            source["lattice_out"] = str(lattice_out.absolute())
+            here = is_in(lattice_out, out)  # the folder may be moved
+            source["lattice_out"] = lattice_out.name if here else str(lattice_out.absolute())
         known = correction = None
         if lattice_out or ((asked or folder) and not before):
             tell("remaining uncertainties")  # minutes, of a large response
@@ -220,7 +224,7 @@ def diagnose(
             correction = None if asked and before else _correction(result, known, asked)
         if folder and not lattice_out and not before:
             try:
-                _save_rings(result, known, folder / ESTIMATED_FILE, None)
+                _save_rings(result, known, folder / ESTIMATED_FILE, None, place)
                 source["lattice_out"] = ESTIMATED_FILE
             except LatticeError as error:  # an element that no file holds
                 log.warning("no estimated ring for `tmlattice correct`: %s", error)
@@ -235,19 +239,19 @@ def diagnose(
             tell("figures")
             write_files(result, folder, document, correction)
         write(document)
-        written = _save_rings(result, known, lattice_out, corrected_out)
+        written = _save_rings(result, known, lattice_out, corrected_out, place)
         if folder and reading:
             _write_weights(reading, folder)
-    _print(result, correction, out, json_file, written)
-    for own in calibrations:
-        console().print(of_device(own), soft_wrap=True)
+    screen, after = console(), []
+    if correction is not None:
+        after = ["", *wrapped(f"Correction: {correction.words}", "", screen.width)]
+    after += ["", _extent(result), *_written_lines(out, json_file, written)]
+    after += [of_device(own) for own in calibrations]
     if calibrations:
-        console().print(
-            "\nTo correct what is left, give the same command without --reference.",
-            soft_wrap=True,
-        )
+        after += ["", "To correct what is left, give the same command without --reference."]
     if reading:
-        _print_weights(ring, reading)
+        after += ["", _weights_text(ring, reading)]
+    print_report(screen, result, after, printed)
 
 
 def _read(
@@ -302,9 +306,7 @@ def _known(ring: "Ring", lattice: str) -> "DistributedErrors | None":
 
 
 def _correction(
-    result: "Diagnosis",
-    known: "DistributedErrors | None",
-    asked: "Sequence[tuple[Knob, float]]",
+    result: "Diagnosis", known: "DistributedErrors | None", asked: "Sequence[tuple[Knob, float]]"
 ) -> "Correction | None":
     """Settings of supplies that bring the estimated ring to the design, where the covariance of its
     errors is known and they have an expected gain; some supplies have applied settings."""
@@ -343,8 +345,10 @@ def _save_rings(
     known: "DistributedErrors | None",
     lattice_out: Path | None,
     corrected_out: Path | None,
+    place: Callable[[Path], Path],
 ) -> dict[str, tuple[str, ...]]:
-    """The estimated ring and the corrected ring: the files, with what they do not hold."""
+    """The estimated ring and the corrected ring: the files, with what they do not hold (place:
+    where a file is written)."""
     from tmlattice.diagnosis.twin import ESTIMATED, knowledge_file, known_document
     from tmlattice.files import output_file, write_json
     from tmlattice.lattice import save_ring
@@ -355,25 +359,25 @@ def _save_rings(
     if lattice_out:
         ring = result.as_found
         ring = ring if known is None else replace(ring, model=ESTIMATED)
-        written[str(lattice_out)] = save_ring(ring, lattice_out)
+        written[str(lattice_out)] = save_ring(ring, place(lattice_out))
         beside = calibration_beside(lattice_out)
         if result.calibration or result.by_families:
             amounts = zip(result.causes, result.errors, strict=True)
             errors = {(c.effect, c.element): e for c, e in amounts if isfinite(e)}
             own = (result.calibration, result.dispersion, result.rejected_channels, errors)
-            write_calibration(beside, Calibration(*own))
+            write_calibration(place(beside), Calibration(*own))
             written[str(beside)] = ()
         else:  # that of the ring which stood there
-            beside.unlink(missing_ok=True)
+            place(beside).unlink(missing_ok=True)
         beside = knowledge_file(lattice_out)
-        beside.unlink(missing_ok=True)  # that of the ring which stood there
-        if lattice_out.is_file() and known is not None:
-            with output_file(beside) as temporary:
-                write_json(temporary, known_document(known, lattice_out))
+        place(beside).unlink(missing_ok=True)  # that of the ring which stood there
+        if place(lattice_out).is_file() and known is not None:
+            with output_file(place(beside)) as temporary:
+                write_json(temporary, known_document(known, place(lattice_out)))
             written[str(beside)] = ()
     if corrected_out:
         ring, by_hand = result.repair()
-        told = save_ring(ring, corrected_out)
+        told = save_ring(ring, place(corrected_out))
         more = by_hand_text(result.ring, by_hand)
         written[str(corrected_out)] = (*told, more) if more else told
     return written
@@ -386,18 +390,22 @@ def _refuse(kind: str, **given: Any) -> None:
             raise click.UsageError(f"--{name.replace('_', '-')} has no meaning for {kind}")
 
 
-def _check_out(ring: "Ring", option: str, path: Path) -> None:
+def _check_out(ring: "Ring", option: str, path: Path, place: Callable[[Path], Path]) -> None:
     """Whether the ring can be written there, before minutes of work."""
     from tempfile import TemporaryDirectory
 
-    from tmlattice.files import check_writable
+    from tmlattice.correction.result import FILES
+    from tmlattice.diagnosis.load import DOCUMENT, LATTICE
+    from tmlattice.files import OutputError, check_writable
     from tmlattice.lattice import save_ring
     from tmlattice.lattice.write import SUFFIXES, knows
 
     if not knows(path):
         raise click.UsageError(f"{option} '{path}' names no format; end it in {SUFFIXES}")
+    if place(path) != path and path.name in (DOCUMENT, LATTICE, *FILES):
+        raise OutputError(f"{option} '{path}' is a file of --out; give it another name")
     for file in (path, calibration_beside(path)):
-        check_writable(file)
+        check_writable(place(file))
     with TemporaryDirectory() as folder:
         save_ring(ring, Path(folder) / path.name)
 
@@ -419,41 +427,24 @@ def _weights(
 
 
 def _write_weights(reading: "WeightReading", folder: Path) -> None:
-    import matplotlib.pyplot as plt
-
     from tmlattice.files import write_json
-    from tmlattice.plots import plot_weights
+    from tmlattice.plots import plot_weights, save_figure
 
-    figure = plot_weights(reading)
-    figure.savefig(folder / "weights.png", dpi=150)
-    plt.close(figure)
+    save_figure(plot_weights(reading), folder / "weights.png")
     write_json(folder / "weights.json", reading.as_json())
 
 
-def _print_weights(ring: "Ring", reading: "WeightReading") -> None:
+def _weights_text(ring: "Ring", reading: "WeightReading") -> str:
     magnets = ring.magnets
     raw, score = (magnets[int(reading.places(by)[0])] for by in ("raw", "score"))
-    console().print(
-        f"\nthe network's weights changed most at {raw.name} (s = {raw.s:.2f} m); in units of "
-        f"their error, at {score.name} (s = {score.s:.2f} m)",
-        soft_wrap=True,
+    return (
+        f"the network's weights changed most at {raw.name} (s = {raw.s:.2f} m); in units of "
+        f"their error, at {score.name} (s = {score.s:.2f} m)"
     )
 
 
-def _print(
-    result: "Diagnosis",
-    correction: "Correction | None",
-    out: Path | None,
-    json_file: Path | None,
-    rings: dict[str, tuple[str, ...]],
-) -> None:
-    from tmlattice.report.text import wrapped
-
-    screen = console()
-    print_report(screen, result)
-    if correction is not None:
-        text = "\n".join(wrapped(f"Correction: {correction.words}", "", screen.width))
-        screen.print(f"\n{text}", soft_wrap=True)
+def _extent(result: "Diagnosis") -> str:
+    """The ring, the readings that were used, and the time."""
     if result.parts:
         parts = result.parts
         names = (p.label.replace("_", " ") if len(parts) == 1 else p.label for p in parts)
@@ -473,7 +464,13 @@ def _print(
             "BPMs"
         )
     made = result.provenance
-    screen.print(f"\n{result.ring.name}: {what}, seed {made['seed']}, {made['seconds']:.1f} s")
+    return f"{result.ring.name}: {what}, seed {made['seed']}, {made['seconds']:.1f} s"
+
+
+def _written_lines(
+    out: Path | None, json_file: Path | None, rings: dict[str, tuple[str, ...]]
+) -> list[str]:
+    """The files that were written, and what those of rings do not hold."""
     from tmlattice.diagnosis.load import ESTIMATED_FILE
 
     written = []
@@ -482,8 +479,5 @@ def _print(
         written = [f"{out}/: report.html, report.txt, diagnosis.json, figures{also}"]
     written += [str(json_file)] if json_file else []
     written += rings
-    if written:
-        screen.print(f"written: {'; '.join(written)}", soft_wrap=True)
-    for file, told in rings.items():
-        for sentence in told:
-            screen.print(f"{file}: {sentence}", soft_wrap=True)
+    lines = [f"written: {'; '.join(written)}"] if written else []
+    return lines + [f"{file}: {sentence}" for file, told in rings.items() for sentence in told]

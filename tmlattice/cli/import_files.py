@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from tmlattice.cli.options import FILE, OfMachine, console, machine_file, open_ring
+from tmlattice.cli.options import FILE, OfMachine, console, machine_file, open_ring, path_option
 
 if TYPE_CHECKING:
     from tmlattice.importers import Imported
@@ -14,9 +14,8 @@ if TYPE_CHECKING:
 
 @click.command("import", cls=OfMachine)
 @click.argument("files", nargs=-1, type=FILE)
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     required=True,
     metavar="FOLDER",
     help="The measurement folder, with lattice.json in it where the files hold one.",

@@ -81,10 +81,8 @@ def _print(facts: dict[str, Any]) -> None:
         f"{facts['lattice']}: {facts['length']:.4f} m, {facts['energy_gev']:g} GeV{particle}, "
         f"{facts['layers']} magnets, bends sum to {facts['bend_angle']:.9f} rad"
     )
-    counts = table("elements", "count")
-    for kind, count in facts["counts"].items():
-        counts.add_row(kind, str(count))
-    screen.print(counts)
+    counts = ((kind, str(count)) for kind, count in facts["counts"].items())
+    screen.print(table("elements", "count", rows=counts))
     if facts["magnets_in_pieces"]:
         screen.print(f"{facts['magnets_in_pieces']} magnets stand in two pieces or more")
     if facts["tunes"] is not None:

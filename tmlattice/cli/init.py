@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 @click.option("--force", is_flag=True, help="Replace a machine file that is there.")
 @click.pass_context
 def init(
-    context: click.Context,
-    /,
-    lattice: str | None,
-    measurement: Path | None,
-    force: bool,
+    context: click.Context, /, lattice: str | None, measurement: Path | None, force: bool
 ) -> None:
     """Write the machine file tmlattice.toml, or that of --machine, of LATTICE and of DATA.
 

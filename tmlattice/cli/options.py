@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import stat
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,6 +108,13 @@ def background_option(title: str) -> Callable[[Callable[..., Any]], Callable[...
         help=f"{title}, with this rms or the catalogue's; `all`, or `all=SCALE`, for every usual "
         "one, or `none`.",
     )
+
+
+def path_option(
+    *names: str, help: str, metavar: str = "FILE", **more: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """An option whose value is a path."""
+    return click.option(*names, type=FILE, metavar=metavar, help=help, **more)
 
 
 def seed_option(purpose: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -394,9 +401,7 @@ assume_option = click.option(
 radiation_option = click.option(
     "--radiation", is_flag=True, help="The model radiates in bends and wigglers."
 )
-json_option = click.option(
-    "--json", "json_file", type=FILE, metavar="FILE", help="Write the result as JSON."
-)
+json_option = path_option("--json", "json_file", help="Write the result as JSON.")
 
 
 @contextmanager
@@ -413,8 +418,18 @@ def outputs(
 
     with ExitStack() as files:
         made = files.enter_context(output_folder(folder, replaced)) if folder else None
-        path = files.enter_context(output_file(json_file)) if json_file else None
+        path = None
+        if json_file:
+            place = made / json_file.name if made and is_in(json_file, folder) else json_file
+            path = files.enter_context(output_file(place))
         yield made, lambda result: write_json(path, result) if path else None
+
+
+def is_in(path: Path, folder: Path | None) -> bool:
+    """Whether a file is one of a folder, which need not exist."""
+    if folder is None:
+        return False
+    return os.path.dirname(os.path.abspath(path)) == os.path.abspath(folder)
 
 
 def read_data(
@@ -477,17 +492,25 @@ def console() -> "Console":
     return Screen(**look, width=min(wide.width, 120) if wide.is_terminal else 100)
 
 
-LINES = 34
-"""Of a report on a terminal; with what is written where, and a correction, 40."""
+LINES = 40
+"""Of a terminal, in all."""
 
 
-def print_report(screen: "Console", found: "Diagnosis | Correction | Differences") -> None:
-    """Print a report; on a terminal, which scrolls, its most important lines."""
-    most = LINES if screen.is_terminal else None
-    screen.print(found.report(screen.width, most), soft_wrap=True)
+def print_report(
+    screen: "Console",
+    found: "Diagnosis | Correction | Differences",
+    after: Sequence[str] = (),
+    before: Sequence[str] = (),
+) -> None:
+    """Print a report and the lines after it; on a terminal, which scrolls, its most important
+    lines, so many that `LINES` hold all (before: what is printed already)."""
+    others = sum(max(1, -(-len(line) // screen.width)) for line in (*before, *after))
+    most = LINES - others if screen.is_terminal else None
+    for text in (found.report(screen.width, most), *after):
+        screen.print(text, soft_wrap=True)
 
 
-def table(*columns: str) -> "Table":
+def table(*columns: str, rows: Iterable[Sequence[str]] = ()) -> "Table":
     """A table with its first column left, the others right."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
@@ -495,4 +518,6 @@ def table(*columns: str) -> "Table":
     made = Table(box=SIMPLE_HEAD, pad_edge=False)
     for i, column in enumerate(columns):
         made.add_column(column, justify="right" if i else "left")
+    for row in rows:
+        made.add_row(*row)
     return made

@@ -4,21 +4,13 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import (
-    FILE,
-    OfMachine,
-    console,
-    lattice_argument,
-    open_ring,
-)
+from tmlattice.cli.options import OfMachine, console, lattice_argument, open_ring, path_option
 
 
 @click.command("predict", cls=OfMachine)
 @lattice_argument
-@click.option(
+@path_option(
     "--calibration",
-    type=FILE,
-    metavar="FILE",
     help="JSON with the gains, rolls and couplings of BPMs, the calibrations and rolls of "
     "correctors, and the energies of the beam.",
 )
@@ -30,13 +22,9 @@ from tmlattice.cli.options import (
     help="Predict this one; repeat for more. Else all.",
 )
 @click.option("--kick", type=float, default=1e-4, help="Of each, rad.")
-@click.option("--out", type=FILE, required=True, metavar="FILE", help="A table: .csv.")
+@path_option("--out", required=True, help="A table: .csv.")
 def predict(
-    lattice: str,
-    calibration: Path | None,
-    correctors: tuple[str, ...],
-    kick: float,
-    out: Path,
+    lattice: str, calibration: Path | None, correctors: tuple[str, ...], kick: float, out: Path
 ) -> None:
     """Predict how the stored beam's orbit answers a kick of each corrector, at fixed RF frequency.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tmlattice.cli.options import FILE, console, is_quiet, table
+from tmlattice.cli.options import console, is_quiet, path_option, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,7 +23,7 @@ SYSTEMS = ["free-fall", "lotka-volterra", "pendulum", "magnets", "cavitation"]
 
 @click.command("reproduce")
 @click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
-@click.option("--out", type=FILE, default="reproduce", metavar="DIR",
+@path_option("--out", default="reproduce", metavar="DIR",
               help="Folder for the figures and reproduction.json.")  # fmt: skip
 @click.option("--small", is_flag=True,
               help="Fewer networks, a gentler collapse: seconds, not minutes.")  # fmt: skip
@@ -40,14 +40,13 @@ def reproduce(systems: tuple[str, ...], out: Path, small: bool) -> None:
     chosen = [name for name in SYSTEMS if name in systems] or SYSTEMS
     with ExitStack() as files:
         folder = files.enter_context(output_folder(out))
-        import matplotlib.pyplot as plt
+        from tmlattice.plots import save_figure
 
         entries = []
         for name in chosen:
             begin = perf_counter()
             rows, figure = _RUN[name](small, not is_quiet())
-            figure.savefig(folder / f"{name}.png", dpi=150)
-            plt.close(figure)
+            save_figure(figure, folder / f"{name}.png")
             entries.append({
                 "system": name,
                 "figure": f"{name}.png",

@@ -4,14 +4,20 @@ from pathlib import Path
 
 import click
 
-from tmlattice.cli.options import FILE, Careful, console, json_option, outputs, print_report
+from tmlattice.cli.options import (
+    FILE,
+    Careful,
+    console,
+    json_option,
+    outputs,
+    path_option,
+    print_report,
+)
 
 
 @click.command("report", cls=Careful)
 @click.argument("result", metavar="FOLDER", type=FILE)
-@click.option(
-    "--out", type=FILE, metavar="DIR", help="Folder to write to; where none is named, FOLDER."
-)
+@path_option("--out", metavar="DIR", help="Folder to write to; where none is named, FOLDER.")
 def report(result: Path, out: Path | None) -> None:
     """Render report.html and report.txt again from the diagnosis.json of FOLDER.
 
@@ -22,10 +28,8 @@ def report(result: Path, out: Path | None) -> None:
     from tmlattice.report.speaking import render
 
     found = render(result, out)
-    screen = console()
-    print_report(screen, found)
     place = out or (result if result.is_dir() else result.parent)
-    screen.print(f"\nwritten: {place / 'report.html'}", soft_wrap=True)
+    print_report(console(), found, ("", f"written: {place / 'report.html'}"))
 
 
 @click.command("compare", cls=Careful)
@@ -45,7 +49,4 @@ def compare(first: str, second: str, json_file: Path | None) -> None:
     with outputs(None, json_file) as (_, write):
         found = run(first, second)
         write(found.as_json())
-    screen = console()
-    print_report(screen, found)
-    if json_file:
-        screen.print(f"written: {json_file}")
+    print_report(console(), found, [f"written: {json_file}"] if json_file else [])

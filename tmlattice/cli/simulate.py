@@ -8,7 +8,6 @@ from typing import Any
 import click
 
 from tmlattice.cli.options import (
-    FILE,
     WithDefault,
     Word,
     background_option,
@@ -18,6 +17,7 @@ from tmlattice.cli.options import (
     lattice_argument,
     machine_file,
     open_ring,
+    path_option,
     require,
     seed_option,
     table,
@@ -102,11 +102,8 @@ CAUSE = Word(
     "stored beam network, on a graphics card where there is one.",
 )
 @click.option("--radiation", is_flag=True, help="Bends and wigglers radiate.")
-@click.option(
-    "--settings",
-    type=FILE,
-    metavar="FILE",
-    help="JSON: a list with the settings of each shot, as in the measurement format.",
+@path_option(
+    "--settings", help="JSON: a list with the settings of each shot, as in the measurement format."
 )
 @seed_option("Of launches, settings and noise.")
 @click.option(
@@ -128,13 +125,8 @@ CAUSE = Word(
     default=1,
     help="Turn by turn: 1 is the middle of the beam; some hundreds decohere.",
 )
-@click.option("--out", type=FILE, required=True, metavar="DIR", help="The measurement folder.")
-@click.option(
-    "--truth",
-    type=FILE,
-    metavar="FILE",
-    help="Write the causes there; never inside a measurement folder.",
-)
+@path_option("--out", required=True, metavar="DIR", help="The measurement folder.")
+@path_option("--truth", help="Write the causes there; never inside a measurement folder.")
 @click.option("--force", is_flag=True, help="Replace a measurement that --out holds already.")
 @click.pass_context
 def simulate(
@@ -264,15 +256,19 @@ def _check_options(context: click.Context, kind: str) -> None:
 def _print_causes(ring: Any, causes: list[Any]) -> None:
     from tmlattice.effects import find
 
-    if not causes:
-        return
-    shown = table("effect", "element", "s [m]", "amount", "unit")
     places = {element.name: f"{element.s:.2f}" for element in ring.elements}
-    for cause in causes:
-        place = cause.element or "-"
-        unit = find(cause.effect).unit
-        shown.add_row(cause.effect, place, places.get(place, "-"), f"{cause.amount:g}", unit)
-    console().print(shown)
+    rows = [
+        (
+            c.effect,
+            c.element or "-",
+            places.get(c.element, "-"),
+            f"{c.amount:g}",
+            find(c.effect).unit,
+        )
+        for c in causes
+    ]
+    if rows:
+        console().print(table("effect", "element", "s [m]", "amount", "unit", rows=rows))
 
 
 def _check_apart(truth: Path, out: Path) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 import click
 
 from tmlattice.cli.options import (
-    FILE,
     Careful,
     Word,
     checked_ring,
@@ -14,6 +13,7 @@ from tmlattice.cli.options import (
     epochs_option,
     is_quiet,
     jobs_option,
+    path_option,
     require,
     table,
 )
@@ -38,10 +38,7 @@ NUMBER = Word("all|N", _number, "'{0}' is no number of magnets; give 'all' or 1,
 @study.command("tune-fit", cls=Careful)
 @click.argument("lattice", default="petra3")
 @click.option(
-    "--magnets",
-    type=NUMBER,
-    default="40",
-    help="Powered magnets, evenly spread over the ring.",
+    "--magnets", type=NUMBER, default="40", help="Powered magnets, evenly spread over the ring."
 )
 @click.option(
     "--methods",
@@ -50,32 +47,25 @@ NUMBER = Word("all|N", _number, "'{0}' is no number of magnets; give 'all' or 1,
     help="adam, adam-none, adam-l1, adam-l2 (its regularizations), map, sparse, known (sparse with "
     "the known magnet).",
 )
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     default="study-tune-fit",
     metavar="DIR",
     help="Folder for the cases, study.png and study.json; a study that was stopped goes on there.",
 )
 @click.option(
-    "--change",
-    type=float,
-    default=-0.2,
-    help="Relative change of the magnet's strength.",
+    "--change", type=float, default=-0.2, help="Relative change of the magnet's strength."
 )
 @epochs_option
 @jobs_option
 def tune_fit(
-    lattice: str,
-    methods: str,
-    out: Path,
-    workers: dict[str, Any],
-    **options: Any,
+    lattice: str, methods: str, out: Path, workers: dict[str, Any], **options: Any
 ) -> None:
     """Tune errors of fine-tuning over many magnets, each changed in turn."""
     from tmlattice import __version__
     from tmlattice.files import output_file, write_json
     from tmlattice.fitting.study import study_tune_fit, summarise
+    from tmlattice.plots import plot_study, save_figure
 
     chosen = tuple(name.strip() for name in methods.split(","))
     cases = study_tune_fit(
@@ -108,21 +98,9 @@ def tune_fit(
     }
     with output_file(out / "study.json") as own:
         write_json(own, summary)
-    _draw(lattice, cases, out)
-    _print(summary)
-
-
-def _draw(lattice: str, cases: list[Any], out: Path) -> None:
-    import matplotlib.pyplot as plt
-
-    from tmlattice.files import output_file
-    from tmlattice.plots import plot_study
-
-    ring = checked_ring(lattice, {})
-    figure = plot_study(ring, cases)
     with output_file(out / "study.png") as path:
-        figure.savefig(path, dpi=150, format="png")
-    plt.close(figure)
+        save_figure(plot_study(checked_ring(lattice, {}), cases), path)
+    _print(summary)
 
 
 def _print(summary: dict[str, Any]) -> None:

@@ -8,7 +8,6 @@ import click
 from click.core import ParameterSource
 
 from tmlattice.cli.options import (
-    FILE,
     WithDefault,
     Word,
     console,
@@ -19,6 +18,7 @@ from tmlattice.cli.options import (
     named_data,
     open_ring,
     outputs,
+    path_option,
     read_data,
     require,
     seed_option,
@@ -54,16 +54,14 @@ LAUNCH = Word(
     help="Quadrupole or sextupole to change; else the defocusing quadrupole in the "
     "middle of the first arc.",
 )
-@click.option(
+@path_option(
     "--measurement",
-    type=FILE,
     metavar="DIR",
     help="Fit these data, a measurement folder or a file of readings, and change no magnet; all "
     "shots together.",
 )
-@click.option(
+@path_option(
     "--out",
-    type=FILE,
     default="tune-fit",
     metavar="DIR",
     help="Folder for the figures, tune-fit.json and network.pt.",
@@ -87,12 +85,7 @@ LAUNCH = Word(
     default="1e-3,0,1e-3,0",
     help="State at the start of the ring, m and rad.",
 )
-@click.option(
-    "--noise",
-    type=click.FloatRange(0),
-    default=2e-5,
-    help="Rms of one reading, m.",
-)
+@click.option("--noise", type=click.FloatRange(0), default=2e-5, help="Rms of one reading, m.")
 @epochs_option
 @seed_option("Of the readings' noise.")
 @json_option
@@ -167,7 +160,7 @@ def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
     """The figures, and their names; a loss there is where the recipe was asked for."""
     import matplotlib.pyplot as plt
 
-    from tmlattice.plots import plot_loss, plot_orbit_fit, plot_tune_fit_spectrum
+    from tmlattice.plots import plot_loss, plot_orbit_fit, plot_tune_fit_spectrum, save_figure
 
     figures = {"orbit": plot_orbit_fit(outcome)}
     figures["spectrum"], axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True,
@@ -185,8 +178,7 @@ def _draw(outcome: "TuneFit", folder: Path) -> list[str]:
         orbits = "one orbit" if outcome.shots == 1 else f"{outcome.shots} orbits"
         ax.set_title(f"Fine-tuning on {orbits} of {monitors} BPMs")
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.png", dpi=150)
-        plt.close(figure)
+        save_figure(figure, folder / f"{name}.png")
     return [f"{name}.png" for name in figures]
 
 
@@ -229,9 +221,8 @@ def _print(outcome: "TuneFit", out: Path, written: list[str], json_file: Path | 
         if method.problem:
             screen.print(f"{method.method}: {method.problem}")
     screen.print(f"\n{outcome.advice}\n")
-    stages = table("stage", *outcome.seconds)
-    stages.add_row("seconds", *(f"{stage:.2f}" for stage in outcome.seconds.values()))
-    screen.print(stages)
+    seconds = ("seconds", *(f"{stage:.2f}" for stage in outcome.seconds.values()))
+    screen.print(table("stage", *outcome.seconds, rows=[seconds]))
     if outcome.methods[0].method == "adam":
         fit = outcome.fit
         how = "patience ran out" if fit.stopped_early else "all epochs"

@@ -165,7 +165,10 @@ def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tup
     if with_beam.is_file():
         found = replace(found, known=read_known(with_beam, ring))
     else:
-        warnings = (f"'{with_beam.name}' is missing: the estimated ring is taken as certain",)
+        warnings = (
+            f"there is no '{with_beam}', which a diagnosis with distributed errors writes: the "
+            "estimated ring is taken as certain",
+        )
     if calibration.is_file():
         own = read_calibration(calibration, ring)
         sigma = own.errors.get(("energy_offset", None), 0.0)

@@ -21,7 +21,7 @@ from tmlattice.diagnosis.records import decoded, encoded
 from tmlattice.late import Method
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
-from tmlattice.speaks import Speaks
+from tmlattice.speaks import Speaks, listed
 
 Interval = tuple[float, float, float]
 """Median and the ends of the central 68 %."""
@@ -121,9 +121,7 @@ class Correction(Speaks):
         """Summary in one sentence."""
         if self.refused:
             return self.refused
-        first = [setting.knob.name for setting in self.settings[:3]]
-        count = len(self.settings)
-        names = ", ".join(first) + (f" and {count - 3} more" if count > 3 else "")
+        count, names = len(self.settings), listed([own.knob.name for own in self.settings], 3)
         falls = []
         for name in self.targets:  # its larger plane
             plane = max((0, 1), key=lambda p: self.before[name][p][0])

@@ -64,7 +64,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import ring_tunes
-from tmlattice.speaks import micrometres
+from tmlattice.speaks import listed, micrometres
 from tmlattice.version import __version__
 
 log = logging.getLogger(__name__)
@@ -434,11 +434,11 @@ def about_rejected(outliers: Sequence[Mapping[str, Any]]) -> list[str]:
     """A message about outliers, if there are any."""
     if not outliers:
         return []
-    some = "; ".join(
+    names = [
         f"{row['monitor']} {row['plane']}, "
         + ("the reference" if row["shot"] is None else f"shot {row['shot']}")
         + (f", turn {row['turn']}" if row["turn"] else "")
-        for row in outliers[:MOST]
-    )
-    more = f"; and {len(outliers) - MOST} more" if len(outliers) > MOST else ""
-    return [f"{len(outliers)} single readings are outliers and were rejected: {some}{more}"]
+        for row in outliers
+    ]
+    some = listed(names, MOST, "; ")
+    return [f"{len(outliers)} single readings are outliers and were rejected: {some}"]

@@ -40,6 +40,7 @@ from tmlattice.effects.effect import (
     modelled,
     names,
     register,
+    with_labels,
 )
 from tmlattice.effects.priors import background_rms, rare
 from tmlattice.effects.radiation import expected_loss, expected_radiation, expected_spread
@@ -71,4 +72,5 @@ __all__ = [
     "rare",
     "register",
     "set_elements",
+    "with_labels",
 ]

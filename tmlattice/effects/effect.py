@@ -5,6 +5,7 @@ position), and on the launch (the beam starts differently). To add an effect, wr
 of them and `register` it: see docs/new_effect.md.
 """
 
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -50,6 +51,11 @@ class Cause:
     def __str__(self) -> str:
         place = f" {self.element}" if self.element else ""
         return f"{self.effect}{place} {self.amount:g}"
+
+
+def with_labels(text: str) -> str:
+    """Return a text with the labels of effects in place of their names."""
+    return re.sub(r"\w+", lambda m: CATALOGUE[m[0]].label if m[0] in CATALOGUE else m[0], text)
 
 
 class Effect(ABC):

@@ -21,6 +21,7 @@ from tmlattice.arrays import Array
 from tmlattice.errors import first_of
 from tmlattice.lattice.parts import Part
 from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring
+from tmlattice.speaks import listed
 
 _TURNS = ("quadrupole", "sextupole", "octupole")
 _NO_FIELD = ("drift", "monitor", "cavity", "hcorrector", "vcorrector")
@@ -55,7 +56,7 @@ def plain(ring: Ring, holds: Holds = lambda element: ()) -> tuple[Ring, tuple[st
             for what in lacks:
                 affected.setdefault(what, []).append(element.name)
     return ring.with_elements(changed), tuple(
-        w.replace("{}", _some(n)) for w, n in affected.items()
+        w.replace("{}", listed(n, NAMED)) for w, n in affected.items()
     )
 
 
@@ -169,11 +170,6 @@ def definitions(
 def _name(family: str, reserved: Collection[str]) -> str:
     name = re.sub(r"[^a-z0-9_.]", "_", family)
     return f"e_{name}" if name in reserved or not name[:1].isalpha() else name
-
-
-def _some(names: list[str]) -> str:
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]:

@@ -9,10 +9,10 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args
 
-from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.errors import LatticeError, first_of, unknown_name
 from tmlattice.late import Method
 from tmlattice.lattice.alike import Supplies, alike_by_design
-from tmlattice.speaks import Speaks, last_part, shown
+from tmlattice.speaks import Speaks, last_part
 
 Kind = Literal[
     "drift",
@@ -264,7 +264,7 @@ class Ring(Speaks):
             "magnets": str(len(self.magnets)),
             "monitors": str(len(self.monitors)),
             "correctors": str(correctors),
-            "changed": shown(self.changes),
+            "changed": first_of(list(self.changes), 3),
             "model": self.model,
         }
 

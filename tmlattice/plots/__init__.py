@@ -1,7 +1,7 @@
 """Figures. Every function takes `ax` (or makes one) and returns it; labels carry units."""
 
 from tmlattice.plots.optics import plot_betas, plot_phase_space
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import lattice_strip, save_figure
 from tmlattice.plots.tune_fit import (
     plot_loss,
     plot_orbit,
@@ -23,4 +23,5 @@ __all__ = [
     "plot_study",
     "plot_tune_fit_spectrum",
     "plot_weights",
+    "save_figure",
 ]

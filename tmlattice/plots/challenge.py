@@ -8,6 +8,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from tmlattice.plots.strip import GRID, save_figure
+
 LAST = ("ambiguous", "unknown", "none")
 
 
@@ -58,7 +60,7 @@ def plot_calibration(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:
                         color="0.35")  # fmt: skip
     ax.set(xlabel="stated probability", ylabel="share that is true", xlim=(-0.02, 1.02),
            ylim=(-0.02, 1.02))  # fmt: skip
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=GRID)
     ax.legend(fontsize="small", loc="lower right")
     return ax
 
@@ -80,7 +82,7 @@ def plot_detection(result: Mapping[str, Any], ax: Axes | None = None) -> Axes:
     ax.set_xticks([5, 10, 20, 50, 100], ["5", "10", "20", "50", "100"])
     ax.minorticks_off()
     ax.set(xlabel="signal to noise", ylabel="share detected", ylim=(-0.02, 1.04))
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=GRID)
     ax.legend(fontsize="small", loc="lower right")
     return ax
 
@@ -96,5 +98,4 @@ def save_challenge(result: Mapping[str, Any], folder: Path) -> None:
         if result.get(name):
             figure = plot(result).get_figure(root=True)
             assert figure is not None
-            figure.savefig(folder / f"{name}.png", dpi=150)
-            plt.close(figure)
+            save_figure(figure, folder / f"{name}.png")

@@ -18,12 +18,13 @@ from tmlattice.plots.readings import (
     AFTER,
     BEFORE,
     mark,
+    parts_along,
     plot_parts,
     plot_readings,
     readings_caption,
 )
 from tmlattice.plots.response import response_figures
-from tmlattice.plots.strip import above_strip, lattice_strip
+from tmlattice.plots.strip import GRID, above_strip, lattice_strip, legend_above
 from tmlattice.speaks import micrometres
 
 STYLES: Mapping[str, tuple[str, str]] = {
@@ -74,7 +75,7 @@ def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]
 def _of_readings(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     if not diagnosis.parts:
         yield "readings", readings_caption(diagnosis), plot_readings(diagnosis)
-    elif any(np.isfinite(part.left).any() for part in diagnosis.parts):
+    elif parts_along(diagnosis):
         yield (
             "readings",
             "Residual at each BPM in units of the noise, of each measurement, with the "
@@ -129,16 +130,14 @@ def plot_scan(diagnosis: Diagnosis) -> Figure:
     ax, side, strip = grid[0, 0], grid[0, 1], grid[1, 0]
     grid[1, 1].axis("off")
     found = diagnosis.explanation.first
+    ax.grid(alpha=GRID)
     _draw_scan(ax, diagnosis, 1.8)
     threshold = thresholds(diagnosis)[0]
     _whole_ring(side, diagnosis)
     ax.set_yscale("log")
     ax.set_ylim(FLOOR, 12 * max(float(found.statistic.max(initial=1.0)), threshold))
     _mark_findings(ax, diagnosis)
-    ax.legend(
-        loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
-        markerscale=3,
-    )  # fmt: skip
+    _scan_legend(ax, 3)
     lattice_strip(diagnosis.ring, strip)
     mark(strip, diagnosis)
     return figure
@@ -150,11 +149,9 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
     figure, (ax,) = above_strip(diagnosis.ring, (11, 5), [6], figure)
     low, high = around(diagnosis, finding)
     _draw_scan(ax, diagnosis, 4.0)
-    seen = [line.get_ydata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
-    places = [line.get_xdata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
-    values = np.concatenate([np.asarray(v, dtype=float) for v in seen])
-    inside = np.concatenate([np.asarray(x, dtype=float) for x in places])
-    top = np.nanmax(values[(inside >= low) & (inside <= high)], initial=FLOOR)
+    drawn = [line.get_xydata() for line in ax.lines if line.get_linestyle() not in ("--", ":")]
+    s, values = np.concatenate([np.asarray(points, dtype=float) for points in drawn]).T
+    top = np.nanmax(values[(s >= low) & (s <= high)], initial=FLOOR)
     ax.set_ylim(0, 1.2 * max(float(top), thresholds(diagnosis)[0]))
     ax.yaxis.set_major_formatter("{x:,.0f}")
     labelled = -np.inf
@@ -169,10 +166,7 @@ def plot_scan_near(diagnosis: Diagnosis, finding: Finding, figure: Figure | None
                 rotation=90, fontsize="x-small", color="0.35", va="bottom",
             )  # fmt: skip
     _mark_findings(ax, diagnosis, (low, high))
-    ax.legend(
-        loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
-        markerscale=1.3,
-    )  # fmt: skip
+    _scan_legend(ax, 1.3)
     mark(figure.axes[-1], diagnosis)
     ax.set_xlim(low, high)
     return figure
@@ -199,16 +193,12 @@ def thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
 
 def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     """Statistics at their places, a colour and a marker for each group, and both thresholds."""
-    found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
-    s = middles(diagnosis)
+    found, s = diagnosis.explanation.first, middles(diagnosis)
     groups = np.array([find(effect).group for effect, _ in found.hypotheses])
-    layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
-    order = np.argsort(layers)
-    if len(order):
-        ax.plot(
-            layers[order], np.maximum(free.statistic[order], FLOOR),
-            color="0.65", linewidth=0.9, zorder=1, label="a free kick in each shot",
-        )  # fmt: skip
+    layers, free = free_kicks(diagnosis)
+    if len(layers):
+        ax.plot(layers, free, color="0.65", linewidth=0.9, zorder=1,
+                label="a free kick in each shot")  # fmt: skip
     for name, (colour, marker) in STYLES.items():
         own = (groups == name) & np.isfinite(s) & (found.statistic > FLOOR)
         if own.any():
@@ -220,11 +210,23 @@ def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
     ax.axhline(
         named, color="k", linestyle="--", linewidth=1, zorder=3, label=f"threshold {named:.1f}"
     )
-    if len(order):
+    if len(layers):
         label = f"threshold of free kicks {kicks:.1f}"
         ax.axhline(kicks, color="0.5", linestyle=":", linewidth=1.2, label=label)
     ax.set_ylabel("Δχ²")
-    ax.grid(alpha=0.25)
+
+
+def _scan_legend(ax: Axes, scale: float) -> None:
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize="small", frameon=False,
+              markerscale=scale)  # fmt: skip
+
+
+def free_kicks(diagnosis: Diagnosis) -> tuple[Array, Array]:
+    """Places of free kicks along the ring, m, and their statistics as they are drawn."""
+    free = diagnosis.explanation.first_kicks
+    s = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
+    order = np.argsort(s)
+    return s[order], np.maximum(free.statistic[order], FLOOR)
 
 
 def middles(diagnosis: Diagnosis) -> Array:
@@ -249,7 +251,7 @@ def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
     if not best:
         side.axis("off")
         return
-    side.grid(alpha=0.25)
+    side.grid(alpha=GRID)
     side.axhline(thresholds(diagnosis)[0], color="k", linestyle="--", linewidth=1, zorder=3)
     for i, (effect, value) in enumerate(best.items()):
         colour, marker = STYLES[find(effect).group]
@@ -299,16 +301,10 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     rows = np.arange(len(rms))
     ax.barh(rows, rms, height=0.55, color=[BEFORE] + [AFTER] * (len(rms) - 1))
     for row, value in zip(rows, rms, strict=True):
-        ax.annotate(
-            micrometres(1e-6 * value).removesuffix(" µm"),
-            (value, row),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-        )
-    ax.axvline(
-        noise, color="k", linestyle="--", linewidth=1, label=f"noise {micrometres(1e-6 * noise)}"
-    )
+        ax.annotate(micrometres(1e-6 * value).removesuffix(" µm"), (value, row), xytext=(4, 0),
+                    textcoords="offset points", va="center")  # fmt: skip
+    label = f"noise {micrometres(1e-6 * noise)}"
+    ax.axvline(noise, color="k", linestyle="--", linewidth=1, label=label)
     ax.set_yticks(rows, ["\n".join(wrap(label, LABEL)) for label in gap_labels(diagnosis)])
     ax.set_ylim(max(len(rms), 2) - 0.4, -0.6)  # the design on top
     there = np.append(rms[np.isfinite(rms)], noise)  # a model may lose a beam
@@ -321,8 +317,8 @@ def plot_gap(diagnosis: Diagnosis, ax: Axes | None = None) -> Axes:
     title = f"Held-out shots {shots}" if shots else "Held-out readings"
     ax.set_xlabel("held-out readings less model, rms [µm]")
     ax.set_title(title, loc="left", fontsize="medium")
-    ax.legend(loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", frameon=False)
-    ax.grid(axis="x", alpha=0.25)
+    legend_above(ax, 1, fontsize="small")
+    ax.grid(axis="x", alpha=GRID)
     ax.set_axisbelow(True)
     return ax
 
@@ -384,6 +380,6 @@ def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
     rest = len(finding.credible_set) - len(members)
     if rest:
         ax.set_title(f"{rest} less probable ones not drawn", loc="right", fontsize="small")
-    ax.grid(axis="x", alpha=0.25)
+    ax.grid(axis="x", alpha=GRID)
     ax.set_axisbelow(True)
     return ax

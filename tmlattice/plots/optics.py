@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from tmlattice.lattice import Ring
 from tmlattice.optics import OffMomentum, Optics, Twiss
-from tmlattice.plots.strip import above_strip
+from tmlattice.plots.strip import GRID, above_strip
 
 
 def plot_betas(
@@ -30,7 +30,6 @@ def plot_betas(
         ax.plot(s, beta[:, plane], color=colour, linewidth=0.9, label=f"beta {name}")
     ax.set_ylabel("beta [m]")
     ax.set_ylim(bottom=0)
-    ax.grid(alpha=0.25)
     lines = ax.get_lines()
     if dispersion is not None:
         side = ax.twinx()
@@ -77,5 +76,5 @@ def plot_phase_space(
     name = "xy"[plane]
     ax.set_xlabel(f"{name} [mm]")
     ax.set_ylabel(f"p{name} [mrad]")
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=GRID)
     return ax

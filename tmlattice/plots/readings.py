@@ -1,5 +1,7 @@
 """Readings along the ring, and what models and corrections leave of them."""
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -8,9 +10,10 @@ from tmlattice.arrays import Array, Flags
 from tmlattice.correction.result import Correction
 from tmlattice.correction.targets import TARGETS
 from tmlattice.diagnosis.result import Diagnosis, Finding
+from tmlattice.diagnosis.views import PartView
 from tmlattice.effects import RingEffect, find
 from tmlattice.inference.newton import fit
-from tmlattice.plots.strip import above_strip, plain_log
+from tmlattice.plots.strip import above_strip, legend_above, plain_log, text_at_top
 
 BEFORE, AFTER = "C0", "C3"
 
@@ -64,6 +67,15 @@ def design_readings(diagnosis: Diagnosis) -> Array:
     return view.before if alone.point.lost else np.asarray(alone.point.view.readings)
 
 
+def models_of(diagnosis: Diagnosis) -> dict[str, tuple[Array, str]]:
+    """The readings of the shots of the fit that design and estimated ring predict, [shot, reading,
+    2], m, each with its colour."""
+    models = {diagnosis.starting_model: (design_readings(diagnosis), BEFORE)}
+    if diagnosis.verdict != "distributed":
+        models["with the findings"] = (diagnosis.trajectories.after, AFTER)
+    return models
+
+
 def worst_shot(diagnosis: Diagnosis, model: Array) -> int:
     """The shot of the fit with the largest residual of a model, [shot, reading, 2], m."""
     data = diagnosis.trajectories.data
@@ -77,51 +89,40 @@ def plot_readings(diagnosis: Diagnosis, shot: int | None = None) -> Figure:
     figure, grid = above_strip(diagnosis.ring, (11, 8.2), [3, 2, 3, 2])
     view = diagnosis.trajectories
     data = view.data
-    explained = diagnosis.verdict != "distributed"
-    models, before = [design_readings(diagnosis)], before_findings(diagnosis)
-    if explained:
-        models.append(view.after)
+    models, before = models_of(diagnosis), before_findings(diagnosis)
+    design = diagnosis.starting_model
     monitors = diagnosis.ring.monitors
     readings = np.where(data.valid, data.readings, np.nan)
-    shot = worst_shot(diagnosis, models[0]) if shot is None else shot
+    shot = worst_shot(diagnosis, models[design][0]) if shot is None else shot
     first = slice(0, len(monitors))
     s = np.array([monitor.s for monitor in monitors])
     read, dropped = readings[shot, first], view.dropped[shot, first]
-    names = (diagnosis.starting_model, "with the findings")
-    styles = ((BEFORE, "-"), (AFTER, "-"))
     for plane, name in enumerate("xy"):
         orbit, residual = grid[2 * plane], grid[2 * plane + 1]
         orbit.plot(s, 1e3 * read[:, plane], "k.", ms=3, label="read by the BPMs")
         sigma = 1e3 * diagnosis.noise[plane]
         residual.axhspan(-2 * sigma, 2 * sigma, color="0.88", zorder=0, label="noise, 2 rms")
         texts = []
-        for model, label, (colour, style) in zip(models, names, styles, strict=False):
+        for label, (model, colour) in models.items():
             predicted = model[shot, first, plane]
-            orbit.plot(s, 1e3 * predicted, style, color=colour, linewidth=0.9, label=label)
+            orbit.plot(s, 1e3 * predicted, color=colour, linewidth=0.9, label=label)
             left = np.where(dropped[:, plane], np.nan, read[:, plane] - predicted)
             residual.plot(s, 1e3 * left, color=colour, linewidth=0.9)
-            texts.append(_left_text(left, before if label == names[0] else None))
+            texts.append(_left_text(left, before if label == design else None))
         if dropped[:, plane].any():
             at = dropped[:, plane]
             orbit.plot(s[at], 1e3 * read[at, plane], "x", color="0.4", ms=5, label="rejected")
         orbit.set_ylabel(f"{name} [mm]")
         residual.set_ylabel(f"residual {name} [mm]")
         after = f"; with the findings {texts[1]}" if len(texts) > 1 else ""
-        residual.annotate(
-            f"rms in µm: {names[0]} {texts[0]}{after}; noise {1e3 * sigma:.1f} (grey: 2 rms)",
-            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
-        )  # fmt: skip
-        low, high = residual.get_ylim()
-        residual.set_ylim(low, high + 0.3 * (high - low))  # space for the text
+        text = f"rms in µm: {design} {texts[0]}{after}; noise {1e3 * sigma:.1f} (grey: 2 rms)"
+        text_at_top(residual, text, 0.3)
         for ax in (orbit, residual):
             mark(ax, diagnosis)
-            ax.grid(alpha=0.25)
-    grid[0].legend(
-        loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize="small", frameon=False
-    )
+    legend_above(grid[0], 4, fontsize="small")
     title = f"Shot {shot + 1} of {len(readings)} in the fit"
     if before is not None:
-        title += f"; {names[0]}: launch fitted to the {int(before.sum())} BPMs before the finding"
+        title += f"; {design}: launch fitted to the {int(before.sum())} BPMs before the finding"
     grid[0].set_title(title, loc="left", fontsize="medium")
     mark(figure.axes[-1], diagnosis)
     return figure
@@ -148,25 +149,35 @@ def mark(ax: Axes, diagnosis: Diagnosis) -> None:
             ax.axvline(finding.s, color="0.45", linestyle=":", linewidth=1.1, zorder=0.5)
 
 
+def parts_along(diagnosis: Diagnosis) -> list[tuple[PartView, Array]]:
+    """Measurements with readings at BPMs, these and the residuals as they are drawn along the ring,
+    and their s, m."""
+    found = []
+    for part in diagnosis.parts:
+        s = np.array([diagnosis.ring[name].s for name in part.monitors])
+        order = np.argsort(s)
+        monitors = tuple(part.monitors[i] for i in order)
+        if np.isfinite(part.left).any():
+            left = np.maximum(part.left[:, order], 1e-2)
+            found.append((replace(part, monitors=monitors, left=left), s[order]))
+    return found
+
+
 def plot_parts(diagnosis: Diagnosis) -> Figure:
     """Draw the rms residual at each BPM in units of the noise, a panel a measurement."""
-    shown = [part for part in diagnosis.parts if np.isfinite(part.left).any()]
+    shown = parts_along(diagnosis)
     count = len(shown)
     figure, axes = above_strip(diagnosis.ring, (11, 1.6 + 1.8 * count), [3.0] * count)
-    places = {monitor.name: monitor.s for monitor in diagnosis.ring.monitors}
-    for ax, part in zip(axes, shown, strict=True):
-        s = np.array([places[diagnosis.ring[name].name] for name in part.monitors])
-        order = np.argsort(s)
-        before, after = np.maximum(part.left[:, order], 1e-2)
-        ax.plot(s[order], before, ".-", color=BEFORE, lw=0.8, ms=4, label=diagnosis.starting_model)
-        ax.plot(s[order], after, ".-", color=AFTER, lw=0.8, ms=4, label="with the findings")
+    for ax, (part, s) in zip(axes, shown, strict=True):
+        before, after = part.left
+        ax.plot(s, before, ".-", color=BEFORE, lw=0.8, ms=4, label=diagnosis.starting_model)
+        ax.plot(s, after, ".-", color=AFTER, lw=0.8, ms=4, label="with the findings")
         ax.axhline(1.0, color="k", linestyle="--", linewidth=1)
         plain_log(ax.yaxis)
         ax.set_ylabel("residual / noise")
         ax.set_title(part.label, loc="left", fontsize="medium")
-        ax.grid(alpha=0.25)
         mark(ax, diagnosis)
-    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    legend_above(axes[0], 2)
     return figure
 
 
@@ -191,6 +202,5 @@ def plot_correction(correction: Correction) -> Figure:
             )  # fmt: skip
         ax.axhline(0.0, color="k", lw=0.7)
         ax.set_ylabel(f"{target.words} {'xy'[plane]} [{unit}]", fontsize="small")
-        ax.grid(alpha=0.25)
-    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    legend_above(axes[0], 2)
     return figure

@@ -9,10 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
+from tmlattice.effects import with_labels
 from tmlattice.lattice import Element
-from tmlattice.optics import twiss
-from tmlattice.plots.strip import above_strip, plain_log
+from tmlattice.optics import Twiss, twiss
+from tmlattice.plots.strip import GRID, above_strip, plain_log
 
 RESIDUALS = (
     ("heldout_rms_in_plane", "in-plane", "C0", "o"),
@@ -25,9 +27,9 @@ RESIDUALS = (
 
 def step_labels(result: Diagnosis) -> list[list[str]]:
     """What is fitted in each step, and in each reversed decision, in lines."""
-    steps = [result.starting_model, *(step.effect for step in result.steps[1:])]
+    steps = [result.starting_model, *(with_labels(step.effect) for step in result.steps[1:])]
     names = [*steps, *(own.reversed_decision for own in result.families)]
-    return [wrap(name.replace("monitor_", "BPM_").replace("_", " "), 44) for name in names]
+    return [wrap(name, 44) for name in names]
 
 
 def gradient_errors(result: Diagnosis) -> list[tuple[Element, float, float]]:
@@ -54,17 +56,13 @@ def response_figures(result: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
         "errors reversed; vertical lines: of the hierarchical fit.",
         cast(Figure, plot_steps(result).figure),
     )
-    if any(cause.effect == "quadrupole_gradient" for cause in result.causes):
+    if gradient_errors(result):
         yield (
             "gradients",
             "Gradient error of each quadrupole along the ring, with its posterior rms.",
             plot_gradients(result),
         )
-        yield (
-            "beta-beat",
-            "Beta of the result relative to the design's.",
-            plot_beta_beat(result),
-        )
+        yield ("beta-beat", "Beta of the result relative to the design's.", plot_beta_beat(result))
 
 
 def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
@@ -128,23 +126,22 @@ def plot_left(result: Diagnosis, figure: Figure | None = None) -> Figure:
 def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
     """Held-out rms of each step, and with the decision on each family reversed; thin lines: of the
     fit with the decisions as they are."""
-    steps = (*result.steps, *result.families)
+    labels = step_labels(result)
     if ax is None:
-        ax = plt.subplots(figsize=(9, 1.5 + 0.25 * len(steps)), layout="constrained")[1]
+        ax = plt.subplots(figsize=(9, 1.5 + 0.25 * len(labels)), layout="constrained")[1]
     for name, label, colour, marker in RESIDUALS:
-        values = [1e6 * getattr(step, name) for step in steps]
-        ax.plot(values, np.arange(len(steps)), marker, color=colour, ms=5, label=label)
+        values = [1e6 * getattr(step, name) for step in (*result.steps, *result.families)]
+        ax.plot(values, range(len(values)), marker, color=colour, ms=5, label=label)
         if result.families:
-            fit = result.steps[min(1, len(result.steps) - 1)]
-            ax.axvline(1e6 * getattr(fit, name), color=colour, linewidth=0.5)
+            ax.axvline(values[min(1, len(result.steps) - 1)], color=colour, linewidth=0.5)
     sigma = 1e6 * result.gap["noise"]
     ax.axvline(sigma, color="0.5", linestyle=":", label="noise of a reading")
     plain_log(ax.xaxis)
     ax.set_xlabel("held-out rms [µm]")
-    ax.set_yticks(range(len(steps)), ["\n".join(own) for own in step_labels(result)], fontsize=7)
+    ax.set_yticks(range(len(labels)), ["\n".join(lines) for lines in labels], fontsize=7)
     ax.axhline(len(result.steps) - 0.5, color="0.4", linewidth=0.8)
     ax.invert_yaxis()
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=GRID)
     ax.legend(frameon=False, fontsize=8)
     return ax
 
@@ -163,18 +160,23 @@ def plot_gradients(result: Diagnosis, figure: Figure | None = None) -> Figure:
                         textcoords="offset points", fontsize="small")  # fmt: skip
     ax.axhline(0, color="0.4", linewidth=0.5)
     ax.set_ylabel("gradient error [%]")
-    ax.grid(alpha=0.25)
     return figure
+
+
+def beta_beats(result: Diagnosis) -> tuple[Twiss, Array, Array]:
+    """The design's optics, and beta of the estimated ring relative to the design's: s, m, and
+    beating in per cent, [place, 2]."""
+    design = twiss(result.ring)
+    (s, before), (_, after) = design.along(), twiss(result.corrected).along()
+    return design, s, 100 * (after / before - 1)
 
 
 def plot_beta_beat(result: Diagnosis) -> Figure:
     """Beta of the result relative to the design, above the lattice."""
     figure, (ax,) = above_strip(result.ring, (11, 4), [5])
-    (s, before), (_, after) = (twiss(r).along() for r in (result.ring, result.corrected))
+    _, s, beats = beta_beats(result)
     for plane, colour in enumerate(("C0", "C3")):
-        beat = 100 * (after[:, plane] / before[:, plane] - 1)
-        ax.plot(s, beat, color=colour, linewidth=0.8, label="xy"[plane])
+        ax.plot(s, beats[:, plane], color=colour, linewidth=0.8, label="xy"[plane])
     ax.set_ylabel(f"beta / {result.starting_model} - 1 [%]")
-    ax.grid(alpha=0.25)
     ax.legend(frameon=False)
     return figure

@@ -24,7 +24,7 @@ from tmlattice.measurement import (
 from tmlattice.optics import twiss
 from tmlattice.plots.diagnosis import figures
 from tmlattice.plots.optics import plot_betas
-from tmlattice.plots.strip import lattice_strip
+from tmlattice.plots.strip import GRID, above_strip, legend_above
 
 MOST = 8
 """Shots that are drawn."""
@@ -70,14 +70,13 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
     known = None if ring is None else load_ring(ring)
     if isinstance(measured, TuneReading):
         return _tunes(measured, known)
-    heights = [3, 3, 0.8] if known is not None else [3, 3]
-    figure, axes = plt.subplots(
-        len(heights), 1, figsize=(11, 6), sharex=True, height_ratios=heights, layout="constrained"
-    )
-    s = np.arange(len(measured.monitors), dtype=float)
-    if known is not None:
+    if known is None:
+        figure, axes = plt.subplots(2, 1, figsize=(11, 6), sharex=True, layout="constrained")
+        s = np.arange(len(measured.monitors), dtype=float)
+        axes[1].set_xlabel("BPM")
+    else:
+        figure, axes = above_strip(known, (11, 6), [3, 3])
         s = np.array([known[name].s for name in measured.monitors])
-        lattice_strip(known, axes[2])
     order = np.argsort(s)
     for label, values in _lines(measured):
         for plane in range(2):
@@ -86,13 +85,9 @@ def plot_measurement(measured: Any, ring: Ring | str | PathLike[str] | None = No
             )
     for plane in range(2):
         axes[plane].set_ylabel(f"{'xy'[plane]} [mm]")
-        axes[plane].grid(alpha=0.25)
-    if known is None:
-        axes[1].set_xlabel("BPM")
+        axes[plane].grid(alpha=GRID)
     if len(axes[0].lines) <= MOST:
-        axes[0].legend(
-            fontsize="small", ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False
-        )
+        legend_above(axes[0], 4, fontsize="small")
     axes[0].set_title(in_words(measured), loc="left", fontsize="medium")
     return figure
 
@@ -138,7 +133,7 @@ def _tunes(measured: TuneReading, ring: Ring | None) -> Figure:
                 ax.legend(fontsize="small")
             ax.set_ylabel(name.format("xy"[plane]))
             ax.ticklabel_format(axis="y", useOffset=False)
-            ax.grid(alpha=0.25)
+            ax.grid(alpha=GRID)
         axes[1, column].set_xlabel("shot")
         if len(shots) <= MOST:
             axes[1, column].set_xticks(shots, [str(shot) for shot in measured.shots])

@@ -1,6 +1,8 @@
 """The lattice strip under anything that is plotted against s."""
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
@@ -21,6 +23,8 @@ COLOURS = {
 }
 
 
+GRID = 0.25
+"""Opacity of a grid."""
 METHOD_COLOURS = {"adam": "C3", "sparse": "C2", "map": "C1"}
 """Colours of the methods of a fit, in every figure."""
 
@@ -28,12 +32,32 @@ METHOD_COLOURS = {"adam": "C3", "sparse": "C2", "map": "C1"}
 def above_strip(
     ring: Ring, size: tuple[float, float], heights: Sequence[float], figure: Figure | None = None
 ) -> tuple[Figure, list[Axes]]:
-    """Panels of these heights with the lattice below, in an empty figure or in a new one of this
-    size: the figure, and the panels."""
+    """Panels of these heights with a grid and the lattice below, in an empty figure or in a new one
+    of this size: the figure, and the panels."""
     figure = plt.figure(figsize=size, layout="constrained") if figure is None else figure
     *axes, strip = figure.subplots(len(heights) + 1, 1, sharex=True, height_ratios=[*heights, 0.8])
     lattice_strip(ring, strip)
+    for ax in axes:
+        ax.grid(alpha=GRID)
     return figure, axes
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, and close it."""
+    figure.savefig(path, dpi=150, format="png")
+    plt.close(figure)
+
+
+def text_at_top(ax: Axes, text: str, room: float) -> None:
+    """A text in the upper left corner, the limits raised by this share of their span for it."""
+    ax.annotate(text, (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small")
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + room * (high - low))
+
+
+def legend_above(ax: Axes, columns: int, **look: Any) -> None:
+    """A legend without a frame above an axes, at its right."""
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, frameon=False, **look)
 
 
 def lattice_strip(ring: Ring, ax: Axes) -> Axes:

@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from tmlattice.plots.strip import GRID, above_strip
+
 if TYPE_CHECKING:
     from tmlattice.lattice.ring import Ring
     from tmlattice.systems.cavitation import CavitationStudy
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 def _finish(ax: Axes, x: str, y: str, title: str = "", legend: str | None = "best") -> None:
     ax.set_xlabel(x)
     ax.set_ylabel(y)
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=GRID)
     if title:
         ax.set_title(title, fontsize="medium")
     if legend:
@@ -119,8 +121,6 @@ def plot_pendulum(done: "PendulumStudy") -> Figure:
 
 def plot_magnets(done: "MagnetStudy", ring: "Ring") -> Figure:
     """What third order adds to the first turn, along the ring."""
-    from tmlattice.plots.strip import above_strip
-
     figure, axes = above_strip(ring, (11, 7), [3, 3])
     for plane, name in enumerate("xy"):
         for i, turn in reversed(list(enumerate(done.turns))):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from tmlattice.harmonics import levelled, normalised
 from tmlattice.optics import Optics, one_turn_optics
-from tmlattice.plots.strip import METHOD_COLOURS, above_strip
+from tmlattice.plots.strip import GRID, METHOD_COLOURS, above_strip, legend_above, text_at_top
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,19 +57,11 @@ def plot_orbit_fit(outcome: "TuneFit") -> Figure:
                 rms.append(f"{what} {1e6 * np.sqrt(np.nanmean(left**2)):.1f} µm")
             residual.plot(outcome.s, 1e3 * left, color=colour, linewidth=0.8)
         residual.set_ylabel(f"residual {name} [mm]")
-        residual.annotate(
-            f"rms {', '.join(rms) or '-'}{noise}",
-            (0.01, 0.95), xycoords="axes fraction", va="top", fontsize="small",
-        )  # fmt: skip
-        low, high = residual.get_ylim()
-        residual.set_ylim(low, high + 0.25 * (high - low))  # space for the text
+        text_at_top(residual, f"rms {', '.join(rms) or '-'}{noise}", 0.25)
         for ax in (orbit, residual):
             if magnet is not None:
                 ax.axvline(magnet.s, color="0.6", linestyle=":", linewidth=1)
-            ax.grid(alpha=0.25)
-    grid[0].legend(
-        loc="lower right", bbox_to_anchor=(1, 1), ncols=5, fontsize="small", frameon=False
-    )
+    legend_above(grid[0], 5, fontsize="small")
     title = f"First turn of {outcome.source or 'a measurement'}"
     if magnet is not None and outcome.change is not None:
         title = (
@@ -107,7 +99,7 @@ def plot_loss(
     ax.axvline(fit.best_epoch, color="0.6", linestyle=":", label="weights kept from here")
     ax.set_xlabel("epoch")
     ax.set_ylabel("loss [m²]")
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=GRID)
     ax.legend(fontsize="small", loc="center right")
     return ax
 
@@ -137,7 +129,7 @@ def plot_spectrum(
     ax.set_xlim(0, 1)
     ax.set_ylabel(f"{'xy'[plane]}: amplitude [of the strongest line]")
     ax.set_xlabel("fractional tune")
-    ax.grid(alpha=0.25)
+    ax.grid(alpha=GRID)
     return ax
 
 
@@ -194,7 +186,6 @@ def plot_study(ring: "Ring", cases: "Sequence[Case]", figure: Figure | None = No
                     transform=ax.get_xaxis_transform(), label="no tune")  # fmt: skip
         ax.set_yscale("log")
         ax.set_ylabel(f"|dQ{name}|")
-        ax.grid(alpha=0.25)
         ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=5, fontsize="small")
     figure.suptitle("Tune error after fine-tuning, by the place of the changed magnet")
     return figure

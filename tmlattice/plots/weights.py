@@ -57,7 +57,6 @@ def plot_weights(reading: "WeightReading", mark: str | None = None) -> Figure:
     for ax in (raw, score, size, share):
         if mark is not None:
             ax.axvline(ring[mark].s, color="0.4", linestyle=":", linewidth=1, zorder=0)
-        ax.grid(alpha=0.25)
     dotted = "" if mark is None else f" (dotted: {mark}, s = {ring[mark].s:.1f} m)"
     raw.set_title(f"Weights after fine-tuning, layer by layer{dotted}")
     return figure

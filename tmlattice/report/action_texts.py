@@ -11,6 +11,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.lattice import Ring
 from tmlattice.report.amounts import amount_text, probability_text, words
+from tmlattice.speaks import listed
 
 _KINDS = {
     "monitor": "BPM",
@@ -24,33 +25,31 @@ SETTLED = Beam((1e-5, 1e-5), (1e-4, 1e-4), (1e-4, 1e-4), (1e-5, 1e-5), (1e-7, 1e
 """Changes of the beam below which it is as designed."""
 
 
-def subject(recommended_action: RecommendedAction) -> str:
+def subject(action: RecommendedAction) -> str:
     """The element, its family and its device: "quadrupole qd::12"."""
-    if recommended_action.element is None or recommended_action.kind is None:
+    if action.element is None or action.kind is None:
         return "the beam"
-    kind = _KINDS.get(recommended_action.kind, recommended_action.kind)
-    family = " family" if recommended_action.effect.startswith("family") else ""
-    others = [name for name in recommended_action.pieces if name != recommended_action.element]
+    kind = _KINDS.get(action.kind, action.kind)
+    family = " family" if action.effect.startswith("family") else ""
+    others = [name for name in action.pieces if name != action.element]
     magnet = f" (one magnet with {', '.join(others)})" if others else ""
-    device = f" [{recommended_action.device}]" if recommended_action.device else ""
-    return f"{kind}{family} {recommended_action.element}{device}{magnet}"
+    device = f" [{action.device}]" if action.device else ""
+    return f"{kind}{family} {action.element}{device}{magnet}"
 
 
-def action_text(recommended_action: RecommendedAction) -> str:
+def action_text(action: RecommendedAction) -> str:
     """The finding in a line: element, quantity, amount."""
-    effect = find(recommended_action.effect)
-    amount = amount_text(
-        recommended_action.effect, recommended_action.amount, recommended_action.amount_sigma
-    )
+    effect = find(action.effect)
+    amount = amount_text(action.effect, action.amount, action.amount_sigma)
     if effect.discrete and amount:
         what = amount  # "no signal"
     else:
         what = f"{effect.quantity or effect.words} {amount}".rstrip()
     strength = ""
-    if recommended_action.strength is not None:
-        own = recommended_action.strength
+    if action.strength is not None:
+        own = action.strength
         strength = f" ({own.name} {own.before:.4g} -> {own.after:.4g} {own.unit})"
-    return f"{subject(recommended_action)}, {what}{strength}"
+    return f"{subject(action)}, {what}{strength}"
 
 
 def title(finding: Finding) -> str:
@@ -64,11 +63,9 @@ LIKELY = 0.01
 """Share of an action's probability above which a mechanism is reported."""
 
 
-def mechanism_text(recommended_action: RecommendedAction) -> str:
+def mechanism_text(action: RecommendedAction) -> str:
     """The mechanisms that share an action, with their probabilities."""
-    likely = [
-        m for m in recommended_action.mechanisms if m[1] >= LIKELY * recommended_action.probability
-    ]
+    likely = [m for m in action.mechanisms if m[1] >= LIKELY * action.probability]
     if len(likely) == 1:
         effect = likely[0][0]
         return f"{words(effect)} ({effect}: {find(effect).sign})"
@@ -102,8 +99,7 @@ def by_hand_text(ring: Ring, causes: Sequence[Cause]) -> str:
         return ""
     parts = []
     for recommended_action, places in todo.items():
-        more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
-        parts.append(recommended_action.replace("{}", ", ".join(places[:NAMED]) + more))
+        parts.append(recommended_action.replace("{}", listed(places, NAMED)))
     return f"no setting in it corrects the rest: {'; '.join(parts)}"
 
 

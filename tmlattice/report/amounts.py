@@ -39,8 +39,13 @@ def amount_text(effect: str, amount: float, sigma: float | None = None) -> str:
     if sigma is None or not 0 < sigma < np.inf:
         return f"{value:.3g} {unit}"
     error = factor * sigma
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
+    digits = digits_of(error)
     return f"{value:+.{digits}f} ± {error:.{digits}f} {unit}"
+
+
+def digits_of(error: float) -> int:
+    """Decimals that show an error with two significant digits."""
+    return int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
 
 
 def least_text(effect: str, amount: float) -> str:

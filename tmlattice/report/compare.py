@@ -26,7 +26,7 @@ from tmlattice.measurement import OrbitResponse, in_words
 from tmlattice.measurement.header import FORMAT as MEASUREMENT
 from tmlattice.optics import twiss
 from tmlattice.report.text import WIDTH, columns, verdict_sentence, wrapped
-from tmlattice.speaks import Speaks
+from tmlattice.speaks import Speaks, listed
 
 _UNITS = {
     "s": "m", "length": "m", "k1": "1/m2", "k2": "1/m3", "angle": "rad", "tilt": "rad",
@@ -249,8 +249,7 @@ def _lattices(one: Ring, other: Ring) -> Found:
     for which, own, against in (("first", here, there), ("second", there, here)):
         alone = [name for name in own if name not in against and own[name].kind != "drift"]
         if alone:
-            shown = ", ".join(alone[:8]) + (f" and {len(alone) - 8} more" if alone[8:] else "")
-            notes.append(f"only in the {which}: {shown}")
+            notes.append(f"only in the {which}: {listed(alone, 8)}")
     return rows, notes
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike
 
+from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import PartView
 from tmlattice.effects import find
@@ -26,14 +27,15 @@ from tmlattice.plots.diagnosis import (
     STYLES,
     around,
     clearest,
+    free_kicks,
     gap_labels,
     middles,
     noise_rms,
     over_decades,
     thresholds,
 )
-from tmlattice.plots.readings import AFTER, BEFORE, design_readings, worst_shot
-from tmlattice.plots.response import RESIDUALS, gradient_errors, step_labels
+from tmlattice.plots.readings import AFTER, BEFORE, models_of, parts_along, worst_shot
+from tmlattice.plots.response import RESIDUALS, beta_beats, gradient_errors, step_labels
 from tmlattice.report.amounts import amount_text, words
 from tmlattice.speaks import micrometres
 
@@ -59,16 +61,17 @@ def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
             made["gap"] = gap(diagnosis)
         return made
     made["steps"] = steps(diagnosis)
-    if any(cause.effect == "quadrupole_gradient" for cause in diagnosis.causes):
+    if gradient_errors(diagnosis):
         made |= {"gradients": gradients(diagnosis), "beta-beat": beta_beat(diagnosis)}
     return made
 
 
 def _of_readings(diagnosis: Diagnosis) -> dict[str, Figure]:
-    left = [part for part in diagnosis.parts if np.isfinite(part.left).any()]
     made = {"scan": scan(diagnosis)}
-    if left or not diagnosis.parts:
-        made["readings"] = parts(diagnosis, left) if left else readings(diagnosis)
+    if not diagnosis.parts:
+        made["readings"] = readings(diagnosis)
+    elif shown := parts_along(diagnosis):
+        made["readings"] = parts(diagnosis, shown)
     first = clearest(diagnosis)
     if first is not None:
         made["scan-near"] = scan(diagnosis, around(diagnosis, first))
@@ -245,14 +248,10 @@ def _s_text(s: float | None, where: tuple[float, float] | None) -> str:
 # --- trajectories ---------------------------------------------------------------------------------
 def readings(diagnosis: Diagnosis) -> Figure:
     """Residuals of each model, for the shot that the design explains worst, by BPM."""
-    view = diagnosis.trajectories
-    data = view.data
+    data, models = diagnosis.trajectories.data, models_of(diagnosis)
     monitors = diagnosis.ring.monitors
     first = slice(0, len(monitors))
     read = np.where(data.valid, data.readings, np.nan)
-    models = {diagnosis.starting_model: (design_readings(diagnosis), BEFORE)}
-    if diagnosis.verdict != "distributed":
-        models["with the findings"] = (view.after, AFTER)
     shot = worst_shot(diagnosis, models[diagnosis.starting_model][0])
     s, names = zip(*((monitor.s, monitor.name) for monitor in monitors), strict=True)
     traces = []
@@ -272,21 +271,16 @@ def readings(diagnosis: Diagnosis) -> Figure:
     return {"data": traces, "layout": layout, "strip": "y3"}
 
 
-def parts(diagnosis: Diagnosis, shown: Sequence[PartView]) -> Figure:
+def parts(diagnosis: Diagnosis, shown: Sequence[tuple[PartView, Array]]) -> Figure:
     """Residuals of each measurement at each BPM in units of the noise, before and after."""
-    places = {monitor.name: monitor.s for monitor in diagnosis.ring.monitors}
     height = 0.9 / len(shown)
     traces, axes = [], {}
-    for k, part in enumerate(shown):
+    for k, (part, s) in enumerate(shown):
         axis = "y" if k == 0 else f"y{k + 1}"
-        s = np.array([places[diagnosis.ring[name].name] for name in part.monitors])
-        order = np.argsort(s)
-        names = [part.monitors[i] for i in order]
-        for model, colour, left in zip(
-            (diagnosis.starting_model, "with the findings"), (BEFORE, AFTER), part.left, strict=True
-        ):
+        names = (diagnosis.starting_model, "with the findings")
+        for model, colour, left in zip(names, (BEFORE, AFTER), part.left, strict=True):
             traces.append(
-                _trace(s[order], np.maximum(left[order], 1e-2), model, colour, text=names,
+                _trace(s, left, model, colour, text=part.monitors,
                        hover=f"<br>{as_plain(part.label)}, {as_plain(model)}<br>"
                        "%{y:.3g} times the noise",
                        showlegend=not k, legendgroup=model, yaxis=axis)
@@ -313,17 +307,14 @@ def _amount(effect: str, power_of_it: float) -> str:
 def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figure:
     """The gain in chi-square of each hypothesis alone, before any finding (span: from and to which
     s, m: then linear, to separate neighbours)."""
-    found, free = diagnosis.explanation.first, diagnosis.explanation.first_kicks
-    s = middles(diagnosis)
+    found, s = diagnosis.explanation.first, middles(diagnosis)
     low, high = span or (0.0, diagnosis.ring.length)
     drawn = np.flatnonzero((s >= low) & (s <= high) & (found.statistic > FLOOR))
     drawn = drawn[np.argsort(-found.statistic[drawn])][:MOST]
-    layers = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
-    order = np.argsort(layers)
-    order = order[(layers[order] >= low) & (layers[order] <= high)]
+    layers, kicks = free_kicks(diagnosis)
+    inside = (layers >= low) & (layers <= high)
     order_of = {group: k for k, group in enumerate(STYLES)}
-    kicks = np.maximum(free.statistic[order], FLOOR)
-    traces = [_trace(layers[order], kicks, "a free kick in each shot", "@faint")]
+    traces = [_trace(layers[inside], kicks[inside], "a free kick in each shot", "@faint")]
     by_effect: dict[str, list[int]] = {}
     for i in drawn:
         by_effect.setdefault(found.hypotheses[i][0], []).append(int(i))
@@ -344,7 +335,7 @@ def scan(diagnosis: Diagnosis, span: tuple[float, float] | None = None) -> Figur
     traces.append(_trace(ends, [named] * 2, f"threshold {named:.1f}", "@ink", dash="dash"))
     text = f"threshold of free kicks {of_kicks:.1f}"
     traces.append(_trace(ends, [of_kicks] * 2, text, "@faint", dash="dot"))
-    if not len(order):
+    if not inside.any():
         del traces[0], traces[-1]
     layout = _layout(
         480, xaxis=_axis("s [m]", anchor="y2"), shapes=_marks(diagnosis),
@@ -392,26 +383,25 @@ _ONE_TWO_FIVE = [float(f"{m}e{e}") for e in range(-3, 6) for m in (1, 2, 5)]
 
 def steps(diagnosis: Diagnosis) -> Figure:
     """Held-out rms of each step, and with the decision on each family reversed."""
-    shown = (*diagnosis.steps, *diagnosis.families)
-    at = list(range(len(shown)))
     names = ["\n".join(lines) for lines in step_labels(diagnosis)]
+    at = list(range(len(names)))
     traces = []
     for name, label, colour, marker in RESIDUALS:
-        values = [1e6 * getattr(step, name) for step in shown]
+        values = [1e6 * getattr(step, name) for step in (*diagnosis.steps, *diagnosis.families)]
         traces.append(
             _trace(values, at, label, colour, mode="markers", size=7, marker=marker,
                    text=names, hover=f"<br>{label} %{{x:.3g}} µm")
         )  # fmt: skip
         if diagnosis.families:
             fit = values[min(1, len(diagnosis.steps) - 1)]
-            traces.append(_trace([fit, fit], [0, len(shown) - 1], label, colour, size=0.5,
+            traces.append(_trace([fit, fit], [0, len(names) - 1], label, colour, size=0.5,
                                  showlegend=False))  # fmt: skip
     noise = 1e6 * diagnosis.gap["noise"]
     traces.append(
-        _trace([noise, noise], [0, len(shown) - 1], f"noise {noise:.2g} µm", "@faint", dash="dot")
+        _trace([noise, noise], [0, len(names) - 1], f"noise {noise:.2g} µm", "@faint", dash="dot")
     )
     layout = _layout(
-        160 + 24 * len(shown),
+        160 + 24 * len(names),
         xaxis=_axis("held-out rms [µm]", type="log", tickvals=_ONE_TWO_FIVE),
         yaxis={"tickvals": at, "ticktext": [as_plain(name) for name in names],
                "automargin": True, "zeroline": False, "autorange": "reversed"},
@@ -431,17 +421,13 @@ def gradients(diagnosis: Diagnosis) -> Figure:
 
 def beta_beat(diagnosis: Diagnosis) -> Figure:
     """Beta of the estimated ring relative to the design's, along the ring."""
-    from tmlattice.optics import twiss
-
-    design = twiss(diagnosis.ring)
-    (s, before), (_, after) = design.along(), twiss(diagnosis.corrected).along()
+    design, s, beats = beta_beats(diagnosis)
     ends = [*design.name, "end"]
     names = [ends[i] for i in np.searchsorted(design.s, s - 1e-9)]
     traces = []
     for plane, colour in enumerate(("C0", "C3")):
-        beat = 100 * (after[:, plane] / before[:, plane] - 1)
         name = "xy"[plane]
-        traces.append(_trace(s, beat, name, colour, text=names,
+        traces.append(_trace(s, beats[:, plane], name, colour, text=names,
                              hover=f"<br>s = %{{x:.2f}} m<br>{name}: %{{y:+.3f}} %"))  # fmt: skip
     return _above_strip(diagnosis, traces, f"beta / {diagnosis.starting_model} - 1 [%]")
 

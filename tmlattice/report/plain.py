@@ -10,12 +10,7 @@ from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.effects import CATALOGUE
 from tmlattice.report.action_texts import next_text
 from tmlattice.report.response_text import steps_text
-from tmlattice.report.tables import (
-    LARGE_TITLE,
-    large_text,
-    number_rows,
-    optics_rows,
-)
+from tmlattice.report.tables import LARGE_TITLE, large_text, number_rows, optics_rows
 from tmlattice.report.text import (
     CORRELATED,
     SUSPECTS,
@@ -46,11 +41,14 @@ def report_text(diagnosis: Diagnosis, width: int = WIDTH, most: int | None = Non
     kept, left = set(range(len(parts))), []
     if most is not None:
         room = most - 3  # the line on what is left out, wrapped
+        all_findings = True
         for i in sorted(kept, key=lambda i: (parts[i].rank, i)):
-            room -= len(parts[i].lines) + 1
-            if room < 0 and parts[i].rank:
+            finding, need = parts[i].name.startswith("finding"), len(parts[i].lines) + 1
+            if parts[i].rank and (need > room or (finding and not all_findings)):
                 kept.discard(i)
-                room += len(parts[i].lines) + 1
+                all_findings &= not finding  # none without those before it
+            else:
+                room -= need
         left = list(dict.fromkeys(p.name for i, p in enumerate(parts) if i not in kept))
     lines = [line for i in sorted(kept) for line in ("", *parts[i].lines)][1:]
     if left:

@@ -9,9 +9,10 @@ from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import numbers
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, with_labels
 from tmlattice.report.amounts import all_of, amount_text, degenerate_text, labelled, words
 from tmlattice.report.text import columns, wrapped
+from tmlattice.speaks import listed
 
 SHOWN = 8
 """Largest errors of each effect that are listed."""
@@ -22,7 +23,8 @@ PULLS = 4
 def step_rows(steps: Iterable[Step], model: str = "") -> list[tuple[str, ...]]:
     """Head and rows of the table of steps: what is fitted (first the model alone), parameters,
     held-out rms in µm."""
-    rows = [((model if s.effect == "design" else "") or s.effect, *_scores(s)) for s in steps]
+    rows = [(model if model and s.effect == "design" else with_labels(s.effect), *_scores(s))
+            for s in steps]  # fmt: skip
     return [("fitted", *SCORES), *rows]
 
 
@@ -110,13 +112,8 @@ def undetermined(result: Diagnosis, effect: str) -> str:
         if not (own := supports[places[0].element]).determined:
             name = all_of([place.element for place in places], result.devices)
             by_reason.setdefault(degenerate_text(effect, own), []).append(name)
-    said = [
-        f"{', '.join(names[:SHOWN])}{f' and {len(names) - SHOWN} more' * (len(names) > SHOWN)} "
-        f"({reason})"
-        for reason, names in by_reason.items()
-    ]
-    more = f"; and {len(said) - SHOWN} more" if len(said) > SHOWN else ""
-    return f"{NOT_DETERMINED}: {'; '.join(said[:SHOWN])}{more}" if said else ""
+    said = [f"{listed(names, SHOWN)} ({reason})" for reason, names in by_reason.items()]
+    return f"{NOT_DETERMINED}: {listed(said, SHOWN, '; ')}" if said else ""
 
 
 NOT_DETERMINED = "not determined by the data"

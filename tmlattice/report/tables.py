@@ -15,8 +15,9 @@ from tmlattice.diagnosis.support import FREE, Support
 from tmlattice.effects import Cause, RingEffect, find
 from tmlattice.measurement.assume import ASSUMPTIONS
 from tmlattice.report.action_texts import SETTLED
-from tmlattice.report.amounts import degenerate_text, labelled, scaled, words
+from tmlattice.report.amounts import degenerate_text, digits_of, labelled, scaled, words
 from tmlattice.report.text import times_usual
+from tmlattice.speaks import listed
 
 TITLES = {"monitors": "BPMs", "correctors": "Correctors"}
 """Titles by the group of an effect; all other elements are magnets."""
@@ -82,7 +83,7 @@ def _table(diagnosis: Diagnosis, title: str, supported: Sequence[Supported]) -> 
                 continue
             factor, _ = units[effect]
             amount, sigma, support = known[name, effect]
-            digits = 4 if not 0 < factor * sigma < np.inf else _digits(factor * sigma)
+            digits = 4 if not 0 < factor * sigma < np.inf else digits_of(factor * sigma)
             if not support.determined:
                 amount = np.nan
                 open_.append(f"{find(effect).label}: {degenerate_text(effect, support)}")
@@ -93,11 +94,6 @@ def _table(diagnosis: Diagnosis, title: str, supported: Sequence[Supported]) -> 
     for effect in effects:
         head += [f"{find(effect).label} [{units[effect][1]}]", "error", "from the data [%]"]
     return Table(title, (*head, "not determined by the data"), tuple(rows))
-
-
-def _digits(error: float) -> int:
-    """Digits that show an error with two significant digits."""
-    return int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
 
 
 def _number(value: float, digits: int) -> str:
@@ -153,7 +149,7 @@ def number_rows(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
             name = f"Q{plane}" if kind == "tune" else f"chromaticity {plane}"
             name += f", shot {number.shot + 1}" if several else ""
             name = f"{part.label}: {name}" if len(with_numbers) > 1 else name
-            digits = _digits(number.error)
+            digits = digits_of(number.error)
             read, *models, error = (
                 f"{value:.{digits}f}"
                 for value in (number.read, number.before, number.after, number.error)
@@ -201,8 +197,7 @@ def notes(diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> Iterator[tuple
             + ("" if row.get("shot") is None else f" (shot {row['shot']}, turn {row['turn']})")
             for row in diagnosis.outliers
         ]
-        more = f" and {len(places) - MOST} more" if len(places) > MOST else ""
-        yield "outliers", ", ".join(places[:MOST]) + more
+        yield "outliers", listed(places, MOST)
     for name in diagnosis.provenance["options"].get("assume", ()):
         yield "assumed of the data", f"{name}: {ASSUMPTIONS[name].words}"
     for said in provenance.get("assumed_of_files", ()):

@@ -128,23 +128,19 @@ def _errors_in_steps(diagnosis: Diagnosis) -> bool:
 def steps_sentence(diagnosis: Diagnosis) -> str:
     """The residuals before and after all steps."""
     first, last = diagnosis.steps[0], diagnosis.steps[-1]
+    falls = [
+        f", {what} from {micrometres(getattr(first, name))} to {micrometres(getattr(last, name))}"
+        for what, name in (
+            ("that of held-out ones", "heldout_rms_in_plane"),
+            ("in the other plane", "heldout_rms_coupling"),
+            ("of the RF's response", "dispersion_rms"),
+        )
+        if name == "heldout_rms_in_plane" or np.isfinite(getattr(last, name))
+    ]
     return (
         "Distributed errors of the ring or of correctors: the rms residual of fitted correctors "
         f"falls from {micrometres(diagnosis.fit_before.rms)} to "
-        f"{micrometres(diagnosis.fit_after.rms)}, that of held-out ones from "
-        f"{micrometres(first.heldout_rms_in_plane)} to {micrometres(last.heldout_rms_in_plane)}"
-        + (
-            f", in the other plane from {micrometres(first.heldout_rms_coupling)} to "
-            f"{micrometres(last.heldout_rms_coupling)}"
-            if np.isfinite(last.heldout_rms_coupling)
-            else ""
-        )
-        + (
-            ", of the RF's response from "
-            f"{micrometres(first.dispersion_rms)} to {micrometres(last.dispersion_rms)}."
-            if np.isfinite(last.dispersion_rms)
-            else "."
-        )
+        f"{micrometres(diagnosis.fit_after.rms)}{''.join(falls)}."
     )
 
 
@@ -167,7 +163,7 @@ def _open(finding: Finding) -> str:
     if not others:
         return text
     more = len(others) - SAID
-    also = [action_text(recommended_action) for recommended_action in others[:SAID]]
+    also = [action_text(other) for other in others[:SAID]]
     also += [f"{more} more"] if more > 0 else []
     chance = probability_text(finding.probability)
     return f"most probable ({chance}) {text}; alternatives: " + ", or ".join(also)
@@ -224,17 +220,10 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def to_do(diagnosis: Diagnosis) -> list[str]:
     """What to do next, in order: corrections, then further measurements."""
-    recommended_actions = [
-        finding.recommended_action
-        for finding in diagnosis.findings
-        if finding.recommended_action is not None
-    ]
-    done = [
-        f"{recommended_action.action[0].upper()}{recommended_action.action[1:]}."
-        for recommended_action in recommended_actions
-    ]
-    if len(diagnosis.findings) == 1 and recommended_actions:
-        done = [f"{done[0]} First: {find(recommended_actions[0].effect).to_check}"]
+    actions = [f.recommended_action for f in diagnosis.findings if f.recommended_action is not None]
+    done = [f"{one.action[0].upper()}{one.action[1:]}." for one in actions]
+    if len(diagnosis.findings) == 1 and actions:
+        done = [f"{done[0]} First: {find(actions[0].effect).to_check}"]
     more = next_text(diagnosis) or advice(diagnosis)
     return [*done, more] if more else done
 
@@ -250,27 +239,23 @@ def gap_sentence(diagnosis: Diagnosis) -> str:
 def finding_rows(finding: Finding) -> list[tuple[str, str]]:
     """Rows of a finding: (name, text)."""
     rows = []
-    recommended_action = finding.recommended_action
-    if recommended_action is not None:
-        rows += [
-            ("action", recommended_action.action),
-            ("check", find(recommended_action.effect).to_check),
-        ]
+    action = finding.recommended_action
+    if action is not None:
+        rows += [("action", action.action), ("check", find(action.effect).to_check)]
     elif finding.to_check:
         rows.append(("check", finding.to_check))
     rows.append(("place", place_text(finding)))
-    consequence = consequence_text(finding)
-    if consequence:
+    if consequence := consequence_text(finding):
         rows.append(("stored beam", consequence))
-    if recommended_action is not None:
+    if action is not None:
         rows.append(("probability", probability_text(finding.probability)))
     rows.append(("seen", _seen_text(finding)))
     if finding.seen_by is not None and len(finding.seen_by) > 1:
         by = sorted(finding.seen_by.items(), key=lambda pair: -pair[1])
         shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in by if share > 0.005)
         rows.append(("seen by", shares))
-    if recommended_action is not None:
-        rows.append(("mechanism", mechanism_text(recommended_action)))
+    if action is not None:
+        rows.append(("mechanism", mechanism_text(action)))
     if len(finding.recommended_actions) > 1:
         rows.append(("alternatives", or_text(finding, MOST)))
     return rows

@@ -26,6 +26,7 @@ from tmlattice.diagnosis.records import HIDDEN
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.stated import of_sizes
+from tmlattice.effects import with_labels
 from tmlattice.inference.normal import Posterior
 
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
@@ -72,7 +73,7 @@ class Step:
     @property
     def reversed_decision(self) -> str:
         """The decision on a family, reversed, in words."""
-        return f"{'without' if self.kept else 'with'} {self.effect}"
+        return f"{'without' if self.kept else 'with'} {with_labels(self.effect)}"
 
 
 class _Missed(NamedTuple):
