@@ -55,6 +55,7 @@ from tmlattice.diagnosis.response.validation import (
     score,
 )
 from tmlattice.diagnosis.response.weights import COUPLING, good_monitors
+from tmlattice.effects import with_labels
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import GROSS
 from tmlattice.inference.normal import Posterior
@@ -235,7 +236,7 @@ def _needed(
                 break
             whole = evidence_of(state, state.good, state.independent)
         least = untested.pop(0)
-        progress(f"without {_title(least)}")
+        progress(with_labels(f"without {_title(least)}"))
         worth[least], refitted, without = _tested(state, least, linear_worth[least], whole)
         if refitted is not None:
             evidence[least] = refitted + LEAST
@@ -273,7 +274,7 @@ def in_turn(
     """Return the rough fit of all families, added one by one: all at once they converge slowly from
     a design that is far from the ring, as PETRA III's is."""
     for trial in readable(state, trials):
-        progress(_title(trial))
+        progress(with_labels(_title(trial)))
         state = settle(jump(allow(state, trial)), _blocks(trial), FIRST, ROUGH)
     return state
 
@@ -451,7 +452,7 @@ def _quickly(
     of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
     validated = inner(state, of_rf)
     for trial in trials:
-        progress(f"is {_title(trial)} needed")
+        progress(with_labels(f"is {_title(trial)} needed"))
         own = (state.values[f.variable] for f in trial if state.allows(f.name))
         at_zero = not any(values.any() for values in own)
         if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
