@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, Flags
 from tmlattice.errors import LatticeError
 from tmlattice.lattice.ring import NO_ERRORS, PHYSICS, Element, Errors
 
@@ -70,7 +70,7 @@ class Quadratic:
         """The maps of a stack."""
         if self.T is None:
             return [Quadratic(B, R, None) for B, R in zip(self.B, self.R, strict=True)]
-        bent = self.T.any(axis=(-3, -2, -1)).tolist()
+        bent: Flags = self.T.any(axis=(-3, -2, -1))
         return [Quadratic(B, R, T if some else None)
                 for B, R, T, some in zip(self.B, self.R, self.T, bent, strict=True)]  # fmt: skip
 

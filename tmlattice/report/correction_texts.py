@@ -1,6 +1,6 @@
 """Sentences and tables of a correction, for the terminal and the page."""
 
-from math import isfinite
+from math import inf, isfinite
 
 from tmlattice.correction.result import Correction
 from tmlattice.correction.targets import TARGETS
@@ -8,6 +8,8 @@ from tmlattice.report.text import WIDTH, columns, wrapped
 
 MOST = 20
 """Devices that are listed; the table has all."""
+FEWEST = 4
+"""Devices, below which the table of what the first of them gain is left out."""
 ROUNDING = 1e-6
 """Share of a tolerance below which an error is shown as 0: rounding of the optics."""
 
@@ -71,16 +73,18 @@ def correction_text(correction: Correction, width: int = WIDTH, most: int | None
     lines are wanted."""
     lines = wrapped(correction.words, "", width)
     more = ["", *columns(expected_rows(correction), width)]
-    if correction.gains:
-        more += ["", "Expected rms with the first devices:"]
-        more += columns(gain_rows(correction), width)
-    for sentence in sentences(correction):
-        more += ["", *wrapped(sentence, "", width)]
+    gains = ["", "Expected rms with the first devices:", *columns(gain_rows(correction), width)]
+    notes = [line for text in sentences(correction) for line in ("", *wrapped(text, "", width))]
+    room = inf if most is None else most - len(lines) - len(more) - len(notes) - 3
+    if correction.gains and room - len(gains) >= FEWEST:
+        more += gains
+        room -= len(gains)
     if correction.settings:
-        count = MOST if most is None else max(min(most - len(lines) - len(more) - 3, MOST), 1)
+        count = int(max(min(room, MOST), 1))
         lines += ["", *columns(setting_rows(correction, count), width)]
         if len(correction.settings) > count:
             lines += [f"and {len(correction.settings) - count} more (settings.csv)"]
+    more += notes
     return "\n".join([*lines, *more])
 
 
