@@ -29,14 +29,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
+from tmlattice.effects import Settings, find
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.inference.problem import Hypothesis, Metric, Point, Products
+from tmlattice.inference.problem import Hypothesis, Metric, Point, Products, effects_on_ring
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
@@ -257,53 +256,16 @@ def too_large(shift: Shift, shots: Sequence[int], found: Lines) -> list[str]:
     ]
 
 
-class StoredMetric(SteadyMetric):
-    """Products at one point of a `Stored` problem; errors of monitors from their own readings."""
+class TurnsMetric(SteadyMetric):
+    """Products at one point of turn-by-turn data."""
 
     problem: Stored
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of monitor errors, by effect; return their indices."""
-        problem, done = self.problem, [np.zeros(0, dtype=np.intp)]
-        owner = problem.owner()[problem.used]
-        place = {name: i for i, name in enumerate(problem.monitors)}
-        read = np.flatnonzero(owner >= 0)
-        belongs = csr_array(
-            (np.ones(len(read)), (read, owner[read])), shape=(len(owner), len(place))
-        )
-        vectors = self.vectors(data)
-        for name in dict.fromkeys(name for name, _ in hypotheses):
-            effect = find(name)
-            if isinstance(effect, ReadingEffect):
-                which = np.array([i for i, h in enumerate(hypotheses) if h[0] == name])
-                at = [place[hypotheses[i][1] or ""] for i in which]
-                row = problem.as_rows(
-                    problem.of_monitors(self.point.view, self.point.nuisances, effect)
-                )
-                along = ((vectors * row) @ belongs)[:, at].T
-                self.put(which, (row**2 @ belongs)[at], along, found)
-                done.append(which)
-        return np.concatenate(done)
-
-    def vectors(self, data: Array) -> Array:
-        """Rows of data, then those that the nuisances span."""
-        return np.concatenate([data, self.projection.Q[0].T])
-
-    def put(self, which: Indices, whole: Array, along: Array, found: Products) -> None:
-        """Set squares [hypothesis], and products with `vectors` [hypothesis, vector]."""
-        data = found.inner.shape[1]
-        found.put(which, whole, (along[:, data:] ** 2).sum(axis=1), along[:, :data])
-
-
-class TurnsMetric(StoredMetric):
-    """Products at one point of turn-by-turn data."""
-
-    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
         """Put in products of errors of the ring and of monitors; return their indices."""
         done = super().quick(hypotheses, data, found)
-        ring = [i for i, (name, _) in enumerate(hypotheses) if isinstance(find(name), RingEffect)]
-        which = np.array(ring, dtype=np.intp)
-        whole, along = self._on_ring([hypotheses[i] for i in ring], self.vectors(data))
+        which = effects_on_ring(hypotheses)
+        whole, along = self._on_ring([hypotheses[i] for i in which], self.vectors(data))
         self.put(which, whole, along, found)
         return np.concatenate([done, which])
 
