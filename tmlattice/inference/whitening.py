@@ -53,6 +53,11 @@ class Root(ABC):
 
     @property
     @abstractmethod
+    def information(self) -> Array:
+        """Diagonal of W^T W: inverse variance of each row given all others, [row]."""
+
+    @property
+    @abstractmethod
     def log_scale(self) -> float:
         """Logarithm of the determinant of W."""
 
@@ -70,6 +75,10 @@ class _Triangle(Root):
     @property
     def matrix(self) -> Array:
         return self.inverse
+
+    @property
+    def information(self) -> Array:
+        return np.asarray((self.inverse**2).sum(axis=0))
 
     @property
     def log_scale(self) -> float:
@@ -91,6 +100,10 @@ class _Symmetric(Root):
     @property
     def matrix(self) -> Array:
         return self.white(np.eye(self.directions.shape[1]))
+
+    @property
+    def information(self) -> Array:
+        return np.asarray(1 - (1 - self.size**2) @ self.directions**2)
 
     @property
     def log_scale(self) -> float:
