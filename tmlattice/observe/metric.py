@@ -142,7 +142,7 @@ class SummedMetric(TurnMetric):
         """Put in products of effects on readings, each from one monitor's readings."""
         done = [np.zeros(0, dtype=np.intp)]
         for effect, which, at in effects_on_readings(hypotheses, self.model.maps.monitors):
-            change = np.nan_to_num(self.model.reading_signatures(self.paths, effect.name))
+            change = np.nan_to_num(self.model.reading_signatures(self.paths, effect))
             product = np.einsum("srp,dsrp->rd", change, rows, optimize=True)
             inner = product.reshape(self.model.turns, -1, len(rows)).sum(axis=0)[at]
             found.put(which, *self.reading_squares(self.weight * change, at), inner)

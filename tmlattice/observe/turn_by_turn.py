@@ -40,6 +40,7 @@ from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
 from tmlattice.observe.stored import Beams, SteadyMetric, Stored, rf_of, seen_by, stacked
+from tmlattice.optics import short_way
 
 TUNE = 3e-4
 """Smallest error of a tune: it moves with the unknown energy."""
@@ -200,7 +201,7 @@ def _fill(
     modes, tunes, actions, kept = (own.reshape(len(SCALES), len(shots), *own.shape[1:])
                                    for own in every)  # fmt: skip
     whole, half, first = (modes[i] - modes[-1] for i in range(3))
-    tune, tune_half, tune_first = ((tunes[i] - tunes[-1] + 0.5) % 1.0 - 0.5 for i in range(3))
+    tune, tune_half, tune_first = (short_way(tunes[i] - tunes[-1]) for i in range(3))
     # tracked actions over the measured ones; a mode that was not kicked makes no shift
     alone = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0)])[:, None]
     over = np.where(size == 0, alone, actions[:3] / np.maximum(np.abs(size) ** 2, TINY))
@@ -349,7 +350,7 @@ class ManyTurns(Stored):
     @property
     def _turn(self) -> Array:
         """Measured phase advance of both lines per turn, [shot, mode], rad, in (-pi, pi)."""
-        return np.asarray(2 * np.pi * ((self.values[:, -2:] + 0.5) % 1 - 0.5))
+        return 2 * np.pi * short_way(self.values[:, -2:])
 
     def with_turn_offsets(self, states: Sequence[Moved], late: Array) -> list[Moved]:
         """Return the states after the phase of each monitor's turn offset."""
@@ -459,7 +460,7 @@ def _chromatic(beam: StoredBeam, at: Array) -> tuple[Array, ComplexArray]:
     def orders(zero: Any, up: Any, down: Any) -> Any:
         return np.stack([(up - down) / (2 * STEP), (up - 2 * zero + down) / (2 * STEP**2)])
 
-    tunes = [(end.tunes - ends[0].tunes + 0.5) % 1.0 - 0.5 for end in ends]
+    tunes = [short_way(end.tunes - ends[0].tunes) for end in ends]
     delays = [np.exp(-2j * np.pi * at[:, None, None] * own) for own in tunes]
     modes = [end.modes * own for end, own in zip(ends, delays, strict=True)]
     return orders(*tunes), orders(*modes)
@@ -521,7 +522,7 @@ def many_turns(
     energy = np.maximum(_faded(found), 1e-3)[..., None] * [ASYMMETRY, 1.0, 1.0, 1.0]
     known = np.concatenate([shift.error.swapaxes(1, 2), energy], axis=2)
     known = known.reshape(shots, -1) * np.sqrt(shots)
-    tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
+    tunes = design + short_way(found.tune - design)
     data = np.concatenate([both.reshape(shots, -1), np.zeros_like(known), tunes], axis=1)
     tune_error = np.sqrt(found.tune_error**2 + TUNE**2)
     errors = np.concatenate([np.repeat(error, 2, axis=1), known, tune_error], axis=1)
