@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from tmlattice import Cause, simulate
 from tmlattice.beam.closed_orbit import ResponseModel
+from tmlattice.beam.model import Model
 from tmlattice.diagnosis.prepare import prepare
 from tmlattice.effects import apply, background_rms, find, modelled, monitors_with
 from tmlattice.inference.alternatives import best_start
@@ -15,8 +16,11 @@ from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import DistributedErrors, fit_distributed_errors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import fit
+from tmlattice.inference.search import outlier
 from tmlattice.machine.stored_beam import simulate_turns
 from tmlattice.measurement import ClosedOrbit
+from tmlattice.observe.data import of_measurement
+from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.orbits import closed_orbits
 from tmlattice.observe.turn_by_turn import many_turns
 
@@ -122,6 +126,29 @@ def test_fast_products_among_small_errors_are_those_of_all_signatures(turns):
     rows = out(problem.white(turns.metric(among.before.point.view).rows(some)))
     assert_allclose(found.whole - found.inside, np.einsum("hr,hr->h", rows, rows), rtol=1e-6)
     assert_allclose(found.inner, rows @ out(data).T, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("shots", [1, 4], ids=["more errors than readings", "fewer"])
+def test_an_outlier_among_small_errors_is_the_reading_without_which_chi_square_falls(
+    small_ring, shots
+):
+    rms = {"quadrupole_offset_x": 1e-4, "quadrupole_offset_y": 1e-4, "quadrupole_gradient": 2e-3}
+    everywhere = [(name, place) for name in rms for place in find(name).places(small_ring)]
+    data = of_measurement(small_ring, simulate(small_ring, shots=shots, seed=3).measurement())
+    model = Model(small_ring, data.settings)
+    for where in [(0, 3, 1), (0, 10, 0), (0, 17, 1)]:
+        readings = data.readings.copy()
+        readings[where] += 20 * data.sigma[where]
+        turns = FirstTurns(model=model, data=replace(data, readings=readings), places={})
+        usual = DistributedErrors.usual(everywhere, rms)
+        among = fit_distributed_errors(turns, usual, turns.first, learn=False)
+        (found,) = outlier(among.problem, among.before.point, 0)
+        assert found.reading == where
+        dropped = np.zeros(readings.shape, dtype=bool)
+        dropped[where] = True
+        without = fit(among.problem.without(dropped), (), among.before.nuisances)
+        fell = among.before.chi2 - without.chi2
+        assert found.detection.statistic == pytest.approx(fell, rel=1e-3)
 
 
 def test_small_errors_leave_a_chi_square_of_one_and_hide_no_fault(small_ring):

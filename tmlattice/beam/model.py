@@ -71,18 +71,12 @@ class Model(TrackedShots):
                 assert place is not None
                 m = self.monitor(place)
                 if name not in read:
-                    read[name] = self._of_readings(paths, effect)
+                    read[name] = self.reading_signatures(paths, effect)
                 out[i, :, m::count] = read[name][:, m::count]
             elif isinstance(effect, LaunchEffect):
                 change = self._of_launch(effect, name, launches)[None]
                 out[i] = _through(paths.monitors, change)[0]
         return out
-
-    def reading_signatures(self, paths: Paths, effect: str) -> Array:
-        """The same for one effect on readings at every monitor, [shot, reading, 2]."""
-        own = find(effect)
-        assert isinstance(own, ReadingEffect)
-        return self._of_readings(paths, own)
 
     def kick_signatures(self, paths: Paths, layers: Indices) -> Array:
         """d readings / d kick (px, py) in the middle of layers' magnets, m / rad, [layer, 2, shot,
@@ -146,8 +140,9 @@ class Model(TrackedShots):
             launch_kick[np.ix_(group.shots, np.searchsorted(owner, d.owner[own]))] = change
         return np.array(ring)[owner], np.searchsorted(self.where, exits), launch_kick
 
-    def _of_readings(self, paths: Paths, effect: ReadingEffect) -> Array:
-        """The effect joins the errors that each monitor has, in the order of `Monitors`."""
+    def reading_signatures(self, paths: Paths, effect: ReadingEffect) -> Array:
+        """d readings / d amount of an effect at every monitor, [shot, reading, 2]; it joins the
+        errors that each monitor has, in the order of `Monitors`."""
         high = 1.0 if effect.discrete else SMALL * effect.largest
         low = 0.0 if effect.discrete else -high
         up, down = (_with_all(paths.monitors_of, effect, amount) for amount in (high, low))

@@ -241,14 +241,19 @@ class MarginalProblem(Problem):
         return self.white(self.inner.as_rows(readings))
 
     def left(self, point: Point) -> tuple[Array, Array]:
-        """Residual of each single reading given those before it, and its variance."""
+        """Residual of each reading given all others, over its error given these and the nuisances;
+        and the share of its information that nuisances leave."""
         assert point.projection is not None
-        alone, size = self.inner.left(point.view)
-        clean = point.projection.out(point.residual)
-        clean = clean[self.inner.as_rows(np.ones(self.valid.shape)) > 0]
-        left = np.zeros(self.valid.shape)
-        left[self.valid] = clean
-        return np.where(alone == 0, 0.0, left), np.ones_like(size)
+        alone, _ = self.inner.left(point.view)
+        there = self.inner.as_rows(np.ones(self.valid.shape)) > 0
+        (Q,) = point.projection.Q
+        information = self._root.information
+        left, share = np.zeros(self.valid.shape), np.ones(self.valid.shape)
+        clean = self._root.back(point.projection.out(point.residual))
+        left[self.valid] = (clean / np.sqrt(information))[there]
+        taken = (self._root.back(Q.T) ** 2).sum(axis=0) / information
+        share[self.valid] = 1 - taken[there]
+        return np.where(alone == 0, 0.0, left), share
 
     def without(self, dropped: Flags) -> Self:
         """Return the problem without some readings; its covariance is computed anew."""

@@ -32,7 +32,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from tmlattice.arrays import ROUNDING, TINY, Array, Flags, Indices
 from tmlattice.inference.newton import ITERATIONS, SETTLED
-from tmlattice.inference.normal import Normal, Slopes, shared_by, times_precision
+from tmlattice.inference.normal import (
+    Normal,
+    Slopes,
+    inverse_by_factor,
+    lower_factor,
+    shared_by,
+    times_precision,
+)
 from tmlattice.inference.priors import Group
 
 MAX_LEVERAGE = 0.75
@@ -287,16 +294,21 @@ def moments(normal: Normal, groups: Sequence[Group], start: Array) -> Moments:
     rest = 1 / np.diag(_gaussian(A, b, precision, pull)[1]) - 1
     open_ = rest * priors.square.min(axis=1) < DATA_ALONE  # the prior matters for these alone
     if open_.any():
-        follow = np.linalg.solve(
-            A[np.ix_(~open_, ~open_)] + np.eye(int((~open_).sum())), A[np.ix_(~open_, open_)]
-        )
-        within = A[np.ix_(open_, open_)] - A[np.ix_(open_, ~open_)] @ follow
-        precision[open_], pull[open_] = _sites(
-            (within + within.T) / 2, b[open_] - follow.T @ b[~open_], priors.some(open_)
-        )
+        within, score, _ = _integrated(A, b, open_)
+        precision[open_], pull[open_] = _sites(within, score, priors.some(open_))
     mean, covariance = _gaussian(A, b, precision, pull)
     scaled = basis * unit
     return Moments(scaled @ mean, scaled @ covariance @ scaled.T)
+
+
+def _integrated(A: Array, b: Array, kept: Flags) -> tuple[Array, Array, Array]:
+    """Information and score of some members, the others integrated out with priors of size 1; and
+    how far these follow each of them, [other, kept]."""
+    rest = ~kept
+    across = A[np.ix_(rest, kept)]
+    follow = np.asarray(np.linalg.solve(A[np.ix_(rest, rest)] + np.eye(len(across)), across))
+    within = A[np.ix_(kept, kept)] - across.T @ follow
+    return (within + within.T) / 2, b[kept] - follow.T @ b[rest], follow
 
 
 def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
@@ -324,9 +336,8 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
 
 def _gaussian(A: Array, b: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
     """Mean and covariance with Gaussian priors of these precisions and shifts."""
-    factor = cho_factor(A + np.diag(precision), lower=True, check_finite=False)
-    covariance = cho_solve(factor, np.eye(len(A)), check_finite=False)
-    return covariance @ (b + pull), (covariance + covariance.T) / 2
+    covariance = inverse_by_factor(lower_factor(A + np.diag(precision)))
+    return covariance @ (b + pull), covariance
 
 
 KNOWN_MEMBERS = 6.0
@@ -372,11 +383,10 @@ def scale_covariance(
     if not unsure.any():
         return np.zeros((len(start), 0))
     U = unsure[own]
-    # the other groups with their priors integrated out
-    follow = np.linalg.solve(A[np.ix_(~U, ~U)] + np.eye(int((~U).sum())), A[np.ix_(~U, U)])
+    information, score, follow = _integrated(A, b, U)
     sizes = _Scales(
-        A[np.ix_(U, U)] - A[np.ix_(U, ~U)] @ follow,
-        b[U] - follow.T @ b[~U],
+        information,
+        score,
         (np.cumsum(unsure) - 1)[own[U]],
         [group for group, here in zip(groups, unsure, strict=True) if here],
         absent[unsure],

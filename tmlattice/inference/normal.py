@@ -317,8 +317,7 @@ class Posterior:
     @cached_property
     def covariance(self) -> Array:
         """Covariance of the groups' parameters, in units of their priors, [p, p]."""
-        lower = dpotri(self.factor, lower=1)[0]
-        return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+        return inverse_by_factor(self.factor)
 
     @property
     def whole(self) -> Array:
@@ -392,6 +391,12 @@ def lower_factor(matrix: Array) -> Array:
     if wrong:
         raise np.linalg.LinAlgError("a matrix of normal equations is not positive definite")
     return np.asarray(factor)
+
+
+def inverse_by_factor(factor: Array) -> Array:
+    """(L L^T)^-1, [n, n], of a lower triangle L."""
+    lower = dpotri(factor, lower=1)[0]  # one half
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
 def inverse_of_lower(factor: Array) -> Array:

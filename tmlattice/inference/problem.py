@@ -16,13 +16,34 @@ from typing import Any, Self
 import numpy as np
 
 from tmlattice.arrays import AT_ONCE, Array, Flags, Indices
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.priors import LOG_UNIFORM, AmountPrior
 from tmlattice.inference.whitening import Projection, Root
 
 Hypothesis = tuple[str, str | None]
 """An effect and its place."""
+
+
+def effects_on_ring(hypotheses: Sequence[Hypothesis]) -> Indices:
+    """Indices of the errors of the ring."""
+    return np.flatnonzero([isinstance(find(name), RingEffect) for name, _ in hypotheses])
+
+
+def effects_on_readings(
+    hypotheses: Sequence[Hypothesis], monitors: Sequence[str]
+) -> Iterator[tuple[ReadingEffect, Indices, Indices]]:
+    """Yield each effect on readings, the indices of its hypotheses, and those of their monitors; -1
+    for another one."""
+    index: dict[str | None, int] = {name: i for i, name in enumerate(monitors)}
+    found: dict[ReadingEffect, list[tuple[int, int]]] = {}
+    for i, (name, place) in enumerate(hypotheses):
+        effect = find(name)
+        if isinstance(effect, ReadingEffect):
+            found.setdefault(effect, []).append((i, index.get(place, -1)))
+    for effect, own in found.items():
+        which, at = np.array(own).T
+        yield effect, which, at
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotrf, dpotri
 
 from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.inference.newton import ITERATIONS
+from tmlattice.inference.normal import inverse_by_factor, lower_factor
 from tmlattice.inference.priors import MAX_STEP, SCALE_SPREAD
 
 COMMON_SPREAD = 1.5
@@ -140,19 +140,16 @@ def _state(
     covariance = base.copy()
     for weight, part in zip(weights, parts, strict=True):
         covariance += weight * part
-    factor, failed = dpotrf(covariance, lower=1, overwrite_a=1)
-    if failed:
+    try:
+        factor = lower_factor(covariance)
+    except np.linalg.LinAlgError:
         return _State(-np.inf, np.zeros(len(size)), np.eye(len(size)))
     solved = cho_solve((factor, True), rows, check_finite=False)
     value = -np.log(np.diag(factor)).sum() - 0.5 * rows @ solved - 0.5 * size @ precision @ size
     moved = np.array([w * (part @ solved) for w, part in zip(weights, parts, strict=True)])
     back = cho_solve((factor, True), moved.T, check_finite=False)
-    inverse, _ = dpotri(factor, lower=1, overwrite_c=1)
-    inverse[np.triu_indices(len(inverse), 1)] = 0.0  # dpotri fills one half
-    inverse[np.diag_indices(len(inverse))] *= 0.5
-    traces = np.array(
-        [2 * w * np.vdot(inverse, part) for w, part in zip(weights, parts, strict=True)]
-    )
+    inverse = inverse_by_factor(factor)
+    traces = np.array([w * np.vdot(inverse, part) for w, part in zip(weights, parts, strict=True)])
     slope = moved @ solved - traces - precision @ size
     information = 2 * moved @ back + precision
     return _State(float(value), slope, information)

@@ -15,7 +15,7 @@ which costs errors^2 x rows once and errors x rows for each row that is whitened
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -53,6 +53,11 @@ class Root(ABC):
 
     @property
     @abstractmethod
+    def information(self) -> Array:
+        """Diagonal of W^T W: inverse variance of each row given all others, [row]."""
+
+    @property
+    @abstractmethod
     def log_scale(self) -> float:
         """Logarithm of the determinant of W."""
 
@@ -70,6 +75,10 @@ class _Triangle(Root):
     @property
     def matrix(self) -> Array:
         return self.inverse
+
+    @property
+    def information(self) -> Array:
+        return np.asarray((self.inverse**2).sum(axis=0))
 
     @property
     def log_scale(self) -> float:
@@ -91,6 +100,10 @@ class _Symmetric(Root):
     @property
     def matrix(self) -> Array:
         return self.white(np.eye(self.directions.shape[1]))
+
+    @property
+    def information(self) -> Array:
+        return np.asarray(1 - (1 - self.size**2) @ self.directions**2)
 
     @property
     def log_scale(self) -> float:
@@ -249,14 +262,27 @@ class Whitening:
             for i, column in enumerate(self.columns):
                 parts[i, :, -5 + column] = self._prior[:, column]
             return np.ascontiguousarray(np.moveaxis(parts, 0, 2))
-        alone = np.zeros((self.shots, p, *slopes.shape[:3]))
-        for shot in range(self.shots):
-            alone[shot, :, shot] = moved[:, shot]
+        (alone,) = each_shot(moved[None], range(self.shots))
         rows = self.signature(alone).reshape(self.shots, p, self.shots, -1)
         for shot in range(self.shots):
             for i, column in enumerate(self.columns):
                 rows[shot, i, shot, -5 + column] = self._prior[shot, column]
         return np.ascontiguousarray(rows.reshape(self.shots * p, -1).T)[None]
+
+
+def each_shot(moved: Array, shots: Iterable[int]) -> Array:
+    """Return changes [place, parameter, shot, ...] of a single shot each, zero in the others,
+    [place, single shot, parameter, shot, ...].
+
+    Args:
+        moved: changes of all shots.
+        shots: the single ones.
+    """
+    shots = list(shots)
+    alone = np.zeros((len(moved), len(shots), *moved.shape[1:]))
+    for i, shot in enumerate(shots):
+        alone[:, i, :, shot] = moved[:, :, shot]
+    return alone
 
 
 class Projection:

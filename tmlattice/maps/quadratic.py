@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,11 @@ class Quadratic:
     R: Array
     T: Array | None
 
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        """Return images [..., out] of states [..., n], and their slopes [..., out, n]."""
+        bent = 0.0 if self.T is None else (self.T @ x[..., None, :, None])[..., 0]
+        return self.B + ((self.R + bent) @ x[..., None])[..., 0], self.R + 2.0 * bent
+
     def after(self, first: "Quadratic") -> "Quadratic":
         """Return this map after `first`, to second order in x."""
         into = first.B[..., None]
@@ -62,7 +67,7 @@ class Quadratic:
             return self.B, self.R, np.zeros((*self.B.shape, len(i)))
         return self.B, self.R, counts * self.T[..., i, j]
 
-    def __getitem__(self, which: Sequence[int]) -> "Quadratic":
+    def __getitem__(self, which: Any) -> "Quadratic":
         """Some maps of a stack."""
         return Quadratic(self.B[which], self.R[which], None if self.T is None else self.T[which])
 

@@ -34,7 +34,7 @@ from tmlattice.observe.response_data import read as read_rf
 from tmlattice.observe.sections import mean_pass
 from tmlattice.observe.stored import NOTHING
 from tmlattice.observe.turn_by_turn import LINES, ManyTurns, many_turns
-from tmlattice.optics import ring_tunes
+from tmlattice.optics import ring_tunes, short_way
 
 USUAL = 0.1
 """Relative misfit of a column by usual errors; distance of a tune from the design's that counts as
@@ -511,7 +511,7 @@ class OfTunes(Compared):
     def misfit(self, names: Names = ()) -> Array:
         """Square of the larger distance from the design's, in units of `USUAL`, [1]."""
         read = np.nanmedian(self.assumed(names).tune % 1, axis=0)
-        apart = np.abs((read - self.design + 0.5) % 1 - 0.5)
+        apart = np.abs(short_way(read - self.design))
         return np.array([np.nanmax(apart) ** 2 / USUAL**2])
 
 

@@ -19,7 +19,7 @@ from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.newton import ITERATIONS, fit
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.validation import Half, HeldOut, cross_predicted
-from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening
+from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening, each_shot
 from tmlattice.observe.data import Data
 from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
@@ -178,12 +178,9 @@ class FirstTurns(Problem):
 
     def kick_rows(self, point: Point, place: int) -> Array:
         """Rows of (px, py) in the middle of a magnet, independent in each active shot."""
-        kicked = self.model.kick_signatures(point.view, np.array([place]))[0]
-        shots = np.flatnonzero(self.data.active)
-        alone = np.zeros((len(shots), *kicked.shape))
-        for i, shot in enumerate(shots):
-            alone[i, :, shot] = kicked[:, shot]
-        return self.whitening.signature(alone).reshape(2 * len(shots), -1)
+        kicked = self.model.kick_signatures(point.view, np.array([place]))
+        alone = each_shot(kicked, np.flatnonzero(self.data.active))
+        return self.whitening.signature(alone).reshape(alone[..., 0, 0, 0].size, -1)
 
     def _of_shots(self, kicks: Kicks) -> dict[int, Array]:
         whole = {}

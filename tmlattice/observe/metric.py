@@ -2,10 +2,11 @@
 
 Most signatures equal a launch's from a reading on (a single kick), or are confined to one monitor
 (an effect on readings): cumulative sums over the readings give all their products. The others are
-formed in chunks. Independent noise, and noise correlated over all shots by distributed errors, have
-separate implementations.
+formed in chunks. The squares of independent noise, and of noise correlated over all shots by
+distributed errors, have separate implementations.
 """
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -13,9 +14,8 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model, Paths
-from tmlattice.effects import ReadingEffect, find
-from tmlattice.inference.problem import Hypothesis, Metric, Products
-from tmlattice.inference.whitening import Projection, Whitening
+from tmlattice.inference.problem import Hypothesis, Metric, Products, effects_on_readings
+from tmlattice.inference.whitening import Projection, Whitening, each_shot
 
 
 def behind(values: Array) -> Array:
@@ -55,35 +55,6 @@ class TurnMetric(Metric):
         signatures = np.nan_to_num(self.model.signatures(self.paths, hypotheses, self.launches))
         return self.whitening.signature(signatures * self.active[:, None, None])
 
-    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of single kicks and of effects on readings; return their indices."""
-        done = (self.kicks(hypotheses, data, found), self.readings(hypotheses, data, found))
-        return np.concatenate(done)
-
-    def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of single kicks; return the indices of their hypotheses."""
-        return np.zeros(0, dtype=np.intp)
-
-    def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of effects on readings; return the indices of their hypotheses."""
-        return np.zeros(0, dtype=np.intp)
-
-    def _on_readings(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Indices, Indices]]:
-        """Indices of the hypotheses on readings, and of their monitors, by effect."""
-        monitor = {name: m for m, name in enumerate(self.model.maps.monitors)}
-        members: dict[str, list[tuple[int, int]]] = {}
-        for i, (name, place) in enumerate(hypotheses):
-            if place is not None and isinstance(find(name), ReadingEffect):
-                members.setdefault(name, []).append((i, monitor[place]))
-        return {
-            name: (np.array([i for i, _ in some]), np.array([m for _, m in some]))
-            for name, some in members.items()
-        }
-
-    def _changed_readings(self, name: str) -> Array:
-        """d readings / d amount of an effect at every monitor, [shot, reading, 2]."""
-        return np.asarray(np.nan_to_num(self.model.reading_signatures(self.paths, name)))
-
     # --- what has no name -----------------------------------------------------------------------
     def free_kicks(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """Information of a kick (px, py) in every active shot in the middle of layers' magnets, and
@@ -104,9 +75,7 @@ class TurnMetric(Metric):
     def _free_rows(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """Whitened signatures of free kicks [layer, block, p, row], and data [block, row]."""
         kicked = self.model.kick_signatures(self.paths, layers)
-        alone = np.zeros((len(kicked), len(self.shots), *kicked.shape[1:]))
-        for i, shot in enumerate(self.shots):
-            alone[:, i, :, shot] = kicked[:, :, shot]
+        alone = each_shot(kicked, self.shots)
         rows = self.projection.out(self.whitening.signature(alone))
         return rows.reshape(len(kicked), 1, -1, len(clean)), clean[None]
 
@@ -125,61 +94,88 @@ class TurnMetric(Metric):
         return np.stack(grams), np.stack(inners)
 
 
-class IndependentMetric(TurnMetric):
-    """Products with independent noise of the readings."""
+class SummedMetric(TurnMetric):
+    """Products of single kicks and of effects on readings, from sums over readings."""
+
+    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
+        """Put in products of single kicks and of effects on readings; return their indices."""
+        rows = self._data(data)
+        done = (self._kicks(hypotheses, rows, found), self._readings(hypotheses, rows, found))
+        return np.concatenate(done)
+
+    @abstractmethod
+    def kick_squares(self, start: Indices, launch_kick: Array) -> tuple[Array, Array | float]:
+        """Squares of kicks, and their parts along the launches' directions, [kick]; from the first
+        reading behind each [kick], and the launches equal to them there [shot, kick, n]."""
+
+    @abstractmethod
+    def reading_squares(self, change: Array, at: Indices) -> tuple[Array, Array | float]:
+        """Squares of an effect at some monitors, and their parts along the launches' directions,
+        [monitor]; from its change of all readings over noise [shot, reading, 2]."""
 
     @cached_property
     def _slopes(self) -> Array:
-        """d readings / d launch in units of the noise, [shot, reading, 2, n]."""
-        return np.asarray(self.whitening.weight[..., None] * self.model.slopes(self.paths))
+        """d readings / d launch, [shot, reading, 2, n]."""
+        return self.model.slopes(self.paths)
 
-    @cached_property
-    def _known(self) -> Array:
-        """Directions of the launches in the readings, [shot, reading, 2, direction]."""
-        shots, readings = self.weight.shape[:2]
-        return self.projection.Q[:, :-5].reshape(shots, readings, 2, -1)
+    def _data(self, rows: Array) -> Array:
+        """Adjoint of `rows`: data for products with signatures in m, [data, shot, reading, 2]."""
+        parts = rows.reshape(len(rows), len(self.active), -1)[:, :, :-5]
+        return self.whitening.back(parts) * self.active[:, None, None]
 
-    def _rows(self, data: Array) -> Array:
-        """Data without the launches' rows, [data, shot, reading, 2]."""
-        shots, readings = self.weight.shape[:2]
-        return data.reshape(len(data), shots, -1)[:, :, :-5].reshape(-1, shots, readings, 2)
+    def _behind(self, row: Array) -> Array:
+        """Data times the launches' signatures from each reading on, [shot, reading + 1, n]."""
+        return behind(np.einsum("smpi,smp->smi", self._slopes, row))
 
-    def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
+    def _kicks(self, hypotheses: Sequence[Hypothesis], rows: Array, found: Products) -> Indices:
         """Put in products of single kicks, from cumulative sums over the readings."""
         which, start, launch_kick = self.model.single_kicks(self.paths, hypotheses)
         if not len(which):
             return which
-        launch_kick = launch_kick * self.active[:, None, None]
-        slopes = self._slopes
+        inner = np.empty((len(which), len(rows)))
+        for d, row in enumerate(rows):
+            inner[:, d] = np.einsum("ski,ski->k", launch_kick, self._behind(row)[:, start])
+        found.put(which, *self.kick_squares(start, launch_kick), inner)
+        return which
+
+    def _readings(self, hypotheses: Sequence[Hypothesis], rows: Array, found: Products) -> Indices:
+        """Put in products of effects on readings, each from one monitor's readings."""
+        done = [np.zeros(0, dtype=np.intp)]
+        for effect, which, at in effects_on_readings(hypotheses, self.model.maps.monitors):
+            change = np.nan_to_num(self.model.reading_signatures(self.paths, effect))
+            product = np.einsum("srp,dsrp->rd", change, rows, optimize=True)
+            inner = product.reshape(self.model.turns, -1, len(rows)).sum(axis=0)[at]
+            found.put(which, *self.reading_squares(self.weight * change, at), inner)
+            done.append(which)
+        return np.concatenate(done)
+
+
+class IndependentMetric(SummedMetric):
+    """Products with independent noise of the readings."""
+
+    @cached_property
+    def _known(self) -> Array:
+        """Directions of the launches in the readings, [shot, reading, 2, direction]."""
+        return self.projection.Q[:, :-5].reshape(*self.weight.shape, -1)
+
+    def kick_squares(self, start: Indices, launch_kick: Array) -> tuple[Array, Array]:
+        """See `SummedMetric`."""
+        slopes = self.weight[..., None] * self._slopes
         gram = behind(np.einsum("smpi,smpj->smij", slopes, slopes, optimize=True))
         along = behind(np.einsum("smpi,smpq->smiq", slopes, self._known, optimize=True))
         whole = np.einsum(
             "ski,skij,skj->k", launch_kick, gram[:, start], launch_kick, optimize=True
         )
         inside = np.einsum("ski,skiq->skq", launch_kick, along[:, start], optimize=True)
-        inner = np.empty((len(which), len(data)))
-        for d, row in enumerate(self._rows(data)):
-            sums = behind(np.einsum("smpi,smp->smi", slopes, row))
-            inner[:, d] = np.einsum("ski,ski->k", launch_kick, sums[:, start])
-        found.put(which, whole, np.einsum("skq,skq->k", inside, inside), inner)
-        return which
+        return whole, np.einsum("skq,skq->k", inside, inside)
 
-    def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of effects on readings, each from one monitor's readings."""
+    def reading_squares(self, change: Array, at: Indices) -> tuple[Array, Array]:
+        """See `SummedMetric`."""
         shape = (len(self.active), self.model.turns, len(self.model.at), 2)
-        Q, rows = self._known.reshape(*shape, -1), self._rows(data).reshape(-1, *shape)
-        done = [np.zeros(0, dtype=np.intp)]
-        for name, (which, at) in self._on_readings(hypotheses).items():
-            change = (self.weight * self._changed_readings(name)).reshape(shape)
-            along = np.einsum("stmp,stmpq->smq", change, Q, optimize=True)
-            found.put(
-                which,
-                np.einsum("stmp,stmp->m", change, change)[at],
-                np.einsum("smq,smq->m", along, along)[at],
-                np.einsum("stmp,dstmp->md", change, rows, optimize=True)[at],
-            )
-            done.append(which)
-        return np.concatenate(done)
+        change, Q = change.reshape(shape), self._known.reshape(*shape, -1)
+        along = np.einsum("stmp,stmpq->smq", change, Q, optimize=True)
+        whole = np.einsum("stmp,stmp->m", change, change)
+        return whole[at], np.einsum("smq,smq->m", along, along)[at]
 
     def _free_rows(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """Rows of free kicks; each shot is a block, as a kick acts in its own shot."""
@@ -201,7 +197,7 @@ class IndependentMetric(TurnMetric):
         return gram.swapaxes(0, 1), inner.swapaxes(0, 1)
 
 
-class DenseMetric(TurnMetric):
+class DenseMetric(SummedMetric):
     """Products with readings of one turn that are correlated over all shots.
 
     Readings are ordered by monitor. The Gram matrix of the launches' signatures behind a monitor
@@ -219,16 +215,6 @@ class DenseMetric(TurnMetric):
         """Block of one monitor's readings, [shot plane, shot plane]."""
         own = slice(2 * len(self.active) * m, 2 * len(self.active) * (m + 1))
         return np.asarray(self._precision[own, own])
-
-    def _data(self, rows: Array) -> Array:
-        """Precision times data, for products with signatures: [data, shot, reading, 2]."""
-        parts = rows.reshape(len(rows), len(self.active), -1)[:, :, :-5]
-        return self.whitening.back(parts) * (self.weight > 0)
-
-    @cached_property
-    def _slopes(self) -> Array:
-        """d readings / d launch, [shot, reading, 2, n]."""
-        return self.model.slopes(self.paths)
 
     @cached_property
     def _grams(self) -> Array:
@@ -249,47 +235,28 @@ class DenseMetric(TurnMetric):
             grams[m] = grams[m + 1] + cross + cross.T + H[m].T @ self._block(m) @ H[m]
         return grams
 
-    def kicks(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of single kicks, from the Gram matrices of the readings behind them."""
-        which, start, launch_kick = self.model.single_kicks(self.paths, hypotheses)
-        if not len(which):
-            return which
-        stacked = np.moveaxis(launch_kick, 0, 1).reshape(len(which), -1)  # [kick, shot n]
-        whole = np.empty(len(which))
+    def kick_squares(self, start: Indices, launch_kick: Array) -> tuple[Array, float]:
+        """See `SummedMetric`; from the Gram matrices of the readings behind the kicks."""
+        stacked = np.moveaxis(launch_kick, 0, 1).reshape(len(start), -1)  # [kick, shot n]
+        whole = np.empty(len(start))
         for m in np.unique(start):
             at = start == m
             whole[at] = np.einsum("ki,ij,kj->k", stacked[at], self._grams[m], stacked[at])
-        inner = np.empty((len(which), len(data)))
-        for d, row in enumerate(self._data(data)):
-            sums = behind(np.einsum("smpi,smp->smi", self._slopes, row))
-            inner[:, d] = np.einsum("ski,ski->k", launch_kick, sums[:, start])
-        found.put(which, whole, 0.0, inner)
-        return which
+        return whole, 0.0
 
-    def readings(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of effects on readings, from one monitor's block of the precision."""
-        rows = self._data(data)
-        done = [np.zeros(0, dtype=np.intp)]
-        for name, (which, at) in self._on_readings(hypotheses).items():
-            change = self._changed_readings(name)
-            weighted = self.weight * change
-            whole = np.array([weighted[:, m].ravel() @ self._block(m) @ weighted[:, m].ravel()
-                              for m in at])  # fmt: skip
-            found.put(which, whole, 0.0, np.einsum("smp,dsmp->md", change, rows)[at])
-            done.append(which)
-        return np.concatenate(done)
+    def reading_squares(self, change: Array, at: Indices) -> tuple[Array, float]:
+        """See `SummedMetric`; from one monitor's block of the precision."""
+        rows = np.moveaxis(change, 1, 0).reshape(change.shape[1], -1)[at]
+        return np.array([row @ self._block(m) @ row for row, m in zip(rows, at, strict=True)]), 0.0
 
     def free_kicks(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
         """One block for all shots: the background correlates them."""
         first, launch_kick = self.model.free_kicks(self.paths, layers)  # [layer, 2, shot, n]
-        sums = behind(np.einsum("smpi,smp->smi", self._slopes, self._data(clean[None])[0]))
+        sums = self._behind(self._data(clean[None])[0])
         size = 2 * len(self.shots)
         gram, inner = np.empty((len(layers), 1, size, size)), np.empty((len(layers), 1, size))
-        for k, m in enumerate(first):
-            alone = np.zeros((len(self.shots), 2, len(self.active), launch_kick.shape[3]))
-            for i, shot in enumerate(self.shots):
-                alone[i, :, shot] = launch_kick[k, :, shot]
-            flat = alone.reshape(size, -1)
+        alone = each_shot(launch_kick, self.shots).reshape(len(layers), size, -1)
+        for k, (m, flat) in enumerate(zip(first, alone, strict=True)):
             gram[k, 0] = flat @ self._grams[m] @ flat.T
             inner[k, 0] = flat @ sums[:, m].ravel()
         return gram, inner

@@ -318,13 +318,16 @@ class Predicted:
         offset) zero.
         """
         on_ring = [h for h in hypotheses if isinstance(find(h[0]), RingEffect)]
-        slopes = self.slopes(on_ring)
+        slopes, changed = self.slopes(on_ring), dict[str, Array]()
         for effect, place in hypotheses:
             kind = find(effect)
             if isinstance(kind, RingEffect):
                 yield self.seen(next(slopes))
             elif isinstance(kind, ReadingEffect):
-                yield self._read_otherwise(effect, place)
+                if effect not in changed:
+                    changed[effect] = self.of_monitors(kind)
+                mine = np.array(self.monitors) == self.data.ring[place or ""].name
+                yield np.where(mine[:, None], changed[effect], 0.0)
             elif effect == "energy_spread":  # by the square of the amount
                 scale = (1 + self.errors.calibration)[:, None, None] / DELTA**2
                 yield self.seen(scale * self.curved)
@@ -333,26 +336,16 @@ class Predicted:
             else:
                 raise EffectError(f"'{effect}' does not act on a closed orbit")
 
-    def _read_otherwise(self, effect: str, place: str | None) -> Array:
-        out, at = np.zeros_like(self.read), self.monitor(place)
-        if at >= 0:
-            out[:, at] = self.monitor_slope(effect, at)
-        return out
-
-    def monitor(self, name: str | None) -> int:
-        """Index among the measured monitors; -1 for none."""
-        return self._monitors.get(self.data.ring[name or ""].name, -1)
-
     @cached_property
-    def _monitors(self) -> dict[str, int]:
-        return {self.data.ring[name].name: i for i, name in enumerate(self.data.measured.monitors)}
+    def monitors(self) -> list[str]:
+        """Names of the measured monitors in the ring."""
+        return [self.data.ring[name].name for name in self.data.measured.monitors]
 
-    def monitor_slope(self, name: str, at: int) -> Array:
-        """d reading / d amount of an effect on one measured monitor, m, [column, 2]."""
-        effect, read, nothing = find(name), self.read[:, at], np.zeros((1, 2))
-        assert isinstance(effect, ReadingEffect)
+    def of_monitors(self, effect: ReadingEffect) -> Array:
+        """d reading / d amount of a further effect, for every monitor, m, [column, monitor, 2]."""
         steps = (1.0, 0.0) if effect.discrete else (SMALL * effect.largest, -SMALL * effect.largest)
-        up, down = (effect.change(read, h) - effect.change(nothing, h) for h in steps)
+        nothing = np.zeros(2)
+        up, down = (effect.change(self.read, h) - effect.change(nothing, h) for h in steps)
         return np.asarray((up - down) / (steps[0] - steps[1]))
 
     def with_causes(self, causes: Sequence[Cause]) -> "Predicted":

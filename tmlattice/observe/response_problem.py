@@ -25,7 +25,14 @@ from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
 from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
 from tmlattice.errors import UnstableRingError
-from tmlattice.inference.problem import Hypothesis, Metric, Point, Products
+from tmlattice.inference.problem import (
+    Hypothesis,
+    Metric,
+    Point,
+    Products,
+    effects_on_readings,
+    effects_on_ring,
+)
 from tmlattice.observe.orbit_response import Predicted
 from tmlattice.observe.response_data import ResponseData
 from tmlattice.observe.stored import Steady, SteadyMetric
@@ -114,14 +121,18 @@ class Response(Steady):
             row[:] = slope
         return out
 
+    def of_monitors(self, view: Predicted, nuisances: Array, effect: ReadingEffect) -> Array:
+        """d reading / d amount of a further effect, for every monitor, m, [column, monitor, 2]."""
+        return view.of_monitors(effect)
+
     def metric(self, point: Point) -> Metric:
         """Return products from factors."""
         return ResponseMetric(self, point)
 
     @property
     def monitors(self) -> Sequence[str]:
-        """Monitors of the measurement."""
-        return self.base.data.measured.monitors
+        """Monitors of the measurement, as the ring names them."""
+        return self.base.monitors
 
     def owner(self) -> Indices:
         """Monitor of each reading."""
@@ -133,26 +144,33 @@ class ResponseMetric(SteadyMetric):
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
         """Put in products of errors of the ring and of monitors; return their indices."""
-        kinds = [find(name) for name, _ in hypotheses]
-        on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
+        done = super().quick(hypotheses, data, found)
+        on_ring = effects_on_ring(hypotheses)
         if len(on_ring):
-            self._on_ring(hypotheses, on_ring, data, found)
-        of_monitors = np.flatnonzero([isinstance(kind, ReadingEffect) for kind in kinds])
-        if len(of_monitors):
-            self._of_monitors(hypotheses, of_monitors, data, found)
-        return np.concatenate([on_ring, of_monitors])
+            here = _Here(self.point.view, self.problem.used, self.problem.sigma)
+            sums = here.sums(data)
+            for part in np.split(
+                on_ring, range(here.slopes.at_once, len(on_ring), here.slopes.at_once)
+            ):
+                some = here.read([hypotheses[i] for i in part])
+                found.put(part, here.squares(some), 0.0, some.products(sums))
+        return np.concatenate([done, on_ring])
 
     def pieces(self, hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[Indices, Array]]:
         """Yield signatures at some monitors at a time, from the factors of all ring errors."""
-        kinds = [find(name) for name, _ in hypotheses]
-        on_ring = np.flatnonzero([isinstance(kind, RingEffect) for kind in kinds])
-        of_monitors = np.flatnonzero([isinstance(kind, ReadingEffect) for kind in kinds])
-        rest = np.setdiff1d(np.arange(len(kinds)), [*on_ring, *of_monitors])
+        view, on_ring = self.point.view, effects_on_ring(hypotheses)
+        of_monitors = [
+            (which, at, view.of_monitors(effect))
+            for effect, which, at in effects_on_readings(hypotheses, self.problem.monitors)
+        ]
+        others = np.concatenate([on_ring, *(which for which, _, _ in of_monitors)])
+        rest = np.setdiff1d(np.arange(len(hypotheses)), others)
         whole = self.rows([hypotheses[int(i)] for i in rest])
-        here = _Here(self.point.view, self.problem.used, self.problem.sigma)
+        here = _Here(view, self.problem.used, self.problem.sigma)
         some = here.read([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
-        places = np.array([self.point.view.monitor(hypotheses[int(i)][1]) for i in of_monitors])
-        used, row = self.problem.used, self._numbered()
+        used = self.problem.used
+        row = np.zeros(used.shape, dtype=np.intp)
+        row[used] = np.arange(np.count_nonzero(used))
         measured = np.flatnonzero(used.any(axis=(0, 2)))
         count = max(AT_ONCE // max(len(hypotheses) * used[:, 0].size, 1), 1)
         for start in range(0, len(measured), count):
@@ -163,45 +181,12 @@ class ResponseMetric(SteadyMetric):
                 own = np.zeros((len(hypotheses), np.count_nonzero(there)))
                 if some is not None:
                     own[on_ring] = here.at(int(at), some)[:, there]
-                for i in of_monitors[places == at]:
-                    slope = self.point.view.monitor_slope(hypotheses[int(i)][0], int(at))
-                    own[i] = (slope / self.problem.sigma[at])[there]
+                for which, places, slope in of_monitors:
+                    own[which[places == at]] = (slope[:, at] / self.problem.sigma[at])[there]
                 own[rest] = whole[:, row[:, at][there]]
                 out.append(own)
             rows = [row[:, at][used[:, at]] for at in group]
             yield np.concatenate(rows), np.concatenate(out, axis=1)
-
-    def _numbered(self) -> Indices:
-        """Row of each used reading, of the readings' shape."""
-        used = self.problem.used
-        row = np.zeros(used.shape, dtype=np.intp)
-        row[used] = np.arange(np.count_nonzero(used))
-        return row
-
-    def _on_ring(
-        self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
-    ) -> None:
-        """Put in products of ring errors, from their factors."""
-        here = _Here(self.point.view, self.problem.used, self.problem.sigma)
-        sums = here.sums(data)
-        for start in range(0, len(which), here.slopes.at_once):
-            part = which[start : start + here.slopes.at_once]
-            some = here.read([hypotheses[i] for i in part])
-            found.put(part, here.squares(some), 0.0, some.products(sums))
-
-    def _of_monitors(
-        self, hypotheses: Sequence[Hypothesis], which: Indices, data: Array, found: Products
-    ) -> None:
-        """Put in products of monitor errors, from each monitor's own rows."""
-        used, row = self.problem.used, self._numbered()
-        places = np.array([self.point.view.monitor(hypotheses[i][1]) for i in which])
-        for at in np.unique(places[places >= 0]):
-            own = which[places == at]
-            there = used[:, at]
-            slopes = [self.point.view.monitor_slope(hypotheses[i][0], at) for i in own]
-            rows = (np.stack(slopes) / self.problem.sigma[at])[:, there]
-            inner = rows @ data[:, row[:, at][there]].T
-            found.put(own, np.einsum("hr,hr->h", rows, rows), 0.0, inner)
 
 
 @dataclass(frozen=True)

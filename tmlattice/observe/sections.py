@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,8 @@ from tmlattice.effects import Cause, Settings
 from tmlattice.inference import chi2
 from tmlattice.inference.newton import ROUNDS, SETTLED
 from tmlattice.lattice import Ring
+from tmlattice.maps.quadratic import Quadratic
+from tmlattice.maps.taylor import second_derivatives
 
 Places = NDArray[np.intp]
 
@@ -43,56 +44,13 @@ MOST = 8
 """Monitors of a section; four coordinates leave three quarters of their readings as a test."""
 
 
-@dataclass(frozen=True)
-class Maps:
-    """Second-order maps x -> c0 + c1 x + x c2 x of (x, px, y, py, delta), stacked.
-
-    Attributes:
-        c0, c1, c2: [..., out], [..., out, 5], [..., out, 5, 5].
-    """
-
-    c0: Array
-    c1: Array
-    c2: Array
-
-    def __call__(self, x: Array) -> tuple[Array, Array]:
-        """Return images [..., out] of states [..., 5], and their slopes [..., out, 5]."""
-        bent = np.einsum("...oij,...j->...oi", self.c2, x)
-        image = self.c0 + np.einsum("...oi,...i->...o", self.c1 + bent, x)
-        return image, self.c1 + 2 * bent
-
-    def after(self, first: "Maps") -> "Maps":
-        """Return these maps after others, to second order."""
-        fed = np.einsum("...oij,...j->...oi", self.c2, first.c0)
-        slope = self.c1 + 2 * fed
-        bent = np.swapaxes(first.c1, -1, -2)[..., None, :, :] @ self.c2 @ first.c1[..., None, :, :]
-        size = first.c2.shape
-        bent = bent + (slope @ first.c2.reshape(*size[:-2], -1)).reshape(bent.shape)
-        return Maps(
-            self.c0 + np.einsum("...oi,...i->...o", self.c1 + fed, first.c0),
-            slope @ first.c1,
-            bent,
-        )
-
-    def __getitem__(self, at: Any) -> "Maps":
-        return Maps(self.c0[at], self.c1[at], self.c2[at])
-
-
-def _five(weights: Sequence[Array]) -> Maps:
-    """Stacked weights in six coordinates as maps of five."""
+def _five(weights: Sequence[Array]) -> Quadratic:
+    """Stacked weights in six coordinates as maps of (x, px, y, py, delta)."""
     W0, W1, W2 = weights
-    n = W1.shape[-1]
-    rows, columns = np.triu_indices(n)
-    T = np.zeros((*W2.shape[:-1], n, n))
-    T[..., rows, columns] = W2 / 2
-    T = T + np.swapaxes(T, -1, -2)
-    if W0.shape[-1] == n:
+    T = second_derivatives(W2) / 2
+    if W0.shape[-1] == W1.shape[-1]:
         W0, W1, T = W0[..., KEPT], W1[..., KEPT, :], T[..., KEPT, :, :]
-    return Maps(W0, W1[..., KEPT], T[..., KEPT, :][..., KEPT])
-
-
-def _stacked(several: Sequence[Maps]) -> Maps:
-    return Maps(*(np.stack([getattr(own, c) for own in several]) for c in ("c0", "c1", "c2")))
+    return Quadratic(W0, W1[..., KEPT], T[..., KEPT, :][..., KEPT])
 
 
 @dataclass(frozen=True)
@@ -257,9 +215,10 @@ class Sections:
         for group in model.groups:
             self.group[group.shots] = group.number
         layers = [group.layers for group in model.groups]
-        self._steps = _stacked([_five(own.W) for own in layers])
-        self._reads = _stacked([_five(own.R)[monitors] for own in layers])
-        self._design = _five(Layers.of(model.maps).W)
+        self._steps = [np.stack(own) for own in zip(*(own.W for own in layers), strict=True)]
+        reads = [np.stack(own) for own in zip(*(own.R for own in layers), strict=True)]
+        self._reads = _five(reads)[:, monitors]
+        self._design = Layers.of(model.maps).W
         exits = layers[0].at[monitors]
         size = int(np.clip(len(monitors) // 12, 4, MOST))
         count = max(len(monitors) // size, 1)
@@ -272,42 +231,41 @@ class Sections:
         """Return the sections with the settings' changes multiplied: maps are linear in kicks."""
         made = copy(self)
         made.__dict__.pop("_made", None)
-        made._steps = Maps(*(
-            getattr(self._design, c)
-            + factor * (getattr(self._steps, c) - getattr(self._design, c))
-            for c in ("c0", "c1", "c2")
-        ))  # fmt: skip
+        made._steps = [
+            design + factor * (own - design)
+            for design, own in zip(self._design, self._steps, strict=True)
+        ]
         return made
 
     @cached_property
-    def _made(self) -> tuple[Maps, Maps, Array]:
+    def _made(self) -> tuple[Quadratic, Quadratic, Array]:
         """Maps from the start of each section to its monitors [group, monitor], and to its end
         [group, section], all sections at once, step by step; and unit kicks at the monitors,
         carried back to the start, [monitor, 4, plane]."""
-        groups, count = len(self._steps.c0), len(self._bounds)
+        steps, reads = _five(self._steps), self._reads
+        groups, count = len(steps.B), len(self._bounds)
         first = np.array([start for start, _ in self._bounds])
         length = np.array([end - start for start, end in self._bounds])
-        steps, reads = self._steps, self._reads
-        way = Maps(
+        way = Quadratic(
             np.zeros((groups, count, 5)),
             np.tile(np.eye(5), (groups, count, 1, 1)),
             np.zeros((groups, count, 5, 5, 5)),
         )
         section = np.concatenate([np.full(len(own), w) for w, own in enumerate(self._members)])
         at = self._exits - first[section]  # steps within the section
-        seen = Maps(*(np.zeros_like(c) for c in (reads.c0, reads.c1, reads.c2)))
+        seen = Quadratic(*(np.zeros_like(getattr(reads, name)) for name in "BRT"))
         before = np.tile(np.eye(4), (len(at), 1, 1))
         for step in range(int(length.max()) + 1):
             here = np.flatnonzero(at == step)
             if len(here):
                 now = reads[:, here].after(way[:, section[here]])
-                for name in ("c0", "c1", "c2"):
+                for name in "BRT":
                     getattr(seen, name)[:, here] = getattr(now, name)
-                before[here] = way.c1[0, section[here], :4, :4]
+                before[here] = way.R[0, section[here], :4, :4]
             go = np.flatnonzero(step < length)
             if len(go):
                 moved = steps[:, first[go] + step].after(way[:, go])
-                for name in ("c0", "c1", "c2"):
+                for name in "BRT":
                     getattr(way, name)[:, go] = getattr(moved, name)
         return seen, way, np.asarray(np.linalg.inv(before)[..., 1::2], dtype=float)
 
@@ -327,7 +285,7 @@ class Sections:
         sigma = np.where(there, passes.sigma[owner], np.inf)
         count = np.asarray(there.sum(axis=2), dtype=np.int64)  # [pass, section, plane]
         freedom = np.maximum(count - TWO, 0).sum(axis=2)
-        prior = _prior_precision(passes, maps.c1, padded, count)
+        prior = _prior_precision(passes, maps.R, padded, count)
         x = np.zeros((P, W, 5))
         x[..., 4] = passes.delta[:, None]
         moved, by_energy = np.inf, np.zeros((P, W, 4))
@@ -367,7 +325,7 @@ class Sections:
         most = there.sum(axis=(2, 3)).argmax(axis=0), np.arange(W)  # the pass of each section
         own = np.where(padded[:, :, None, None], kicks[np.where(padded, owner, 0)], 0.0)
         behind = np.tril(np.ones((width, width)), -1)[:, None, :, None]  # reading, kick
-        kicked = np.einsum("wkpi,wmiq->wkpmq", maps.c1[most][..., :4], own) * behind
+        kicked = np.einsum("wkpi,wmiq->wkpmq", maps.R[most][..., :4], own) * behind
         kicked = kicked.reshape(W, 2 * width, -1) / sigma[most].reshape(W, -1, 1)
         moved_start = covariance[most] @ np.swapaxes(A[most], -1, -2) @ kicked
         carried_back = np.moveaxis(own, 1, 2).reshape(W, 4, -1)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
@@ -34,7 +35,17 @@ from tmlattice.effects import (
 )
 from tmlattice.effects.effect import MIN_STRENGTH
 from tmlattice.errors import LatticeError, UnstableRingError
-from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Metric, Point, Problem
+from tmlattice.inference.problem import (
+    NO_KICKS,
+    Hypothesis,
+    Kicks,
+    Metric,
+    Point,
+    Problem,
+    Products,
+    effects_on_readings,
+    effects_on_ring,
+)
 from tmlattice.inference.whitening import Projection
 from tmlattice.lattice import Ring
 
@@ -71,6 +82,10 @@ class Steady(Problem):
     def signatures(self, view: Any, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
         """d readings / d amount ** power of one cause more, [hypothesis, ...]; of a discrete effect
         its change, of an invisible one zero."""
+
+    @abstractmethod
+    def of_monitors(self, view: Any, nuisances: Array, effect: ReadingEffect) -> Array:
+        """d readings / d amount of a further effect, for every monitor, of the kind's shape."""
 
     def directions(self, view: Any, nuisances: Array) -> Array:
         """d readings / d nuisance, [nuisance, ...]; here none."""
@@ -155,7 +170,7 @@ class Steady(Problem):
 
 
 class SteadyMetric(Metric):
-    """Products at one point, with the kind's signatures."""
+    """Products at one point; errors of monitors from their own readings."""
 
     def __init__(self, problem: Steady, point: Point) -> None:
         assert point.projection is not None
@@ -168,6 +183,30 @@ class SteadyMetric(Metric):
         return self.problem.as_rows(
             self.problem.signatures(point.view, point.nuisances, hypotheses)
         )
+
+    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
+        """Put in products of monitor errors, by effect; return their indices."""
+        problem, point, done = self.problem, self.point, [np.zeros(0, dtype=np.intp)]
+        owner, count = problem.owner()[problem.used], len(problem.monitors)
+        read = np.flatnonzero(owner >= 0)
+        belongs = csr_array(  # the last column, at -1, has no readings
+            (np.ones(len(read)), (read, owner[read])), shape=(len(owner), count + 1)
+        )
+        vectors = self.vectors(data)
+        for effect, which, at in effects_on_readings(hypotheses, problem.monitors):
+            row = problem.as_rows(problem.of_monitors(point.view, point.nuisances, effect))
+            self.put(which, (row**2 @ belongs)[at], ((vectors * row) @ belongs)[:, at].T, found)
+            done.append(which)
+        return np.concatenate(done)
+
+    def vectors(self, data: Array) -> Array:
+        """Rows of data, then those that the nuisances span."""
+        return np.concatenate([data, self.projection.Q[0].T])
+
+    def put(self, which: Indices, whole: Array, along: Array, found: Products) -> None:
+        """Set squares [hypothesis], and products with `vectors` [hypothesis, vector]."""
+        data = found.inner.shape[1]
+        found.put(which, whole, (along[:, data:] ** 2).sum(axis=1), along[:, :data])
 
     def free_monitors(self, clean: Array) -> tuple[Array, Array]:
         """Information of all readings of each monitor, and product with data."""
@@ -351,9 +390,8 @@ class Stored(Steady):
     def signatures(self, view: Beams, nuisances: Array, hypotheses: Sequence[Hypothesis]) -> Array:
         """Signatures: effects on the ring in closed form, those on monitors by differences."""
         out = np.zeros((len(hypotheses), *self.used.shape))
-        kinds = [find(name) for name, _ in hypotheses]
-        on_ring = [i for i, kind in enumerate(kinds) if isinstance(kind, RingEffect)]
-        if on_ring:
+        on_ring = effects_on_ring(hypotheses)
+        if len(on_ring):
             some = [hypotheses[i] for i in on_ring]
             matrix = view.monitors.matrix()
             known: dict[int, Moved] = {}
@@ -364,15 +402,11 @@ class Stored(Steady):
                 [known[id(beam)] for beam in view.beams], view.monitors.late
             )
             out[on_ring] = self.readings_of(moved, nuisances)
-        place = {monitor.name: i for i, monitor in enumerate(self.ring.monitors)}
-        for name in dict.fromkeys(name for name, _ in hypotheses):
-            effect = find(name)
-            if isinstance(effect, ReadingEffect):
-                own = [i for i, h in enumerate(hypotheses) if h[0] == name]
-                changed = self.of_monitors(view, nuisances, effect)
-                for i in own:
-                    mine = self.read_by == place[hypotheses[i][1] or ""]
-                    out[i][mine] = changed[mine]
+        for effect, which, at in effects_on_readings(hypotheses, self.monitors):
+            changed = self.of_monitors(view, nuisances, effect)
+            for i, monitor in zip(which, at, strict=True):
+                mine = self.read_by == monitor
+                out[i][mine] = changed[mine]
         return out
 
     def of_monitors(self, view: Beams, nuisances: Array, effect: ReadingEffect) -> Array:

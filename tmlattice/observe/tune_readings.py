@@ -13,7 +13,7 @@ from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TuneReading
 from tmlattice.observe.stored import Stored, rf_of, stacked
-from tmlattice.optics import ring_tunes
+from tmlattice.optics import ring_tunes, short_way
 
 DELTA = 5e-4
 """Energy deviation dE / p0 c on both sides of the nominal one, for the chromaticity."""
@@ -43,7 +43,7 @@ class TuneReadings(Stored):
     def readings_of(self, states: Sequence[Moved], nuisances: Array) -> Array:
         """Return the tunes, and the chromaticities from the two outer states of each shot."""
         tunes = stacked(states, "tunes")
-        slope = (tunes[..., 1::3, :] - tunes[..., 2::3, :] + 0.5) % 1.0 - 0.5
+        slope = short_way(tunes[..., 1::3, :] - tunes[..., 2::3, :])
         return np.concatenate([tunes[..., ::3, :], slope / self.energies], axis=-1)
 
 
@@ -62,12 +62,12 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     design = np.array(
         [StoredBeam(ResponseModel(apply(ring, (), one), 6, rf_of(one))).tunes for one in settings]
     )
-    near = design + (measured.tune - design + 0.5) % 1.0 - 0.5
+    near = design + short_way(measured.tune - design)
     slopes = np.full((shots, 2), np.nan)
     if measured.chromaticity is not None:
         slopes = measured.chromaticity
         up, down = (StoredBeam(ResponseModel(ring, 6, h)).tunes for h in (step, -step))
-        own = ((up - down + 0.5) % 1.0 - 0.5) / energies
+        own = short_way(up - down) / energies
         most = LARGEST * (1 + np.abs(own) + (ring_tunes(ring) or [0.0, 0.0]))
         for shot, plane in np.argwhere(np.abs(slopes - own) > most)[:1]:
             raise MeasurementError(
@@ -111,7 +111,7 @@ def fringe_uncertainty(ring: Ring) -> Array:
     before, after = (
         StoredBeam(ResponseModel(own)).tunes for own in (ring, ring.with_elements(wider))
     )
-    return np.asarray(((after - before + 0.5) % 1.0 - 0.5) / WIDER)
+    return short_way(after - before) / WIDER
 
 
 def _filled(errors: Array | None, usual: float, shots: int) -> Array:

@@ -29,18 +29,18 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.effects import ReadingEffect, RingEffect, Settings, find
+from tmlattice.effects import Settings, find
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.inference.problem import Hypothesis, Metric, Point, Products
+from tmlattice.inference.problem import Hypothesis, Metric, Point, Products, effects_on_ring
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
 from tmlattice.observe.stored import Beams, SteadyMetric, Stored, rf_of, seen_by, stacked
+from tmlattice.optics import short_way
 
 TUNE = 3e-4
 """Smallest error of a tune: it moves with the unknown energy."""
@@ -201,7 +201,7 @@ def _fill(
     modes, tunes, actions, kept = (own.reshape(len(SCALES), len(shots), *own.shape[1:])
                                    for own in every)  # fmt: skip
     whole, half, first = (modes[i] - modes[-1] for i in range(3))
-    tune, tune_half, tune_first = ((tunes[i] - tunes[-1] + 0.5) % 1.0 - 0.5 for i in range(3))
+    tune, tune_half, tune_first = (short_way(tunes[i] - tunes[-1]) for i in range(3))
     # tracked actions over the measured ones; a mode that was not kicked makes no shift
     alone = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0)])[:, None]
     over = np.where(size == 0, alone, actions[:3] / np.maximum(np.abs(size) ** 2, TINY))
@@ -257,53 +257,16 @@ def too_large(shift: Shift, shots: Sequence[int], found: Lines) -> list[str]:
     ]
 
 
-class StoredMetric(SteadyMetric):
-    """Products at one point of a `Stored` problem; errors of monitors from their own readings."""
+class TurnsMetric(SteadyMetric):
+    """Products at one point of turn-by-turn data."""
 
     problem: Stored
 
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
-        """Put in products of monitor errors, by effect; return their indices."""
-        problem, done = self.problem, [np.zeros(0, dtype=np.intp)]
-        owner = problem.owner()[problem.used]
-        place = {name: i for i, name in enumerate(problem.monitors)}
-        read = np.flatnonzero(owner >= 0)
-        belongs = csr_array(
-            (np.ones(len(read)), (read, owner[read])), shape=(len(owner), len(place))
-        )
-        vectors = self.vectors(data)
-        for name in dict.fromkeys(name for name, _ in hypotheses):
-            effect = find(name)
-            if isinstance(effect, ReadingEffect):
-                which = np.array([i for i, h in enumerate(hypotheses) if h[0] == name])
-                at = [place[hypotheses[i][1] or ""] for i in which]
-                row = problem.as_rows(
-                    problem.of_monitors(self.point.view, self.point.nuisances, effect)
-                )
-                along = ((vectors * row) @ belongs)[:, at].T
-                self.put(which, (row**2 @ belongs)[at], along, found)
-                done.append(which)
-        return np.concatenate(done)
-
-    def vectors(self, data: Array) -> Array:
-        """Rows of data, then those that the nuisances span."""
-        return np.concatenate([data, self.projection.Q[0].T])
-
-    def put(self, which: Indices, whole: Array, along: Array, found: Products) -> None:
-        """Set squares [hypothesis], and products with `vectors` [hypothesis, vector]."""
-        data = found.inner.shape[1]
-        found.put(which, whole, (along[:, data:] ** 2).sum(axis=1), along[:, :data])
-
-
-class TurnsMetric(StoredMetric):
-    """Products at one point of turn-by-turn data."""
-
-    def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
         """Put in products of errors of the ring and of monitors; return their indices."""
         done = super().quick(hypotheses, data, found)
-        ring = [i for i, (name, _) in enumerate(hypotheses) if isinstance(find(name), RingEffect)]
-        which = np.array(ring, dtype=np.intp)
-        whole, along = self._on_ring([hypotheses[i] for i in ring], self.vectors(data))
+        which = effects_on_ring(hypotheses)
+        whole, along = self._on_ring([hypotheses[i] for i in which], self.vectors(data))
         self.put(which, whole, along, found)
         return np.concatenate([done, which])
 
@@ -387,7 +350,7 @@ class ManyTurns(Stored):
     @property
     def _turn(self) -> Array:
         """Measured phase advance of both lines per turn, [shot, mode], rad, in (-pi, pi)."""
-        return np.asarray(2 * np.pi * ((self.values[:, -2:] + 0.5) % 1 - 0.5))
+        return 2 * np.pi * short_way(self.values[:, -2:])
 
     def with_turn_offsets(self, states: Sequence[Moved], late: Array) -> list[Moved]:
         """Return the states after the phase of each monitor's turn offset."""
@@ -497,7 +460,7 @@ def _chromatic(beam: StoredBeam, at: Array) -> tuple[Array, ComplexArray]:
     def orders(zero: Any, up: Any, down: Any) -> Any:
         return np.stack([(up - down) / (2 * STEP), (up - 2 * zero + down) / (2 * STEP**2)])
 
-    tunes = [(end.tunes - ends[0].tunes + 0.5) % 1.0 - 0.5 for end in ends]
+    tunes = [short_way(end.tunes - ends[0].tunes) for end in ends]
     delays = [np.exp(-2j * np.pi * at[:, None, None] * own) for own in tunes]
     modes = [end.modes * own for end, own in zip(ends, delays, strict=True)]
     return orders(*tunes), orders(*modes)
@@ -559,7 +522,7 @@ def many_turns(
     energy = np.maximum(_faded(found), 1e-3)[..., None] * [ASYMMETRY, 1.0, 1.0, 1.0]
     known = np.concatenate([shift.error.swapaxes(1, 2), energy], axis=2)
     known = known.reshape(shots, -1) * np.sqrt(shots)
-    tunes = design + (found.tune - design + 0.5) % 1.0 - 0.5
+    tunes = design + short_way(found.tune - design)
     data = np.concatenate([both.reshape(shots, -1), np.zeros_like(known), tunes], axis=1)
     tune_error = np.sqrt(found.tune_error**2 + TUNE**2)
     errors = np.concatenate([np.repeat(error, 2, axis=1), known, tune_error], axis=1)
