@@ -75,7 +75,7 @@ class Quadratic:
         """The maps of a stack."""
         if self.T is None:
             return [Quadratic(B, R, None) for B, R in zip(self.B, self.R, strict=True)]
-        bent: Flags = self.T.any(axis=(-3, -2, -1))
+        bent: Flags = np.asarray(self.T.any(axis=(-3, -2, -1)))
         return [Quadratic(B, R, T if some else None)
                 for B, R, T, some in zip(self.B, self.R, self.T, bent, strict=True)]  # fmt: skip
 
