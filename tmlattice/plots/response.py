@@ -127,19 +127,21 @@ def plot_steps(result: Diagnosis, ax: Axes | None = None) -> Axes:
     """Held-out rms of each step, and with the decision on each family reversed; thin lines: of the
     fit with the decisions as they are."""
     labels = step_labels(result)
+    height = np.maximum([len(lines) for lines in labels], 2) / 2  # a long label takes more room
+    at = np.cumsum(height) - height / 2
     if ax is None:
-        ax = plt.subplots(figsize=(9, 1.5 + 0.25 * len(labels)), layout="constrained")[1]
+        ax = plt.subplots(figsize=(9, 1.5 + 0.25 * sum(height)), layout="constrained")[1]
     for name, label, colour, marker in RESIDUALS:
         values = [1e6 * getattr(step, name) for step in (*result.steps, *result.families)]
-        ax.plot(values, range(len(values)), marker, color=colour, ms=5, label=label)
+        ax.plot(values, at, marker, color=colour, ms=5, label=label)
         if result.families:
             ax.axvline(values[min(1, len(result.steps) - 1)], color=colour, linewidth=0.5)
     sigma = 1e6 * result.gap["noise"]
     ax.axvline(sigma, color="0.5", linestyle=":", label="noise of a reading")
     plain_log(ax.xaxis)
     ax.set_xlabel("held-out rms [µm]")
-    ax.set_yticks(range(len(labels)), ["\n".join(lines) for lines in labels], fontsize=7)
-    ax.axhline(len(result.steps) - 0.5, color="0.4", linewidth=0.8)
+    ax.set_yticks(at, ["\n".join(lines) for lines in labels], fontsize=7)
+    ax.axhline(sum(height[: len(result.steps)]), color="0.4", linewidth=0.8)
     ax.invert_yaxis()
     ax.grid(alpha=GRID)
     ax.legend(frameon=False, fontsize=8)
