@@ -93,6 +93,11 @@ def test_single_quadrupoles_correct_their_own_errors(small_ring, wrong):
     assert (after < 0.05 * before).all()
     predicted = [interval[0] for interval in found.before["beta_beating"]]
     np.testing.assert_allclose(predicted, before, rtol=0.01)
+    for width in (80, 120):  # what fits on a terminal has the best device and every target
+        lines = found.report(width, 36).splitlines()
+        assert len(lines) <= 36 < len(found.report(width).splitlines())
+        assert any(line.startswith(found.settings[0].knob.name) for line in lines)
+        assert sum(line.startswith("beta beating") for line in lines) == 2
     one = correct(apply(small_ring, wrong[:1]), goal=small_ring, knobs=["quadrupoles"],
                   targets=NO_ORBIT)  # fmt: skip
     assert [s.knob.name for s in one.settings] == [wrong[0].element]  # few where few are enough

@@ -30,10 +30,11 @@ def setting_rows(correction: Correction, most: int = MOST) -> list[list[str]]:
     return rows
 
 
-def expected_rows(correction: Correction) -> list[list[str]]:
-    """Head and rows of the table of targets."""
+def expected_rows(correction: Correction, short: bool = False) -> list[list[str]]:
+    """Head and rows of the table of errors; short: of the targets alone, without what limits
+    them."""
     rows = [["rms", "", "now", "expected", "68 %", "not reachable", "not determined"]]
-    for name in correction.before:
+    for name in correction.targets if short else correction.before:
         target = TARGETS[name]
         for plane in (0, 1):
             now, *_ = correction.before[name][plane]
@@ -43,7 +44,7 @@ def expected_rows(correction: Correction) -> list[list[str]]:
             words = target.words + ("" if name in correction.targets else " (no target)")
             rows.append([words, target.planes[plane], shown[0], shown[1],
                          f"{shown[2].split(' ')[0]} to {shown[3]}", *shown[4:]])  # fmt: skip
-    return rows
+    return [row[:5] for row in rows] if short else rows
 
 
 def amount(name: str, value: float) -> str:
@@ -69,13 +70,17 @@ def gain_rows(correction: Correction) -> list[list[str]]:
 
 
 def correction_text(correction: Correction, width: int = WIDTH, most: int | None = None) -> str:
-    """The whole report as plain text of so many columns; with fewer settings where only so many
-    lines are wanted."""
+    """The whole report as plain text of so many columns; with fewer settings, and the targets
+    alone, where only so many lines are wanted."""
+    room = inf if most is None else most
     lines = wrapped(correction.words, "", width)
-    more = ["", *columns(expected_rows(correction), width)]
-    gains = ["", "Expected rms with the first devices:", *columns(gain_rows(correction), width)]
     notes = [line for text in sentences(correction) for line in ("", *wrapped(text, "", width))]
-    room = inf if most is None else most - len(lines) - len(more) - len(notes) - 3
+    room -= len(lines) + len(notes) + 4
+    more = ["", *columns(expected_rows(correction), width)]
+    if len(more) + FEWEST > room:
+        more = ["", *columns(expected_rows(correction, short=True), width)]
+    room -= len(more)
+    gains = ["", "Expected rms with the first devices:", *columns(gain_rows(correction), width)]
     if correction.gains and room - len(gains) >= FEWEST:
         more += gains
         room -= len(gains)
