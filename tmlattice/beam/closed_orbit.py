@@ -116,7 +116,7 @@ class ResponseModel:
             UnstableRingError: no closed orbit.
         """
         other = copy(self)
-        # near the new orbit, which is its fixed point to second order in the step
+        # the new orbit to first order: fewer iterations
         near = self.state + (frequency - self.frequency) * self.rf_start
         other._forget()
         other._close(frequency, near)

@@ -33,14 +33,14 @@ def effects_on_ring(hypotheses: Sequence[Hypothesis]) -> Indices:
 def effects_on_readings(
     hypotheses: Sequence[Hypothesis], monitors: Sequence[str]
 ) -> Iterator[tuple[ReadingEffect, Indices, Indices]]:
-    """Yield each effect on readings, the indices of its hypotheses, and those of their monitors; -1
-    for another one."""
+    """Yield each effect on readings, the indices of its hypotheses at these monitors, and those of
+    the monitors."""
     index: dict[str | None, int] = {name: i for i, name in enumerate(monitors)}
     found: dict[ReadingEffect, list[tuple[int, int]]] = {}
     for i, (name, place) in enumerate(hypotheses):
         effect = find(name)
-        if isinstance(effect, ReadingEffect):
-            found.setdefault(effect, []).append((i, index.get(place, -1)))
+        if isinstance(effect, ReadingEffect) and place in index:
+            found.setdefault(effect, []).append((i, index[place]))
     for effect, own in found.items():
         which, at = np.array(own).T
         yield effect, which, at

@@ -249,9 +249,9 @@ class LayerMaps:
         readouts = []
         for drifts, run in groupby(elements, _drifts):
             if drifts:  # decks cut some straight sections into hundreds
-                length = sum(element.length for element in run)
-                way = drift(length, *at).after(way)
-            for element in () if drifts else run:
+                way = drift(sum(element.length for element in run), *at).after(way)
+                continue
+            for element in run:
                 if element.kind == "monitor":  # read in its middle; nearly all are thin
                     half = element.length / 2
                     here = drift(half, *at).after(way) if half else way

@@ -179,8 +179,8 @@ class FirstTurns(Problem):
     def kick_rows(self, point: Point, place: int) -> Array:
         """Rows of (px, py) in the middle of a magnet, independent in each active shot."""
         kicked = self.model.kick_signatures(point.view, np.array([place]))
-        alone = each_shot(kicked, np.flatnonzero(self.data.active))
-        return self.whitening.signature(alone).reshape(alone[..., 0, 0, 0].size, -1)
+        shots = np.flatnonzero(self.data.active)
+        return self.whitening.signature(each_shot(kicked, shots)).reshape(2 * len(shots), -1)
 
     def _of_shots(self, kicks: Kicks) -> dict[int, Array]:
         whole = {}

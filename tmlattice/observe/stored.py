@@ -187,11 +187,10 @@ class SteadyMetric(Metric):
     def quick(self, hypotheses: Sequence[Hypothesis], data: Array, found: Products) -> Indices:
         """Put in products of monitor errors, by effect; return their indices."""
         problem, point, done = self.problem, self.point, [np.zeros(0, dtype=np.intp)]
-        owner, count = problem.owner()[problem.used], len(problem.monitors)
+        owner = problem.owner()[problem.used]
         read = np.flatnonzero(owner >= 0)
-        belongs = csr_array(  # the last column, at -1, has no readings
-            (np.ones(len(read)), (read, owner[read])), shape=(len(owner), count + 1)
-        )
+        shape = len(owner), len(problem.monitors)
+        belongs = csr_array((np.ones(len(read)), (read, owner[read])), shape=shape)
         vectors = self.vectors(data)
         for effect, which, at in effects_on_readings(hypotheses, problem.monitors):
             row = problem.as_rows(problem.of_monitors(point.view, point.nuisances, effect))

@@ -8,8 +8,8 @@ from tmlattice.report.text import WIDTH, columns, wrapped
 
 MOST = 20
 """Devices that are listed; the table has all."""
-FEWEST = 4
-"""Devices, below which the table of what the first of them gain is left out."""
+FEWEST = 8
+"""Devices, below which other tables are shortened or left out."""
 ROUNDING = 1e-6
 """Share of a tolerance below which an error is shown as 0: rounding of the optics."""
 
@@ -75,9 +75,9 @@ def correction_text(correction: Correction, width: int = WIDTH, most: int | None
     room = inf if most is None else most
     lines = wrapped(correction.words, "", width)
     notes = [line for text in sentences(correction) for line in ("", *wrapped(text, "", width))]
-    room -= len(lines) + len(notes) + 4
+    room -= len(lines) + len(notes) + 2  # the blank line before the settings, and how many more
     more = ["", *columns(expected_rows(correction), width)]
-    if len(more) + FEWEST > room:
+    if len(more) + FEWEST > room:  # of the rest the page has more
         more = ["", *columns(expected_rows(correction, short=True), width)]
     room -= len(more)
     gains = ["", "Expected rms with the first devices:", *columns(gain_rows(correction), width)]
@@ -85,8 +85,10 @@ def correction_text(correction: Correction, width: int = WIDTH, most: int | None
         more += gains
         room -= len(gains)
     if correction.settings:
-        count = int(max(min(room, MOST), 1))
-        lines += ["", *columns(setting_rows(correction, count), width)]
+        count = min(MOST, len(correction.settings))
+        while len(table := columns(setting_rows(correction, count), width)) > room and count > 1:
+            count -= 1
+        lines += ["", *table]
         if len(correction.settings) > count:
             lines += [f"and {len(correction.settings) - count} more (settings.csv)"]
     more += notes
