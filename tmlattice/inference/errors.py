@@ -22,6 +22,7 @@ sampled from their posterior with the members integrated out, and the law of tot
 the additional variance of each number.
 """
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from copy import copy
 from itertools import combinations
@@ -440,9 +441,10 @@ class _Scales:
         new = [i for i, key in enumerate(keys) if key not in self.known]
         if new:
             scale, inside = self._inside(sizes[new])
-            pull = scale * self.score
-            square = np.sum(pull * np.linalg.solve(inside, pull[..., None])[..., 0], axis=-1)
-            found = 0.5 * (square - np.linalg.slogdet(inside)[1])
+            root = np.linalg.cholesky(inside)
+            pull = np.linalg.solve(root, (scale * self.score)[..., None])
+            log_volume = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+            found = 0.5 * np.sum(pull**2, axis=(-2, -1)) - log_volume
             self.known.update(zip([keys[i] for i in new], found.tolist(), strict=True))
         return np.array([self.known[key] for key in keys])
 
@@ -468,7 +470,7 @@ class _Scales:
         random = np.random.default_rng(0)
         here = np.where(np.isinf(self.now), 0.0, self.now)
         mean, stated = self.amounts(self.now)
-        total = np.zeros_like(stated)
+        visits: Counter[tuple[float, ...]] = Counter()
         for draw in range(DRAWS):
             for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
                 tried = np.repeat(here[None], len(choices), axis=0)
@@ -483,6 +485,9 @@ class _Scales:
                 if np.log(random.random()) < both:
                     here = other
             if draw >= BURN_IN:
-                then, spread = self.amounts(here)
-                total += spread + np.outer(then - mean, then - mean)
+                visits[tuple(here.tolist())] += 1
+        total = np.zeros_like(stated)
+        for sizes, times in visits.items():
+            then, spread = self.amounts(np.array(sizes))
+            total += times * (spread + np.outer(then - mean, then - mean))
         return np.asarray(total / (DRAWS - BURN_IN) - stated)

@@ -7,6 +7,7 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -77,7 +78,17 @@ def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
     """Return a root F of the covariance F F^T by unknown prior scales, those of rejected families
-    included, [parameter, direction]; see `stated`."""
+    included, [parameter, direction]; see `stated`. It is sampled once for each state."""
+    known = _SIZES.setdefault(state, {})
+    if block not in known:
+        known[block] = _sampled(state, block, there)
+    return known[block]
+
+
+_SIZES: WeakKeyDictionary[State, dict[int, Array]] = WeakKeyDictionary()
+
+
+def _sampled(state: State, block: int, there: Linear) -> Array:
     tried = [
         family
         for family in state.unneeded
