@@ -33,6 +33,7 @@ from tmlattice.diagnosis.response.rounds import (
     Evidence,
     evidence_of,
     linear_evidence,
+    one_round,
     settle,
 )
 from tmlattice.diagnosis.response.state import (
@@ -42,7 +43,6 @@ from tmlattice.diagnosis.response.state import (
     bend,
     forbid,
     jump,
-    projected,
 )
 from tmlattice.diagnosis.response.validation import (
     WORTH,
@@ -224,10 +224,9 @@ def _needed(
     removed = True
     while untested:
         if removed:
-            linear_worth, rejected = _quickly(state, untested, progress)
+            linear_worth, sure = _quickly(state, untested, progress)
             evidence |= {own: linear_worth[own] + LEAST for own in untested
                          if np.isfinite(linear_worth[own])}  # fmt: skip
-            sure = [own for own in untested if linear_worth[own] > SURE and not rejected[own]]
             worth |= {own: linear_worth[own] for own in sure}
             untested = sorted(
                 (own for own in untested if own not in worth), key=lambda own: linear_worth[own]
@@ -300,14 +299,21 @@ def reversed_decisions(
 ) -> HierarchicalFit:
     """Return the fit with the scores that each decision would have if it were reversed, after one
     round in which the other families are fitted again; none if that round diverges."""
+    rejected = [trial for trial, step in fit.decisions.items() if not step.kept]
+    state = allow(fit.state, [family for trial in rejected for family in trial])
+    there = {block: linear(state, block) for block in (0, 1) if state.of_block(block)}
     scored = {}
     for trial, step in fit.decisions.items():
         progress(step.reversed_decision)
-        try:
-            other = projected(forbid(fit.state, trial)) if step.kept else allow(fit.state, trial)
-            scores = score(settle(jump(other), _blocks(trial), 1), step.effect)
-        except (TmlatticeError, np.linalg.LinAlgError):
+        without = [own for own in rejected if own != trial] + [trial] * step.kept
+        names = {name for own in without for name in _priors(own, state)}
+        moved: State | None = state
+        for block in _blocks(trial):
+            if moved is not None and block in there:
+                moved = _moved_without(moved, block, there[block], names)
+        if moved is None:
             continue
+        scores = score(moved, step.effect)
         if scores.heldout_rms_in_plane < DIVERGED * fit.steps[0].heldout_rms_in_plane:
             scored[trial] = replace(scores, parameters=step.parameters, kept=step.kept,
                                     log_evidence=step.log_evidence)  # fmt: skip
@@ -437,12 +443,12 @@ def _asked(trial: Trial) -> bool:
 
 
 def _quickly(
-    state: State, trials: Iterable[Trial], progress: Callable[[str], Any]
-) -> tuple[dict[Trial, float], dict[Trial, bool]]:
-    """Log evidence of each trial beyond `LEAST`, linearised at the fit, which is sufficient in
-    clear cases; and whether validation rejects it."""
+    state: State, trials: Sequence[Trial], progress: Callable[[str], Any]
+) -> tuple[dict[Trial, float], list[Trial]]:
+    """Log evidence of each trial beyond `LEAST`, linearised at the fit; and the trials for which it
+    is sufficient: clearly needed, and not rejected by validation."""
     worth: dict[Trial, float] = {}
-    unwanted: dict[Trial, bool] = {}
+    sure: list[Trial] = []
     blocks: dict[int, tuple[Linear, tuple[float, dict[str, Array], Posterior | None]]] = {}
     for block in {trial[0].block for trial in trials} | {0}:
         if state.of_block(block):
@@ -456,25 +462,38 @@ def _quickly(
         own = (state.values[f.variable] for f in trial if state.allows(f.name))
         at_zero = not any(values.any() for values in own)
         if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
-            worth[trial], unwanted[trial] = -np.inf, False
+            worth[trial] = -np.inf
             continue
         block = trial[0].block
         there, (evidence, _, _) = blocks[block]
         other, values, found = linear_evidence(there, _priors(trial, state))
         worth[trial] = evidence - other - LEAST
+        log.info("%s: linear evidence %+.1f", _title(trial), worth[trial])
+        if worth[trial] <= SURE:
+            continue
         without_it = of_rf if block else rf_by_others(state, there, found)
         try:
             messages = lost(inner(state.moved({**state.values, **values}), without_it), validated)
         except TmlatticeError:  # no closed orbit without it
             messages = np.inf, 0.0
-        unwanted[trial] = _asked(trial) and against(messages)
-        log.info(
-            "%s: linear evidence %+.1f, validation %+.3f +- %.3f",
-            _title(trial),
-            worth[trial],
-            *messages,
-        )
-    return worth, unwanted
+        log.info("%s: validation %+.3f +- %.3f", _title(trial), *messages)
+        if not (_asked(trial) and against(messages)):
+            sure.append(trial)
+    return worth, sure
+
+
+def _moved_without(state: State, block: int, there: Linear, names: Collection[str]) -> State | None:
+    """The state after one round of a block in which some priors are narrow, so that their numbers
+    are zero; None if it has no closed orbit, or the others are not determined."""
+    groups = tuple(
+        replace(group, basis=0 * group.basis) if group.name in names else group
+        for group in there.groups
+    )
+    try:
+        moved, _, after = one_round(state, block, there._replace(groups=groups))
+    except np.linalg.LinAlgError:
+        return None
+    return moved if np.isfinite(after) else None
 
 
 def _without(state: State, trial: Trial) -> State:

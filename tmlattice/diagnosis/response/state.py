@@ -190,20 +190,6 @@ def forbid(state: State, families: Sequence[Family]) -> State:
     return replace(state, families=left, groups=groups, unneeded=unneeded).moved(values)
 
 
-def projected(state: State) -> State:
-    """The state with the values that its families can represent: of single gradients the mean of
-    each supply, for example, where a family of these has been removed."""
-    bases: dict[str, list[Array]] = {}
-    for family in state.families:
-        bases.setdefault(family.variable, []).extend(g.basis for g in family.groups(state.data))
-    values = dict(state.values)
-    for variable, own in bases.items():
-        if not any(len(basis) and (basis == np.eye(*basis.shape)).all() for basis in own):
-            basis = np.concatenate(own, axis=1)
-            values[variable] = basis @ np.linalg.lstsq(basis, values[variable], rcond=None)[0]
-    return state.moved(values)
-
-
 def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
     """Return each column's own estimate of its number from its near BPMs, with the third order of
     its step, or without it where that agrees better.
