@@ -65,9 +65,8 @@ log = logging.getLogger(__name__)
 
 LEAST = 5.0
 """Log evidence required for a family."""
-SPOILT, ENOUGH = 0.05, 3
-"""Largest rise of the validation score with all families together, and fewest correctors for this
-test: a single one may be near the design by chance."""
+SPOILT = 0.05
+"""Largest rise of the validation score with all families together."""
 ASTRAY, NEAR = 1.2, 1e-3
 """Largest unexplained share of the typical column's mean square: as a ratio to the design's, or
 itself if that is more. Above it the fit has diverged."""
@@ -163,13 +162,12 @@ def fit_families(
     state, gone, others, evidence = _needed(state, trials, most, progress)
     notes += others
     validated = inner(state)
-    enough = int(np.sum(validated.columns[:, 0, 1] > 0)) >= ENOUGH
-    worse = -lost(inner(replace(design, jitter=state.jitter)), validated)[0]
+    change = lost(inner(replace(design, jitter=state.jitter)), validated)
     nothing = HierarchicalFit(
         design, design, (before,), decisions(data, trials, (), evidence), tuple(notes),
         tuple(labels),
     )  # fmt: skip
-    if enough and worse > SPOILT:  # together they worsen the validation
+    if against(change, SPOILT):  # together they worsen the validation
         return nothing
     progress("result")
     # inner validation columns start at their own estimates: far from them they have no weight
