@@ -311,7 +311,9 @@ def reversed_decisions(
                 moved = _moved_without(moved, block, there[block], names)
         if moved is None:
             continue
-        scores = score(moved, step.effect)
+        gone = {family.name for own in without for family in own}
+        left = tuple(family for family in moved.families if family.name not in gone)
+        scores = score(replace(moved, families=left), step.effect)
         if scores.heldout_rms_in_plane < DIVERGED * fit.steps[0].heldout_rms_in_plane:
             scored[trial] = replace(scores, parameters=step.parameters, kept=step.kept,
                                     log_evidence=step.log_evidence)  # fmt: skip
