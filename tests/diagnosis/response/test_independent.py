@@ -61,6 +61,14 @@ def test_judges_count_what_they_know(rng):
     assert against(said)
 
 
+@pytest.mark.parametrize(("columns", "decides"), [(1, False), (2, False), (3, True)])
+def test_few_judges_that_agree_decide_nothing(rng, columns, decides):
+    own = np.ones(columns)
+    change = lost(judged(own, rng, columns), judged(1.2 * own, rng, columns))
+    assert change[0] == pytest.approx(-np.log(1.2))
+    assert against(change) is decides
+
+
 def test_error_of_the_judges_vs_drawn_again(rng):
     """The jackknife against the scatter of what other correctors would have said."""
 

@@ -448,15 +448,12 @@ def _quickly(
     """Log evidence of each trial beyond `LEAST`, linearised at the fit; and the trials for which it
     is sufficient: clearly needed, and not rejected by validation."""
     worth: dict[Trial, float] = {}
-    sure: list[Trial] = []
     blocks: dict[int, tuple[Linear, tuple[float, dict[str, Array], Posterior | None]]] = {}
     for block in {trial[0].block for trial in trials} | {0}:
         if state.of_block(block):
             there = linear(state, block)
             blocks[block] = there, linear_evidence(there)
-    in_plane = blocks.get(0)
-    of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
-    validated = inner(state, of_rf)
+    clear: dict[Trial, tuple[dict[str, Array], Posterior | None]] = {}
     for trial in trials:
         progress(with_labels(f"is {_title(trial)} needed"))
         own = (state.values[f.variable] for f in trial if state.allows(f.name))
@@ -464,20 +461,27 @@ def _quickly(
         if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
             worth[trial] = -np.inf
             continue
-        block = trial[0].block
-        there, (evidence, _, _) = blocks[block]
+        there, (evidence, _, _) = blocks[trial[0].block]
         other, values, found = linear_evidence(there, _priors(trial, state))
         worth[trial] = evidence - other - LEAST
         log.info("%s: linear evidence %+.1f", _title(trial), worth[trial])
-        if worth[trial] <= SURE:
-            continue
-        without_it = of_rf if block else rf_by_others(state, there, found)
+        if worth[trial] > SURE:
+            clear[trial] = values, found
+    sure = [trial for trial in clear if not _asked(trial)]
+    if len(sure) == len(clear):
+        return worth, sure
+    in_plane = blocks.get(0)
+    of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
+    validated = inner(state, of_rf)
+    for trial in [own for own in clear if own not in sure]:
+        block, (values, found) = trial[0].block, clear[trial]
+        without_it = of_rf if block else rf_by_others(state, blocks[block][0], found)
         try:
-            messages = lost(inner(state.moved({**state.values, **values}), without_it), validated)
+            change = lost(inner(state.moved({**state.values, **values}), without_it), validated)
         except TmlatticeError:  # no closed orbit without it
-            messages = np.inf, 0.0
-        log.info("%s: validation %+.3f +- %.3f", _title(trial), *messages)
-        if not (_asked(trial) and against(messages)):
+            change = np.inf, 0.0
+        log.info("%s: validation %+.3f +- %.3f", _title(trial), *change)
+        if not against(change):
             sure.append(trial)
     return worth, sure
 

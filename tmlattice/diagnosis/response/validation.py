@@ -32,7 +32,7 @@ from tmlattice.inference.normal import Posterior
 JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
 """Weights of log rms in the validation score: in-plane, coupling, RF (one reading per BPM); and the
 fall of the score that rejects a family against the evidence, which may fit model discrepancy."""
-ENOUGH = 3
+FEWEST = 3
 """Fewest correctors of a validation: a single one may agree by chance."""
 FLOOR = np.array([0.1, 0.1, 1.0])
 """Share of the noise that is added to each rms in quadrature, in-plane, coupling and RF: for
@@ -247,7 +247,7 @@ def inner(state: State, by_others: Array | None = None) -> Validated:
 def lost(without: Validated, within: Validated) -> tuple[float, float]:
     """Return the rise of the validation score (weighted log rms; lower is better) without a family,
     and its standard error by the jackknife over correctors and over BPMs of the RF's orbit. It is
-    infinite for fewer than `ENOUGH` correctors."""
+    infinite for fewer than `FEWEST` correctors."""
     whole = float(np.nansum(JUDGES * (without.logs - within.logs)))
     variance = 0.0
     for now, then, weights in (
@@ -259,7 +259,7 @@ def lost(without: Validated, within: Validated) -> tuple[float, float]:
             one_less = [_logs(own.sum(axis=0) - own[counted]) for own in (then, now)]
             changes = np.nansum(weights * (one_less[0] - one_less[1]), axis=1)
             variance += (len(changes) - 1) * float(np.var(changes))
-    enough = np.count_nonzero(within.columns[:, 0, 1]) >= ENOUGH
+    enough = np.count_nonzero(within.columns[:, 0, 1]) >= FEWEST
     return whole, float(np.sqrt(variance)) if enough else np.inf
 
 
