@@ -8,13 +8,14 @@ from shared import parted
 
 from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS
-from tmlattice.diagnosis.response.before_after import ANY
+from tmlattice.diagnosis.response.before_after import ANY, drifts
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
 from tmlattice.diagnosis.response.hierarchical import in_turn
 from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, and_orbits, undetermined
+from tmlattice.diagnosis.response.validation import remainder
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import Cause, find
 from tmlattice.inference.judgement import DEFAULT
@@ -126,14 +127,12 @@ def test_what_is_open_of_a_ring_is_in_what_changed(small_ring, crowded_change):
     magnet, which no ring has, other supplies explain it as well.)"""
     places = find("quadrupole_gradient").places(small_ring)
     errors = tuple(("quadrupole_gradient", place) for place in places)
-    of_one, of_three = (
-        changed_supplies(crowded_change, DEFAULT, Undetermined(errors, size * np.eye(len(places))))[
-            0
-        ]
+    (of_one, _, _), (of_three, _, state) = (
+        changed_supplies(crowded_change, DEFAULT, Undetermined(errors, size * np.eye(len(places))))
         for size in (0.01, 0.03)
     )
     assert {own.element for own in of_one} == set(CROWDED)
-    known, _ = changed_supplies(crowded_change, DEFAULT)
+    known, *_ = changed_supplies(crowded_change, DEFAULT)
     pulls = [(own.amount - CROWDED[own.element]) / own.amount_sigma for own in of_one]
     assert max(map(abs, pulls)) < 2.5
     most, sure, less = (
@@ -141,6 +140,25 @@ def test_what_is_open_of_a_ring_is_in_what_changed(small_ring, crowded_change):
     )
     assert 0 < less < 0.75 * sure
     assert sure < most
+    sigmas, wider = (
+        np.array([sigma for (_, sigma), _ in drifts(one)]) for one in (crowded_change, state)
+    )
+    assert np.all(wider > 0.999 * sigmas)  # of monitors and correctors, too
+    assert np.max(wider / sigmas) > 1.2
+
+
+def test_a_residual_is_compared_with_its_whole_covariance(fitted, rng):
+    """Against the inverse of the covariance by noise and undetermined errors."""
+    spread = 3e-6 * rng.standard_normal((4, *fitted.data.orbits.shape))
+    state = replace(begin(fitted.data, fitted.split), undetermined=spread)
+    (block,) = [own for own in remainder(state) if own.name == "fitted, in-plane"]
+    data = fitted.data
+    columns = np.flatnonzero(~fitted.split.held[:-1])
+    left, sigma = data.pick(state.at.left)[columns].ravel(), data.noise_of(0)[columns].ravel()
+    slopes = np.array([data.pick(own)[columns].ravel() for own in spread])
+    expected = left @ np.linalg.solve(np.diag(sigma**2) + slopes.T @ slopes, left)
+    assert np.isclose(block.chi2, expected, rtol=1e-6)
+    assert block.freedom == len(left)
 
 
 def test_a_supply_of_sextupoles_shows_by_the_orbit_that_nobody_knows(small_ring, before):

@@ -49,7 +49,7 @@ from tmlattice.diagnosis.response.hierarchical import (
     steps_of,
 )
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
-from tmlattice.diagnosis.response.linear import linear
+from tmlattice.diagnosis.response.linear import linear, with_undetermined
 from tmlattice.diagnosis.response.procedure import as_diagnosis, provenance, trials_of
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.sparse import SparseFit, outperforms, sparse_fit
@@ -170,7 +170,7 @@ def diagnose_change(
         )  # fmt: skip
     progress("changes")
     whole = settle(_all_columns(fit.state))
-    changed, scatter = changed_supplies(whole, judgement, open_)
+    changed, scatter, whole = changed_supplies(whole, judgement, open_)
     changed += outstanding(whole, judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
@@ -319,9 +319,11 @@ def drifts(state: State) -> list[tuple[StatedCause, Support]]:
         own = {f.variable: f for f in state.of_block(block) if f.per != "ring"}
         if not own:
             continue
-        there = linear(state, block)
+        there = with_undetermined(state, block)
         posterior = there.posterior
-        found += with_support(state, own.values(), there, unwidened(posterior))
+        values = {name: posterior.values[there.where[name]] for name in own}
+        given = replace(state, values={**state.values, **values})
+        found += with_support(given, own.values(), there, unwidened(posterior))
     return found
 
 

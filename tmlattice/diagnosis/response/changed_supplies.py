@@ -1,6 +1,6 @@
 """Changed supplies, magnets and devices: candidates compared by the marginal likelihood.
 
->>> findings, scatter = changed_supplies(state, judgement, undetermined_of(reference))
+>>> findings, scatter, state = changed_supplies(state, judgement, undetermined(reference))
 
 The magnets of a supply scatter in their change, which limits the precision of a supply's change. In
 a hierarchical fit of every magnet this scatter includes changes of single magnets. So it is learnt
@@ -8,6 +8,7 @@ again given the candidates, and likewise that of undetermined changes of other s
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -21,7 +22,7 @@ from tmlattice.diagnosis.families.fields import (
     QuadrupoleGradient,
 )
 from tmlattice.diagnosis.findings import cause_of, finding_of
-from tmlattice.diagnosis.response.linear import Linear, linear, marginal, with_numbers
+from tmlattice.diagnosis.response.linear import Linear, marginal, with_undetermined
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, strongest
 from tmlattice.diagnosis.result import Finding
@@ -52,7 +53,7 @@ Causes = tuple[tuple[str, str], ...]
 
 def changed_supplies(
     state: State, judgement: Judgement, open_: Undetermined | None = None
-) -> tuple[list[Finding], dict[str, float]]:
+) -> tuple[list[Finding], dict[str, float], State]:
     """Return findings on all supplies, magnets and devices that changed, and the remaining scatter.
 
     Args:
@@ -61,50 +62,38 @@ def changed_supplies(
         open_: undetermined errors of the ring that changed; None: none.
 
     Returns:
-        The findings; and the rms scatter, relative, of magnets of a supply and of undetermined
-        supplies (0: none), by the effects' names; empty if no quadrupoles were fitted.
+        The findings; the rms scatter, relative, of magnets of a supply and of undetermined supplies
+        (0: none), by the effects' names, empty if no quadrupoles were fitted; and the state with
+        the effects of undetermined errors on the findings.
     """
-    found, scatter = _found(state, judgement, {})
-    if open_ is None or not found:
-        return found, scatter
-    data = state.data
-    base = Predicted(data, Errors.none(data)).bend()
-    problem = Response(base=base, used=np.isfinite(data.orbits), places={})
-    for _ in range(AGAIN):
-        before = {(own.effect, own.element) for own in found}
+    found, scatter = _found(state, judgement)
+    if open_ is None:
+        return found, scatter, state
+    base = Predicted(state.data, Errors.none(state.data)).bend()
+    problem = Response(base=base, used=np.isfinite(state.data.orbits), places={})
+    for _ in range(AGAIN if found else 0):
+        causes = [cause_of(own) for own in found]
         try:
-            blurred = _blurred(problem, open_, found)
+            orbits = Blur(problem, strongest(problem, open_, causes)).of(causes)
         except UnstableRingError:  # the ring is unstable with the findings
             break
-        found, scatter = _found(state, judgement, blurred)
-        if not found or {(own.effect, own.element) for own in found} == before:
+        state = replace(state, undetermined=orbits)
+        found, scatter = _found(state, judgement)
+        if {(own.effect, own.element) for own in found} in (
+            set(), {(own.effect, own.element) for own in causes}
+        ):  # fmt: skip
             break
-    return found, scatter
+    return found, scatter, state
 
 
-def _blurred(problem: Response, open_: Undetermined, found: Sequence[Finding]) -> dict[int, Array]:
-    """Effects of undetermined errors on the changes, m, by block, [error, column, monitor]."""
-    data = problem.base.data
-    causes = [cause_of(own) for own in found]
-    spread = Blur(problem, strongest(problem, open_, causes)).of(causes)
-    return {
-        block: np.array([data.pick(own, block) for own in spread]).reshape(-1, *data.shape)
-        for block in (0, 1)
-    }
-
-
-def _found(
-    state: State, judgement: Judgement, blurred: Mapping[int, Array]
-) -> tuple[list[Finding], dict[str, float]]:
+def _found(state: State, judgement: Judgement) -> tuple[list[Finding], dict[str, float]]:
     found: list[Finding] = []
     of_magnets: dict[str, float] = {}
     for block in (0, 1):
         fitted = {f.variable: f for f in state.of_block(block) if f.per == "ring"}
         if not fitted:
             continue
-        there = linear(state, block)
-        if block in blurred:
-            there = with_numbers(there, state, block, "left open", blurred[block])
+        there = with_undetermined(state, block)
         scatter, causes, own = _by_evidence(state, block, there, fitted)
         if QuadrupoleGradient.name in scatter:
             of_magnets = {**scatter, FamilyGradient.name: own.rms}

@@ -205,6 +205,15 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
     )
 
 
+def with_undetermined(state: State, block: int) -> Linear:
+    """Return the linearisation with the undetermined errors of the reference, if any."""
+    there = linear(state, block)
+    if state.undetermined is None:
+        return there
+    rows = [state.data.pick(own, block) for own in state.undetermined]
+    return with_numbers(there, state, block, "undetermined", np.array(rows))
+
+
 def marginal(there: Linear, names: Sequence[str]) -> tuple[Array, Array]:
     """Return information and score of some variables, with all others integrated out.
 

@@ -16,7 +16,7 @@ from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.hierarchical import HierarchicalFit
 from tmlattice.diagnosis.response.missing_effects import HELPS
-from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.undetermined import Blur, SingleChange, Undetermined
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Finding
@@ -127,16 +127,20 @@ def sparse_fit(
         found = _explained(search, problem, before, gap)
     except UnstableRingError:  # the sparse solution stores no beam
         found = None
+    blur = None
     if (
         open_ is not None
         and open_.root.size
         and len(open_.hypotheses) * problem.used.size <= AT_ONCE
     ):
-        found = _among_open(search, problem, before, found, open_)
+        blur = Blur(problem, open_)
+        found = _among_open(search, before, found, blur)
     if found is None:
         return None
     base = problem.near(found.fit.causes).base
-    return _result(data, split, base, found, count, most, judgement)
+    orbits = None if blur is None else blur.of(found.fit.causes)
+    return _result(replace(begin(data, split), undetermined=orbits), base, found, count, most,
+                   judgement)  # fmt: skip
 
 
 def outperforms(fit: HierarchicalFit, sparse: SparseFit, judgement: Judgement) -> bool:
@@ -183,9 +187,10 @@ def _noise_alone(problem: Problem) -> float:
 
 
 def _among_open(
-    search: Search, plain: Response, before: Fit, found: Explanation | None, open_: Undetermined
+    search: Search, before: Fit, found: Explanation | None, blur: Blur
 ) -> Explanation | None:
     """The solution given undetermined errors of the ring, if more probable; else `found`."""
+    plain = blur.problem
     seen = found.first if found else scan(
         plain.metric(before.point), search.hypotheses, before.residual, seed=search.seed
     )  # fmt: skip
@@ -195,7 +200,6 @@ def _among_open(
     )
     if detection.p_value > plain.judgement.false_alarm:
         return found
-    blur = Blur(plain, open_)
     changes = SingleChange(blur)
     starts: dict[Hypothesis, float | None] = {
         h: None for h in search.hypotheses if isinstance(find(h[0]), FamilyEffect)
@@ -286,8 +290,7 @@ def _used(data: ResponseData, split: Split) -> Flags:
 
 
 def _result(
-    data: ResponseData,
-    split: Split,
+    design: State,
     base: Predicted,
     found: Explanation,
     count: int,
@@ -297,11 +300,10 @@ def _result(
     found = finished(found)
     causes = found.fit.causes
     p_value = float(chi2.sf(found.fit.chi2, count - len(causes)))
-    findings = findings_of(data.ring, found, (), judgement)
+    findings = findings_of(design.data.ring, found, (), judgement)
     verdict, findings, messages = verdict_of(
         replace(found, full=False), findings, p_value, False, judgement
     )
-    design = begin(data, split)
     steps = [score(design, "design")]
     state = design
     for i, cause in enumerate(causes, 1):

@@ -94,6 +94,8 @@ class State:
         guessed: rms of the logarithm of a prior scale about its first guess.
         unneeded: rejected families. Their numbers are zero, but their uncertainty is in the stated
             errors (for the ring's families of few numbers).
+        undetermined: of a change: d reading / d undetermined error of its reference, m,
+            [error, column, monitor, 2]; None: without these.
     """
 
     data: ResponseData
@@ -113,6 +115,7 @@ class State:
     jitter: Array | None = None
     guessed: float = SCALE_SPREAD
     unneeded: tuple[Family, ...] = ()
+    undetermined: Array | None = None
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""

@@ -320,13 +320,15 @@ def _chi2(
     free: bool = False,
 ) -> tuple[float, int]:
     """Chi-square of the readings of some columns at some BPMs, and their number, in the covariance
-    of their noise and of the fit's posterior (by Woodbury's identity); with kicks free or fixed."""
+    of their noise, of the fit's posterior and of undetermined errors (by Woodbury's identity); with
+    kicks free or fixed."""
     data, square, count = state.data, 0.0, 0
     left, kicks = data.pick(state.at.left, block), data.pick(state.at.seen(state.at.beam), block)
     # outliers count in the fit, and here, as if their noise were larger
     with np.errstate(divide="ignore"):
         noise = data.noise_of(block) / np.sqrt(state.share[block])
     size = 0 if fit is None else len(fit.found.prior) + fit.sizes.shape[1]
+    size += 0 if state.undetermined is None else len(state.undetermined)
     vector, matrix = np.zeros(size), np.eye(size)
     for column in columns.tolist():
         plane = int(data.plane_of(block)[column])
@@ -334,12 +336,14 @@ def _chi2(
         if not len(read):
             continue
         sigma = noise[column, read]
-        slopes: list[Array] = []  # roots of the posterior covariance, m, [reading, number]
+        slopes: list[Array] = []  # roots of the covariance, m, [reading, number]
         if fit is not None:
             by = fit.there.of_column(column, read, plane)
             spread = np.asarray((by @ fit.found.spread).T)
             inside = solve_triangular(fit.found.factor, spread, lower=True).T
-            slopes = [inside, by @ fit.sizes]
+            slopes += [inside, by @ fit.sizes]
+        if state.undetermined is not None:
+            slopes.append(state.undetermined[:, column, read, plane].T)
         rows = np.column_stack([left[column, read], *slopes]) / sigma[:, None]
         if state.jitter is not None:
             orbits = state.jitter[plane][:, read].T / sigma[:, None]
