@@ -128,7 +128,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # diverged
             continue
-        found.append((evidence_of(state, state.good).log, state))
+        found.append((evidence_of(state, state.good), state))
         log.info("distributed errors: evidence %.1f", found[-1][0])
         if all(own.ratio**2 < MISSING for own in fit_chi2(state)[:2]):
             break
@@ -423,8 +423,8 @@ def detected_faults(
         if chosen in seen_before:
             break
         seen_before.append(chosen)
-    seen = search.seen(search.state)
-    return search.state.apart, [search.finding(seen, one) for one in search.state.apart]
+    apart = search.state.apart
+    return apart, [search.finding(search.seen(search.state), one) for one in apart]
 
 
 class _Search:
@@ -432,6 +432,7 @@ class _Search:
         self, state: State, hypotheses: Sequence[Hypothesis], judgement: Judgement
     ) -> None:
         self.state, self.hypotheses, self.judgement = state, list(hypotheses), judgement
+        self.latest: Seen | None = None
         self.tries = TRIES if state.data.orbits.size <= ANEW else 1
         count = [name for name, _ in hypotheses]
         places = {name: count.count(name) for name in dict.fromkeys(count)}
@@ -442,7 +443,9 @@ class _Search:
 
     def seen(self, state: State) -> Seen:
         """All suspects, linearised at the state."""
-        return Seen(state, self.hypotheses, self.problem)
+        if self.latest is None or self.latest.state is not state:
+            self.latest = Seen(state, self.hypotheses, self.problem)
+        return self.latest
 
     def drowned(self) -> bool:
         """Whether the residual far exceeds the noise, and no single cause explains most of it:
@@ -469,13 +472,16 @@ class _Search:
 
     def next(self) -> State | None:
         """The state with the most probable further cause, if it is detected; else None."""
-        # the distributed errors have outliers already, so the evidence need not grow with a fault;
-        # a second optimum, where all readings are far less probable, is none
-        least = evidence_of(self.state, self.state.good).log - self.judgement.log_odds
         tried: list[tuple[float, State]] = []
         for cause, _, information in self.leaders():
-            state = self.put(self.state, cause, information)
-            found = -np.inf if state is None else evidence_of(state, state.good).log
+            alone = _apart(_as_number(self.state, cause, information)[0], cause)
+            if not self.clear(Seen(alone, [cause], self.problem), alone.apart[-1]):
+                continue  # by the linear model
+            state = _settled(alone)
+            # the distributed errors have outliers already, so the evidence need not grow with a
+            # fault; a second optimum, where all readings are far less probable, is none
+            least = evidence_of(self.state, self.state.good) - self.judgement.log_odds
+            found = -np.inf if state is None else evidence_of(state, state.good)
             if state is not None and found > least:
                 tried.append((found + self.problem.prior(cause), state))
         for _, state in sorted(tried, key=lambda one: -one[0]):
@@ -529,7 +535,7 @@ class _Search:
         if other is None:
             return state
         prior = self.problem.prior
-        gained = evidence_of(other, state.good).log - evidence_of(state, state.good).log
+        gained = evidence_of(other, state.good) - evidence_of(state, state.good)
         gained += prior(other.apart[-1].cause) - prior(one.cause)
         return other if gained > 0 else state
 
@@ -609,20 +615,20 @@ def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[Sta
 
 
 def _apart(state: State, cause: Hypothesis) -> State:
-    """The state with a separate prior for a number of the fit."""
-    return replace(state, apart=(*state.apart, *suspects_of(state, [cause])))
+    """The state with a separate prior for a number of the fit, and scales to be learnt anew."""
+    return replace(state, apart=(*state.apart, *suspects_of(state, [cause])), groups={})
 
 
 def _without(state: State, one: Candidate) -> State:
-    """The state without a cause, not converged: the next step takes its number back."""
-    return replace(state, apart=tuple(other for other in state.apart if other is not one))
+    """The state without a cause, not converged: the next step takes its number back, and scales are
+    learnt anew, because one that vanished would not grow again."""
+    left = tuple(other for other in state.apart if other is not one)
+    return replace(state, apart=left, groups={})
 
 
 def _settled(state: State) -> State | None:
     """The state after convergence from the linear estimate or from the present one. None where no
-    beam is stored, or where an amount is implausible. Scales are learnt anew, because a scale that
-    vanished would not grow again."""
-    state = replace(state, groups={})
+    beam is stored, or where an amount is implausible."""
     for first in (_stepped, replace):
         try:
             rough = settle(first(state), gain=ROUGH, possible=_possible)

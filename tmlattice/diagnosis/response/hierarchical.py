@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags
+from tmlattice.arrays import Flags
 from tmlattice.diagnosis.assessment import Block, combined_p_value
 from tmlattice.diagnosis.families.steps import STEPS, Trial
 from tmlattice.diagnosis.response.first_guess import begun, strange
@@ -30,7 +30,6 @@ from tmlattice.diagnosis.response.labels import (
 from tmlattice.diagnosis.response.linear import Linear, linear, rf_by_others
 from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.rounds import (
-    Evidence,
     evidence_of,
     linear_evidence,
     one_round,
@@ -48,7 +47,6 @@ from tmlattice.diagnosis.response.validation import (
     WORTH,
     Step,
     against,
-    in_favour,
     inner,
     lost,
     remainder,
@@ -58,7 +56,6 @@ from tmlattice.diagnosis.response.weights import COUPLING, good_monitors
 from tmlattice.effects import with_labels
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.judgement import GROSS
-from tmlattice.inference.normal import Posterior
 from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
@@ -70,8 +67,6 @@ SPOILT = 0.05
 ASTRAY, NEAR = 1.2, 1e-3
 """Largest unexplained share of the typical column's mean square: as a ratio to the design's, or
 itself if that is more. Above it the fit has diverged."""
-SURE = 100.0
-"""Log evidence, linearised at the fit, above which a family is needed without a second fit."""
 FIRST, ROUGH = 4, 0.03
 """Rounds of each block after a family is added or removed, and the relative fall of the cost
 required for another one."""
@@ -211,39 +206,35 @@ def _needed(
     """The state with the needed families alone, `most` trials at most; the rejected trials;
     messages about implausible ones; and the log evidence of each plausible trial.
 
-    The least needed one by the linearised evidence is tested first. Once one is removed, those that
-    were not tested are linearised again."""
+    The least needed one goes first. What is needed beside the others is needed without some of
+    them, so that only the other ones are tested again."""
     there = {family.name for family in state.families}
-    untested = [own for own in trials if there & {family.name for family in own}]
+    untested = [own for own in trials if there & {family.name for family in own}
+                and any(state.values[family.variable].any() for family in own)]  # fmt: skip
     gone = [own for own in trials if own not in untested]
+    # at zero: nothing is lost
+    state = forbid(state, [f for own in gone for f in own if state.allows(f.name)])
     doubts: list[str] = []
     worth: dict[Trial, float] = {}
     evidence: dict[Trial, float] = {}
-    removed = True
     while untested:
-        if removed:
-            linear_worth, sure = _quickly(state, untested, progress)
-            evidence |= {own: linear_worth[own] + LEAST for own in untested
-                         if np.isfinite(linear_worth[own])}  # fmt: skip
-            worth |= {own: linear_worth[own] for own in sure}
-            untested = sorted(
-                (own for own in untested if own not in worth), key=lambda own: linear_worth[own]
-            )
-            if not untested:
-                break
-            whole = evidence_of(state, state.good, state.independent)
-        least = untested.pop(0)
-        progress(with_labels(f"without {_title(least)}"))
-        worth[least], refitted, without = _tested(state, least, linear_worth[least], whole)
-        if refitted is not None:
-            evidence[least] = refitted + LEAST
-        removed = without is not None and worth[least] <= 0
-        if without is not None and removed:
-            doubts += _doubts(state, least)
+        tested = _tested(state, untested, progress)
+        worth |= {own: gained for own, (gained, _) in tested.items()}
+        evidence |= {own: log for own, (_, log) in tested.items() if np.isfinite(log)}
+        untested = sorted((own for own in untested if worth[own] <= 0), key=worth.__getitem__)
+        if untested:
+            least = untested.pop(0)
+            progress(with_labels(f"without {_title(least)}"))
+            doubted = _doubts(state, least)
+            try:
+                state = _without(state, least)
+            except TmlatticeError:  # no closed orbit without it
+                worth[least] = np.inf
+                continue
+            doubts += doubted
             gone.append(least)
             del worth[least]
-            state = without
-    for least in sorted(worth, key=lambda own: worth[own])[: max(len(worth) - most, 0)]:
+    for least in sorted(worth, key=worth.__getitem__)[: max(len(worth) - most, 0)]:
         state = _without(state, least)
         gone.append(least)
     return state, gone, doubts, evidence
@@ -348,7 +339,7 @@ def taken_back(state: State) -> State:
     trial = settle(replace(state, good=good), look_at_monitors=False)
     sound = good_monitors(trial) & good_monitors(trial, 1)
     back = together & sound
-    before, after = (evidence_of(own, state.good, state.independent).log for own in (state, trial))
+    before, after = (evidence_of(own, state.good, state.independent) for own in (state, trial))
     lost = before - after
     orbits = state.data.pick(state.data.orbits)[state.fitted]
     readings = int(np.isfinite(orbits[:, back]).sum())
@@ -387,38 +378,46 @@ def _blocks(trial: Trial) -> list[int]:
 
 
 def _tested(
-    state: State, trial: Trial, linear_worth: float, whole: Evidence
-) -> tuple[float, float | None, State | None]:
-    """Worth of a trial: its log evidence beyond `LEAST`, or less by validation (0 or less: not
-    needed); that evidence; and the state without it, None if no beam is stored without it.
+    state: State, trials: Collection[Trial], progress: Callable[[str], Any]
+) -> dict[Trial, tuple[float, float]]:
+    """Worth of each trial and its log evidence, both linearised at the fit: two separate fits agree
+    only to a share of their cost. The worth is the evidence beyond `LEAST`, or less by validation
+    (0 or less: not needed).
 
     Validation has a veto, because the evidence assumes independent readings, and model discrepancy
-    is not. Where validation and the linearised evidence both favour a family, the latter decides,
-    because the costs of two separate fits agree only to a share of their size.
+    is not.
     """
-    try:
-        without = _without(state, trial)
-    except TmlatticeError:  # no closed orbit without it
-        return np.inf, None, None
-    if linear_worth == -np.inf:
-        return linear_worth, None, without
-    good = state.good & without.good
-    shares = state.independent
-    with_it = whole if (good == state.good).all() else evidence_of(state, good, shares)
-    other = evidence_of(without, good, shares)
-    refitted = gained = with_it.log - other.log - LEAST
-    messages = lost(
-        inner(replace(without, good=good), _of_rf(other)),
-        inner(replace(state, good=good), _of_rf(with_it)),
-    )
-    log.info("without %s: evidence %+.1f, validation %+.3f +- %.3f", _title(trial), -gained,
-             *messages)  # fmt: skip
-    unsure = ROUGH * np.count_nonzero(np.isfinite(state.data.orbits[state.fitted])) / 2
-    if _asked(trial) and against(messages):
-        gained = min(gained, messages[0])
-    elif _asked(trial) and in_favour(messages) and linear_worth > gained > -unsure:
-        gained = linear_worth
-    return gained, refitted, without
+    blocks = {}
+    for block in {trial[0].block for trial in trials} | {0}:
+        if state.of_block(block):
+            there = linear(state, block)
+            blocks[block] = there, linear_evidence(there)
+    in_plane = blocks.get(0)
+    of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
+    best = {name: values for _, (_, own, _) in blocks.values() for name, values in own.items()}
+    validated = inner(state.moved({**state.values, **best}), of_rf)
+    worth: dict[Trial, tuple[float, float]] = {}
+    for trial in trials:
+        progress(with_labels(f"is {_title(trial)} needed"))
+        if _doubts(state, trial):
+            worth[trial] = -np.inf, np.nan
+            continue
+        block = trial[0].block
+        there, (whole, _, _) = blocks[block]
+        other, values, found = linear_evidence(there, _priors(trial, state))
+        gained = whole - other - LEAST
+        without_it = of_rf if block else rf_by_others(state, there, found)
+        try:
+            change = lost(inner(state.moved({**state.values, **best, **values}), without_it),
+                          validated)  # fmt: skip
+        except TmlatticeError:  # no closed orbit without it
+            worth[trial] = np.inf, gained + LEAST
+            continue
+        log.info("%s: log evidence %+.1f, validation %+.3f +- %.3f", _title(trial), gained + LEAST,
+                 *change)  # fmt: skip
+        vetoed = _asked(trial) and against(change)
+        worth[trial] = min(gained, change[0]) if vetoed else gained, gained + LEAST
+    return worth
 
 
 def _doubts(state: State, trial: Trial) -> list[str]:
@@ -428,11 +427,6 @@ def _doubts(state: State, trial: Trial) -> list[str]:
     return [doubt for doubt in doubts if doubt is not None]
 
 
-def _of_rf(own: Evidence) -> Array:
-    """Leave-one-out residuals of the RF's orbit."""
-    return rf_by_others(own.state, own.in_plane, own.found)
-
-
 def _priors(trial: Trial, state: State) -> set[str]:
     return {group.name for family in trial for group in family.groups(state.data)}
 
@@ -440,50 +434,6 @@ def _priors(trial: Trial, state: State) -> set[str]:
 def _asked(trial: Trial) -> bool:
     """Whether held-out correctors can validate a trial: not numbers of fitted correctors."""
     return any(family.per != "column" for family in trial)
-
-
-def _quickly(
-    state: State, trials: Sequence[Trial], progress: Callable[[str], Any]
-) -> tuple[dict[Trial, float], list[Trial]]:
-    """Log evidence of each trial beyond `LEAST`, linearised at the fit; and the trials for which it
-    is sufficient: clearly needed, and not rejected by validation."""
-    worth: dict[Trial, float] = {}
-    blocks: dict[int, tuple[Linear, tuple[float, dict[str, Array], Posterior | None]]] = {}
-    for block in {trial[0].block for trial in trials} | {0}:
-        if state.of_block(block):
-            there = linear(state, block)
-            blocks[block] = there, linear_evidence(there)
-    clear: dict[Trial, tuple[dict[str, Array], Posterior | None]] = {}
-    for trial in trials:
-        progress(with_labels(f"is {_title(trial)} needed"))
-        own = (state.values[f.variable] for f in trial if state.allows(f.name))
-        at_zero = not any(values.any() for values in own)
-        if at_zero or _doubts(state, trial):  # at zero, nothing is lost without it
-            worth[trial] = -np.inf
-            continue
-        there, (evidence, _, _) = blocks[trial[0].block]
-        other, values, found = linear_evidence(there, _priors(trial, state))
-        worth[trial] = evidence - other - LEAST
-        log.info("%s: linear evidence %+.1f", _title(trial), worth[trial])
-        if worth[trial] > SURE:
-            clear[trial] = values, found
-    sure = [trial for trial in clear if not _asked(trial)]
-    if len(sure) == len(clear):
-        return worth, sure
-    in_plane = blocks.get(0)
-    of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
-    validated = inner(state, of_rf)
-    for trial in [own for own in clear if own not in sure]:
-        block, (values, found) = trial[0].block, clear[trial]
-        without_it = of_rf if block else rf_by_others(state, blocks[block][0], found)
-        try:
-            change = lost(inner(state.moved({**state.values, **values}), without_it), validated)
-        except TmlatticeError:  # no closed orbit without it
-            change = np.inf, 0.0
-        log.info("%s: validation %+.3f +- %.3f", _title(trial), *change)
-        if not against(change):
-            sure.append(trial)
-    return worth, sure
 
 
 def _moved_without(state: State, block: int, there: Linear, names: Collection[str]) -> State | None:
@@ -501,6 +451,9 @@ def _moved_without(state: State, block: int, there: Linear, names: Collection[st
 
 
 def _without(state: State, trial: Trial) -> State:
-    """The state without a trial's families and the others fitted again; the other block is
-    unchanged to first order."""
-    return settle(forbid(state, trial), _blocks(trial), FIRST, ROUGH)
+    """The state without a trial's families and the others fitted again, first with the derivatives
+    here; the other block is unchanged to first order."""
+    block = trial[0].block
+    there = linear(state, block)
+    moved = _moved_without(state, block, there, _priors(trial, state))
+    return settle(forbid(moved or state, trial), _blocks(trial), FIRST, ROUGH)

@@ -6,7 +6,6 @@
 import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,15 +50,13 @@ def one_round(
     found = bounded_step(there, bold)
     groups = {group.name: group for group in found.groups}
     learnt = replace(state, groups={**state.groups, **groups})
-    weights = weight(state, block)
 
     def cost(at: State) -> float:
-        left = np.where(weights > 0, state.data.pick(at.at.left, block), 0.0)
         penalty = sum(
             _penalty([g for g in found.groups if g.basis[rows].any()], rows, at.values[name])
             for name, rows in there.where.items()
         )
-        return float(np.sum(left * weighed(state, block, left))) + penalty
+        return _misfit(state, at, block) + penalty
 
     best, last, aim = learnt, np.inf, found.values
     for _ in range(CORRECTED + 1):
@@ -87,6 +84,12 @@ def one_round(
         if further @ there.normal.matrix @ further < CORRECTS * after:
             break  # linear enough
     return best, cost(state), last
+
+
+def _misfit(state: State, at: State, block: int) -> float:
+    """Weighted sum of squares of a block's residuals at another state, with the state's weights."""
+    left = np.where(weight(state, block) > 0, state.data.pick(at.at.left, block), 0.0)
+    return float(np.sum(left * weighed(state, block, left)))
 
 
 def bounded_step(there: Linear, bold: float) -> Posterior:
@@ -129,7 +132,7 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
 
 def settle(
     state: State,
-    blocks: Sequence[int] = (1, 0),
+    blocks: Sequence[int] = (0, 1),
     most: int = ROUNDS,
     gain: float = GAIN,
     possible: Callable[[State], bool] = lambda state: True,
@@ -137,8 +140,9 @@ def settle(
 ) -> State:
     """Return the state after damped rounds, which end when none reduces the cost any further.
 
-    This is the method of Levenberg and Marquardt with a step bound for each number. A round that
-    increases the cost is repeated with smaller bounds.
+    This is the method of Levenberg and Marquardt with a step bound for each number. A step of one
+    block that increases its cost is repeated with smaller bounds. What it costs the other block is
+    subtracted from its gain: otherwise what that one regains in turn would be taken for progress.
 
     Args:
         state: the start.
@@ -151,10 +155,8 @@ def settle(
     good = state.good
     bold = dict.fromkeys(blocks, 1.0)
     for turn in range(most):
-        gained = 0.0
-        for block in blocks:
-            if not state.of_block(block):
-                continue
+        gained = total = 0.0
+        for block in [own for own in blocks if state.of_block(own)]:
             there = linear(state, block)
             state = replace(state, kept={**state.kept, **there.kept})
             for _ in range(RETRIES):
@@ -165,19 +167,22 @@ def settle(
             if after > before:
                 continue
             bold[block] = min(BOLDER * bold[block], BOLDEST)
-            gained = max(gained, (before - after) / max(after, TINY))
+            others = [own for own in blocks if own != block and state.of_block(own)]
+            gained += before - after
+            gained += sum(_misfit(state, state, own) - _misfit(state, moved, own) for own in others)
+            total += after
             state = moved
-            for seen in (0, 1):
-                if state.of_block(seen):
-                    state = look(state, seen)
-                    state = state if look_at_monitors else replace(state, good=good)
+        for seen in (0, 1):
+            if state.of_block(seen):
+                state = look(state, seen)
+                state = state if look_at_monitors else replace(state, good=good)
         log.info(
             "round %d: cost %.3g less, model discrepancy %s m",
             turn,
-            gained,
+            gained / max(total, TINY),
             np.median(state.lacking, axis=1),
         )
-        if gained < gain or not possible(state):
+        if gained <= gain * total or not possible(state):
             break
     return state
 
@@ -208,16 +213,7 @@ def linear_evidence(
     return total, {name: found.values[rows] for name, rows in there.where.items()}, found
 
 
-class Evidence(NamedTuple):
-    """The evidence of a state."""
-
-    log: float  # of both blocks
-    state: State  # with the weights of the evidence
-    in_plane: Linear | None  # `linear` of it; None: nothing is fitted in-plane
-    found: Posterior | None  # its solution
-
-
-def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evidence:
+def evidence_of(state: State, good: Flags, shares: Array | None = None) -> float:
     """Return the evidence of a state by the readings of some BPMs, at the most probable model
     discrepancy and prior scales; up to a constant of the data.
 
@@ -226,16 +222,10 @@ def evidence_of(state: State, good: Flags, shares: Array | None = None) -> Evide
         good: the BPMs.
         shares: effective sample sizes, see `State.independent`; equal for states that are compared.
     """
-    total, in_plane, found = 0.0, None, None
+    total = 0.0
     for block in (block for block in (1, 0) if state.reads(block)):
         state = replace(look(state, block), good=good, independent=shares)
-        left = np.where(weight(state, block) > 0, state.data.pick(state.at.left, block), 0.0)
-        total += 0.5 * log_scale(state, block)
-        total -= 0.5 * float(np.sum(left * weighed(state, block, left)))
+        total += 0.5 * (log_scale(state, block) - _misfit(state, state, block))
         if state.of_block(block):
-            there = linear(state, block)
-            more, _, last = linear_evidence(there)
-            total += more
-            if block == 0:
-                in_plane, found = there, last
-    return Evidence(total, state, in_plane, found)
+            total += linear_evidence(linear(state, block))[0]
+    return total

@@ -268,11 +268,6 @@ def against(change: tuple[float, float], least: float = VETO) -> bool:
     return change[0] < -max(least, change[1])
 
 
-def in_favour(change: tuple[float, float]) -> bool:
-    """Return whether validation is better with, likewise."""
-    return against((-change[0], change[1]))
-
-
 BLOCKS = ("in-plane", "coupling", "RF")
 
 
