@@ -4,7 +4,7 @@
 >>> [(step.effect, step.heldout_rms_in_plane) for step in fit.steps]
 
 Families are added one by one, then all are fitted together, and each is tested by the loss without
-it.
+it, with the fit linearised.
 """
 
 import logging
@@ -132,7 +132,7 @@ def fit_families(
     """Return the fit of all families that are needed, to all correctors except the held-out ones.
 
     Families need one another: BPM gains improve nothing without the gradients, for example. So all
-    are fitted together, without outliers, and each is tested by the loss without it.
+    are fitted together, without outliers, and each is tested by the loss without it, linearised.
 
     Args:
         data, split: the data, and the validation split.
@@ -395,7 +395,10 @@ def _tested(
     in_plane = blocks.get(0)
     of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
     best = {name: values for _, (_, own, _) in blocks.values() for name, values in own.items()}
-    validated = inner(state.moved({**state.values, **best}), of_rf)
+    try:
+        validated = inner(state.moved({**state.values, **best}), of_rf)
+    except TmlatticeError:  # the linear model is wrong there: no closed orbit
+        best, validated = {}, inner(state, of_rf)
     worth: dict[Trial, tuple[float, float]] = {}
     for trial in trials:
         progress(with_labels(f"is {_title(trial)} needed"))
