@@ -206,8 +206,8 @@ def _needed(
     """The state with the needed families alone, `most` trials at most; the rejected trials;
     messages about implausible ones; and the log evidence of each plausible trial.
 
-    The least needed one goes first. What is needed beside the others is needed without some of
-    them, so that only the other ones are tested again."""
+    The least needed one is rejected first. A trial that is needed given all others is needed
+    without some of them, and is not tested again."""
     there = {family.name for family in state.families}
     untested = [own for own in trials if there & {family.name for family in own}
                 and any(state.values[family.variable].any() for family in own)]  # fmt: skip
