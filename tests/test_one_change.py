@@ -12,7 +12,7 @@ from tmlattice.diagnosis.response.before_after import ANY, drifts
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
 from tmlattice.diagnosis.response.hierarchical import in_turn
 from tmlattice.diagnosis.response.linear import linear, with_numbers
-from tmlattice.diagnosis.response.rounds import settle
+from tmlattice.diagnosis.response.rounds import evidence_of, settle
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.undetermined import Blur, Undetermined, and_orbits, undetermined
 from tmlattice.diagnosis.response.validation import remainder
@@ -145,6 +145,19 @@ def test_what_is_open_of_a_ring_is_in_what_changed(small_ring, crowded_change):
     )
     assert np.all(wider > 0.999 * sigmas)  # of monitors and correctors, too
     assert np.max(wider / sigmas) > 1.2
+
+
+def test_a_fit_that_has_ended_goes_no_further(fitted):
+    """In both planes, whose steps disturb one another: no number moves by half of its error."""
+    once = settle(fitted)
+    again = settle(once)
+    before, after = (evidence_of(own, fitted.good) for own in (fitted, once))
+    assert after > before - 0.1  # it had nearly ended
+    for block in (0, 1):
+        there = linear(again, block)
+        for name, at in there.where.items():
+            moved = np.abs(again.values[name] - once.values[name])
+            assert np.all(moved < 0.5 * there.posterior.sigma[at] + 1e-12), name
 
 
 def test_a_residual_is_compared_with_its_whole_covariance(fitted, rng):

@@ -171,7 +171,8 @@ def diagnose_change(
     progress("changes")
     whole = settle(_all_columns(fit.state))
     changed, scatter, whole = changed_supplies(whole, judgement, open_)
-    changed += outstanding(whole, judgement)
+    drifted = drifts(whole)
+    changed += outstanding(there, [row for row, _ in drifted], judgement)
     wanted = changed if effects is None else [own for own in changed if own.effect in effects]
     named = strongest_first(wanted)[:max_effects]
     causes = tuple(cause_of(own) for own in named)
@@ -180,7 +181,7 @@ def diagnose_change(
     found = strongest_first([*named, *pairs])
     have = {(cause.effect, cause.element) for cause in causes}
     supports = [FREE] * len(reported)
-    for row, support in drifts(whole):
+    for row, support in drifted:
         if (row[0].effect, row[0].element) not in have:
             reported.append(row)
             supports.append(support)
@@ -327,9 +328,8 @@ def drifts(state: State) -> list[tuple[StatedCause, Support]]:
     return found
 
 
-def outstanding(state: State, judgement: Judgement) -> list[Finding]:
+def outstanding(ring: Ring, changes: Sequence[StatedCause], judgement: Judgement) -> list[Finding]:
     """Return the findings: BPMs and correctors whose change is an outlier of the usual drift."""
-    changes = [row for row, _ in drifts(state)]
     found = []
     for effect in dict.fromkeys(cause.effect for cause, _ in changes):
         rows = [row for row in changes if row[0].effect == effect]
@@ -339,10 +339,7 @@ def outstanding(state: State, judgement: Judgement) -> list[Finding]:
             if size > max(DRIFT, OUTSTANDING * usual) and size > SIGNIFICANT * sigma:
                 square = (size / max(sigma, 1e-12)) ** 2
                 seen = Detection.among(square, len(rows))
-                found.append(
-                    finding_of(state.data.ring, [cause], np.ones(1), sigma, seen,
-                               judgement.mass)
-                )  # fmt: skip
+                found.append(finding_of(ring, [cause], np.ones(1), sigma, seen, judgement.mass))
     return found
 
 

@@ -67,21 +67,20 @@ def changed_supplies(
         the effects of undetermined errors on the findings.
     """
     found, scatter = _found(state, judgement)
-    if open_ is None:
+    if open_ is None or not found:
         return found, scatter, state
     base = Predicted(state.data, Errors.none(state.data)).bend()
     problem = Response(base=base, used=np.isfinite(state.data.orbits), places={})
-    for _ in range(AGAIN if found else 0):
+    for _ in range(AGAIN):
         causes = [cause_of(own) for own in found]
+        before = {(own.effect, own.element) for own in found}
         try:
             orbits = Blur(problem, strongest(problem, open_, causes)).of(causes)
         except UnstableRingError:  # the ring is unstable with the findings
             break
         state = replace(state, undetermined=orbits)
         found, scatter = _found(state, judgement)
-        if {(own.effect, own.element) for own in found} in (
-            set(), {(own.effect, own.element) for own in causes}
-        ):  # fmt: skip
+        if not found or {(own.effect, own.element) for own in found} == before:
             break
     return found, scatter, state
 

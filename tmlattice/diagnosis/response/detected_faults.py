@@ -472,18 +472,21 @@ class _Search:
 
     def next(self) -> State | None:
         """The state with the most probable further cause, if it is detected; else None."""
+        begun = [_with_cause(self.state, cause, informed) for cause, _, informed in self.leaders()]
+        clear = [
+            state for state in begun  # by the linear model
+            if self.clear(Seen(state, [state.apart[-1].cause], self.problem), state.apart[-1])
+        ]  # fmt: skip
+        if not clear:
+            return None
+        # the distributed errors have outliers already, so the evidence need not grow with a fault;
+        # a second optimum, where all readings are far less probable, is none
+        least = evidence_of(self.state, self.state.good) - self.judgement.log_odds
         tried: list[tuple[float, State]] = []
-        for cause, _, information in self.leaders():
-            alone = _apart(_as_number(self.state, cause, information)[0], cause)
-            if not self.clear(Seen(alone, [cause], self.problem), alone.apart[-1]):
-                continue  # by the linear model
-            state = _settled(alone)
-            # the distributed errors have outliers already, so the evidence need not grow with a
-            # fault; a second optimum, where all readings are far less probable, is none
-            least = evidence_of(self.state, self.state.good) - self.judgement.log_odds
-            found = -np.inf if state is None else evidence_of(state, state.good)
-            if state is not None and found > least:
-                tried.append((found + self.problem.prior(cause), state))
+        for state in filter(None, map(_settled, clear)):
+            found = evidence_of(state, state.good)
+            if found > least:
+                tried.append((found + self.problem.prior(state.apart[-1].cause), state))
         for _, state in sorted(tried, key=lambda one: -one[0]):
             state = self.better(state, state.apart[-1])  # noqa: PLW2901
             if self.clear(self.seen(state), state.apart[-1]):
@@ -512,16 +515,6 @@ class _Search:
                 found.setdefault(same, (cause, amount, own.information[:, h]))
         return list(found.values())
 
-    def put(self, state: State, cause: Hypothesis, information: Array) -> State | None:
-        """The converged state with one more cause; None where no beam is stored.
-
-        Args:
-            state: without the cause.
-            cause: effect and place.
-            information: of each block on its amount, [2].
-        """
-        return _settled(_apart(_as_number(state, cause, information)[0], cause))
-
     def better(self, state: State, one: Candidate) -> State:
         """The state with an alternative instead of a cause, if that explains more."""
         seen = self.seen(state)
@@ -531,7 +524,9 @@ class _Search:
         best = int(np.argmax(evidence))
         if not evidence[best] > evidence[seen.place(one)] + self.judgement.behind:
             return state
-        other = self.put(_without(state, one), seen.causes[best], own.information[:, best])
+        other = _settled(
+            _with_cause(_without(state, one), seen.causes[best], own.information[:, best])
+        )
         if other is None:
             return state
         prior = self.problem.prior
@@ -612,6 +607,11 @@ def _as_number(state: State, cause: Hypothesis, information: Array) -> tuple[Sta
         state = with_number(state, cause, int(np.argmax(information)))
         (suspect,) = suspects_of(state, [cause])
     return state, suspect
+
+
+def _with_cause(state: State, cause: Hypothesis, information: Array) -> State:
+    """The state with one more cause, not converged; `information` of each block on its amount."""
+    return _apart(_as_number(state, cause, information)[0], cause)
 
 
 def _apart(state: State, cause: Hypothesis) -> State:
