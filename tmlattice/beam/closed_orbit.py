@@ -107,6 +107,7 @@ class ResponseModel:
         self.maps = self._dispersed(ring_maps(ring, dimension, self.layers), magnets)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
         self._chain = Chain(self.maps)
+        self._columns: dict[tuple[tuple[str, ...], bool], Columns] = {}
         self._close(frequency)
 
     def at_frequency(self, frequency: float) -> "ResponseModel":
@@ -141,6 +142,7 @@ class ResponseModel:
         other = copy(self)
         other.ring = ring
         other.layers, touched = self.layers.changed_to(ring)
+        other._columns = {}
         if touched:  # else the kicks differ, and the orbit is the same
             other._forget()
             other.maps = other._dispersed(changed_maps(self.maps, other.layers, touched), touched)
@@ -171,6 +173,7 @@ class ResponseModel:
 
     def _forget(self) -> None:
         """Drop what was cached for the previous orbit."""
+        self._columns = {}
         for name in ("closing", "inverse", "rf_start"):
             self.__dict__.pop(name, None)
 
@@ -234,15 +237,21 @@ class ResponseModel:
             raise ValueError("the RF moves the energy, which four coordinates do not have")
         return -self._solve[:, 4] * self.slip
 
-    def columns(self, correctors: Sequence[str] | None = None) -> Columns:
-        """Return correctors as sources; None: all of the ring.
+    def columns(self, correctors: Sequence[str] | None = None, turned: bool = False) -> Columns:
+        """Return correctors as sources.
+
+        Args:
+            correctors: names; None: all of the ring, in beam order.
+            turned: with their kicks turned by a right angle, from x towards y.
 
         Raises:
             UnknownNameError: no such element.
             MeasurementError: an element that is not a corrector.
         """
         ring = self.ring
-        names = self.correctors if correctors is None else correctors
+        names = self.correctors if correctors is None else tuple(correctors)
+        if (names, turned) in self._columns:
+            return self._columns[names, turned]
         place = np.array([ring.index(name) for name in names], dtype=np.int64)
         planes = []
         for i in place:
@@ -254,8 +263,10 @@ class ResponseModel:
             planes.append(CORRECTORS[element.kind])
         layer = self.layers.layer_of[place] if len(place) else np.empty(0, dtype=np.int64)
         kick, slope = self._kicks(place, layer)
+        if turned:
+            kick, slope = _turned(kick), _turned(slope)
         launch_kick = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
-        return Columns(
+        found = self._columns[names, turned] = Columns(
             names=tuple(ring.elements[i].name for i in place),
             planes=tuple(planes),
             place=place,
@@ -264,20 +275,23 @@ class ResponseModel:
             start=launch_kick @ self.closing.T,
             launch_kick=launch_kick,
         )
+        return found
 
-    def response(self, correctors: Sequence[str] | None = None) -> Array:
+    def response(self, correctors: Sequence[str] | None = None, turned: bool = False) -> Array:
         """d (closed orbit) / d kick at fixed RF frequency, m/rad, [corrector, monitor, 2].
 
         Args:
             correctors: names; None: all of the ring, in beam order.
+            turned: with their kicks turned by a right angle, from x towards y.
 
         Raises:
             UnknownNameError: no such element.
             MeasurementError: an element that is not a corrector.
         """
-        columns = self.columns(correctors)
-        before = np.einsum("mai,ci->cma", self.reading_slopes, columns.start)
-        after = np.einsum("mai,ci->cma", self.reading_slopes, columns.launch_kick)
+        columns = self.columns(correctors, turned)
+        slopes = self.reading_slopes
+        before, after = (np.tensordot(own, slopes, (1, 2))
+                         for own in (columns.start, columns.launch_kick))  # fmt: skip
         return np.asarray(before + self.downstream(columns)[:, :, None] * after)
 
     def downstream(self, columns: Columns) -> Flags:
@@ -302,21 +316,15 @@ class ResponseModel:
             UnknownNameError: no such element.
             UnstableRingError: no closed orbit is found.
         """
-        n, ring = self.dimension, self.ring
-        turn = self.turn
-        layer = np.empty(len(correctors), dtype=np.int64)
-        replaced = []
-        paths = np.empty((len(correctors), turn.steps + 1, n))
-        paths[:, 0] = self.state
-        for row, (name, kick) in enumerate(zip(correctors, kicks, strict=True)):
-            i = ring.index(name)
-            layer[row] = self.layers.layer_of[i]
-            element = ring.elements[i]
-            changed = element.changed(angle=element.angle + float(kick))
-            replaced.append(self.layers.layer(int(layer[row]), {i: changed})[0])
+        turn, columns, steps = self.turn, self.columns(correctors), np.asarray(kicks)
+        layer = columns.layer
+        per_kick = self._per_kick(columns.place, layer).reduced()
         V0, V1, V2 = (
-            self._with_orbit_kicks(layer, np.stack(own)) for own in zip(*replaced, strict=True)
+            whole[layer] + (steps * self._with_orbit_kicks(layer, slope).T).T
+            for whole, slope in zip(turn.W, per_kick, strict=True)
         )
+        paths = np.empty((len(steps), turn.steps + 1, self.dimension))
+        paths[:, 0] = self.state + steps[:, None] * columns.start  # the linear orbit
         good = np.zeros(len(paths), dtype=bool)
         share(
             settle, len(paths), *turn.W, turn.curved, turn.third, layer, V0, V1, V2, self._solve,
@@ -328,9 +336,12 @@ class ResponseModel:
 
     def _read(self, here: Array) -> Array:
         """Readings [..., monitor, 2] of the states at the monitors' exits."""
-        maps = self.maps
-        bent = np.einsum("maij,...mj->...mai", second_derivatives(maps.R2), here)
-        return np.asarray(maps.R0 + np.einsum("...mai,...mi->...ma", maps.R1 + bent / 2, here))
+        maps, n = self.maps, self.dimension
+        x = np.moveaxis(here, -2, 0).reshape(len(maps.at), -1, n)  # [monitor, orbit, n]
+        bends = second_derivatives(maps.R2).reshape(len(x), 2 * n, n)
+        bent = (x @ bends.swapaxes(1, 2)).reshape(*x.shape[:2], 2, n)
+        read = maps.R0[:, None] + ((maps.R1[:, None] + bent / 2) @ x[..., None])[..., 0]
+        return np.moveaxis(read, 0, 1).reshape(*here.shape[:-1], 2)
 
     def rf_response(self) -> Array:
         """d (closed orbit) / d (relative RF frequency), m, [monitor, 2]."""
@@ -348,7 +359,17 @@ class ResponseModel:
 
     def _kicks(self, place: Indices, layer: Indices) -> tuple[Array, Array]:
         """Correctors' kicks at their layers' exits, [column, n], and their slopes by the state at
-        the entrances, [column, n, n]; the maps are the same on every orbit."""
+        the entrances, [column, n, n]."""
+        per_kick = self._per_kick(place, layer)
+        x = self.path[layer]
+        bent = np.zeros_like(per_kick.R)
+        if per_kick.T is not None:
+            bent = (per_kick.T @ x[:, None, :, None])[..., 0]
+        kick = per_kick.B + ((per_kick.R + bent) @ x[:, :, None])[..., 0]
+        return kick, per_kick.R + 2 * bent
+
+    def _per_kick(self, place: Indices, layer: Indices) -> Quadratic:
+        """Derivatives of layers' maps by their correctors' kicks, [column, ...]."""
         layers, n, key = self.layers, self.dimension, ("kicks", place.tobytes())
         if key not in layers.memory:
             correctors = [self.ring.elements[i] for i in place]
@@ -363,12 +384,14 @@ class ResponseModel:
             per_kick = per_kick.after(stacked([layers.way(int(k)) for k in layer], n))
             layers.memory[key] = per_kick
         found: Quadratic = layers.memory[key]
-        x = self.path[layer]
-        bent = np.zeros_like(found.R)
-        if found.T is not None:
-            bent = (found.T @ x[:, None, :, None])[..., 0]
-        kick = found.B + ((found.R + bent) @ x[:, :, None])[..., 0]
-        return kick, found.R + 2 * bent
+        return found
+
+
+def _turned(kicks: Array) -> Array:
+    """Kicks [column, n, ...] turned by a right angle, from x towards y."""
+    turned = np.zeros_like(kicks)
+    turned[:, :2], turned[:, 2:4] = -kicks[:, 2:4], kicks[:, :2]
+    return turned
 
 
 def feed_down(

@@ -187,30 +187,36 @@ class ResponseSlopes:
         kicks, slopes = kicks_on_orbit(model, d)
         sources = model.inverse[d.layer + 1] @ slopes @ model.tangents[d.layer]
         G, p, errors = self.readings.reshape(-1, n), self.launch_kick, len(hypotheses)
-        behind = np.stack([self._mixed(hypothesis) for hypothesis in hypotheses])
         later = (model.maps.at > d.layer[:, None])[:, :, None, None]  # monitors
         ahead = (self._exits > d.layer[:, None])[:, :, None]  # columns
-        strongest = np.zeros(errors)
-        np.maximum.at(strongest, d.owner, np.abs(kicks).max(axis=1))
-        moving = strongest[d.owner] > STILL
-        seen, end = np.zeros((errors, *self.readings.shape)), np.zeros((errors, n, n))
+        rows = np.arange(len(d.owner))
+        of_error = csr_array((np.ones(len(rows)), (d.owner, rows)), (errors, len(rows)))
+
+        def summed(each: Array) -> Array:
+            """The sum over the rows of each error, [error, ...]."""
+            flat = each.reshape(len(each), int(np.prod(each.shape[1:])))
+            return np.asarray((of_error @ flat).reshape(errors, *each.shape[1:]))
+
+        moving = summed(np.abs(kicks).max(axis=1))[d.owner] > STILL
         if moving.any():  # the closed orbit
             fed, seen_by, missed_by, own_by = self._fed
             kicks *= moving[:, None]
             sources -= (fed[d.layer + 1] @ kicks[:, None, :, None])[..., 0]  # before the kick
-            total = np.zeros((errors, n))
-            np.add.at(total, d.owner, kicks)
+        seen = (G @ sources).reshape(-1, *self.readings.shape)
+        behind = -(ahead * (p @ sources.transpose(0, 2, 1)))
+        if moving.any():
+            further = (self._exits > d.layer[:, None] + 1)[:, :, None]
+            seen += np.tensordot(kicks, seen_by, (1, 3))
+            behind += further * np.tensordot(kicks, own_by, (1, 2))
+            behind -= ahead * np.tensordot(kicks, missed_by, (1, 2))
+        seen, behind, end = summed(later * seen), summed(behind), summed(sources)
+        behind += np.stack([self._mixed(hypothesis) for hypothesis in hypotheses])
+        if moving.any():
+            total = summed(kicks)
             orbit = total @ model.closing.T
             seen += np.tensordot(orbit, seen_by, (1, 3))
-            np.add.at(seen, d.owner, later * np.tensordot(kicks, seen_by, (1, 3)))
             behind += np.tensordot(orbit, own_by - missed_by, (1, 2))
-            further = (self._exits > d.layer[:, None] + 1)[:, :, None]
-            np.add.at(behind, d.owner, further * np.tensordot(kicks, own_by, (1, 2)))
-            np.subtract.at(behind, d.owner, ahead * np.tensordot(kicks, missed_by, (1, 2)))
             end += np.tensordot(orbit + total, fed[-1], (1, 2))
-        np.add.at(seen, d.owner, later * (G @ sources).reshape(-1, *seen.shape[1:]))
-        np.subtract.at(behind, d.owner, ahead * (p @ sources.transpose(0, 2, 1)))
-        np.add.at(end, d.owner, sources)
         for r, (owner, m) in enumerate(zip(d.read_owner, d.monitor, strict=True)):
             bent = second_derivatives(d.E2[r][None])[0] @ model.path[model.maps.at[m]]
             seen[owner, m] += (d.E1[r] + bent) @ model.tangents[model.maps.at[m]]

@@ -38,8 +38,6 @@ from tmlattice.observe.stored import SMALL
 DELTA = 1e-3
 """Energy step of the differences for an energy spread; its square is the unit of the fitted
 spread."""
-TURN = 0.1
-"""Roll with which a corrector's kick in the other plane is computed, rad."""
 MIN_KICK = 0.1
 """Kick over the set one below which a corrector's plane is undetermined."""
 
@@ -218,12 +216,8 @@ class Predicted:
     @cached_property
     def across(self) -> Array:
         """Orbit changes by a corrector's roll, m/rad, [column, monitor, 2]; 0 for the RF."""
-        data, names = self.data, self.data.measured.correctors
-        turned = [Cause("corrector_roll", name, TURN) for name in names]
-        model = self.model.changed_to(apply(self.model.ring, turned)).response(names)[:, data.at]
-        flat = self.model.response(names)[:, data.at]
-        out = np.zeros_like(data.orbits)
-        slope = (model - flat * np.cos(TURN)) / np.sin(TURN)
+        data, out = self.data, np.zeros_like(self.data.orbits)
+        slope = self.model.response(data.measured.correctors, turned=True)[:, data.at]
         out[:-1] = slope * data.kicks[:-1, None, None]
         return out
 
@@ -245,7 +239,8 @@ class Predicted:
 
     def seen(self, beam: Array) -> Array:
         """Readings of orbit changes [..., monitor, 2] by the monitors."""
-        return np.asarray(np.einsum("mij,...mj->...mi", self.errors.monitors, beam))
+        x, y = np.moveaxis(self.errors.monitors, 2, 0)
+        return np.asarray(x * beam[..., :1] + y * beam[..., 1:])
 
     @cached_property
     def read(self) -> Array:
