@@ -88,6 +88,15 @@ def test_finite_steps_settle_to_the_derivative(model):
     assert_allclose((up - down) / 2e-6, model.response(names), atol=1e-5 * scale)
 
 
+def test_a_corrector_that_is_rolled_kicks_by_its_turned_kick_too(petra3, model):
+    """Against the maps of a ring with rolled correctors, in both planes."""
+    names, angle = [model.correctors[i] for i in SOME], 0.1
+    rolled = apply(petra3, [Cause("corrector_roll", name, angle) for name in names])
+    mine = np.cos(angle) * model.response(names) + np.sin(angle) * model.response(names, turned=True)
+    theirs = ResponseModel(rolled).response(names)
+    assert_allclose(mine, theirs, atol=1e-9 * np.abs(theirs).max())
+
+
 def test_without_energy_a_horizontal_kick_moves_less(petra3, model):
     """Without energy shift lacks -eta_m eta_c / (alpha C): what the longer path takes."""
     flat = ResponseModel(petra3, dimension=4)

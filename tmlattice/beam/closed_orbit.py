@@ -337,7 +337,8 @@ class ResponseModel:
     def _read(self, here: Array) -> Array:
         """Readings [..., monitor, 2] of the states at the monitors' exits."""
         maps, n = self.maps, self.dimension
-        x = np.moveaxis(here, -2, 0).reshape(len(maps.at), -1, n)  # [monitor, orbit, n]
+        count = int(np.prod(here.shape[:-2]))
+        x = np.moveaxis(here, -2, 0).reshape(len(maps.at), count, n)  # [monitor, orbit, n]
         bends = second_derivatives(maps.R2).reshape(len(x), 2 * n, n)
         bent = (x @ bends.swapaxes(1, 2)).reshape(*x.shape[:2], 2, n)
         read = maps.R0[:, None] + ((maps.R1[:, None] + bent / 2) @ x[..., None])[..., 0]
