@@ -92,7 +92,9 @@ def test_a_corrector_that_is_rolled_kicks_by_its_turned_kick_too(petra3, model):
     """Against the maps of a ring with rolled correctors, in both planes."""
     names, angle = [model.correctors[i] for i in SOME], 0.1
     rolled = apply(petra3, [Cause("corrector_roll", name, angle) for name in names])
-    mine = np.cos(angle) * model.response(names) + np.sin(angle) * model.response(names, turned=True)
+    mine = np.cos(angle) * model.response(names) + np.sin(angle) * model.response(
+        names, turned=True
+    )
     theirs = ResponseModel(rolled).response(names)
     assert_allclose(mine, theirs, atol=1e-9 * np.abs(theirs).max())
 

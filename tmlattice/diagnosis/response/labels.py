@@ -454,7 +454,7 @@ class _Step:
         among = np.ones(len(odd), dtype=bool) if among is None else among
         near, far = (among & ~odd, among & odd) if half else (among, among)
         patterns = np.column_stack([self.own, *more])
-        return rms_of([amplitudes(patterns, self.left, near, far)[1]]) ** 2
+        return rms_of(amplitudes(patterns, self.left, near)[1][far]) ** 2
 
     @cached_property
     def jump(self) -> Array:
@@ -478,8 +478,7 @@ class _Step:
 
     def _displaced(self, among: Flags) -> tuple[float, Array]:
         patterns = np.column_stack([self.own, self.jump])
-        every = np.ones(len(self.left), dtype=bool)
-        (kick, jump), missed = amplitudes(patterns, self.left, among, every)
+        (kick, jump), missed = amplitudes(patterns, self.left, among)
         whole = self.kick + kick * self.state.data.kicks[self.column]
         return -jump / whole if whole else 0.0, np.abs(missed)
 

@@ -578,20 +578,19 @@ class Fitted:
 
     def _score(self, change: Array, own: Array | None) -> tuple[float, float]:
         state, split = self.state, self.state.split
-        read = self.read + change
-        data = state.data.pick(state.data.orbits)
-        jumps = state.data.pick(state.at.seen(state.at.jumps))
-        inside: list[Array] = []
-        jumped: list[Array] = []
-        for c in np.flatnonzero(split.held):
-            patterns = [read[c], *([] if own is None else own[:, c])]
-            patterns = [p for p in patterns if np.abs(p).max() > 0]
-            seen = np.isfinite(data[c]) & state.good
-            near, far = seen & split.half[c], seen & ~split.half[c]
-            for more, into in (([], inside), ([jumps[c]], jumped)):
-                both = np.stack([*patterns, *more], axis=1)
-                into.append(amplitudes(both, data[c], near, far)[1])
-        return rms_of(inside), rms_of(jumped)
+        columns = np.flatnonzero(split.held)
+        data = state.data.pick(state.data.orbits)[columns]
+        seen = np.isfinite(data) & state.good
+        near, far = seen & split.half[columns], seen & ~split.half[columns]
+        patterns = (
+            (self.read + change)[None] if own is None else np.stack([self.read + change, *own])
+        )
+        jumps = state.data.pick(state.at.seen(state.at.jumps))[None]
+        inside, jumped = (
+            rms_of(amplitudes(np.moveaxis(some[:, columns], 0, 2), data, near)[1][far])
+            for some in (patterns, np.concatenate([patterns, jumps]))
+        )
+        return inside, jumped
 
 
 @dataclass(frozen=True)

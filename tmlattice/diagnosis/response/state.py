@@ -4,7 +4,7 @@ Everything that is fitted is one frozen `State`; each function returns another o
 """
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -209,19 +209,24 @@ def by_columns(state: State, family: Family) -> tuple[Array, Array, Array]:
     scale = 1 + state.at.errors.calibration[:, None]
     # a kick is (1 + calibration) (linear + bent); only in its own plane
     flat = (rows - bent, left + scale * bent) if family.block == 0 else (rows, left)
-    amounts, without, sure = np.full((3, len(left)), np.nan)
-    for c in np.flatnonzero(~state.split.held[:-1]):
-        seen = np.isfinite(left[c]) & state.good
-        near, far = seen & state.split.half[c], seen & ~state.split.half[c]
-        if not rows[c, near].any():
-            continue
-        without[c] = np.mean((left[c, far] / noise[c, far]) ** 2)
-        for own, read in ((rows[c], left[c]), (flat[0][c], flat[1][c])):
-            (amount,), miss = amplitudes(own[:, None], read, near, far)
-            mean = np.mean((miss / noise[c, far]) ** 2)
-            if not mean >= sure[c]:
-                amounts[c], sure[c] = amount, mean
+    seen = np.isfinite(left) & state.good & ~state.split.held[:, None]
+    seen[-1] = False  # the RF's
+    near, far = seen & state.split.half, seen & ~state.split.half
+    amounts, sure = np.full((2, len(left)), np.nan)
+    known = np.any(near & (rows != 0), axis=1)
+    without = np.where(known, _mean_square(left / noise, far), np.nan)
+    for own, read in ((rows, left), flat):
+        (amount,), miss = amplitudes(own[..., None], read, near)
+        mean = _mean_square(miss / noise, far)
+        better = known & ~(mean >= sure)
+        amounts, sure = np.where(better, [amount, mean], [amounts, sure])
     return amounts, without, sure
+
+
+def _mean_square(values: Array, read: Flags) -> Array:
+    """The mean square of some readings of each column, NaN without any, [column]."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sum(np.where(read, values, 0.0) ** 2, axis=1) / read.sum(axis=1))
 
 
 def by_monitors(state: State) -> Array:
@@ -268,27 +273,31 @@ def jump(state: State, beyond: float | None = None) -> State:
     return state.moved(values) if changed else state
 
 
-def rms_of(parts: Iterable[Array]) -> float:
-    """Return the rms of all entries; NaN without any."""
-    values = np.concatenate([np.zeros(0), *parts])
+def rms_of(values: Array) -> float:
+    """Return the rms of all finite values; NaN without any."""
+    values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
 def amplitudes(
-    patterns: Array, data: Array, near: Flags, far: Flags, held: Array | None = None
+    patterns: Array, data: Array, near: Flags, held: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the amplitudes of patterns by near readings, [pattern], and the residuals of far ones.
+    """Return the amplitudes of patterns by near readings, [pattern, ...], and the residuals of all.
 
     Args:
-        patterns, data: m, [monitor, pattern] and [monitor].
-        near, far: [monitor].
-        held: ratio of a reading's noise to the prior rms of each amplitude, [pattern]; 0: no prior.
+        patterns, data: m, [..., monitor, pattern] and [..., monitor].
+        near: [..., monitor].
+        held: ratio of a reading's noise to the prior rms of each amplitude, [..., pattern]; 0: no
+            prior.
     """
-    size = np.abs(patterns[near]).max(axis=0)
+    rows, right = np.where(near[..., None], patterns, 0.0), np.where(near, data, 0.0)
+    size = np.abs(rows).max(axis=-2)
     size[size == 0] = 1
-    rows, right = patterns[near] / size, data[near]
+    rows = rows / size[..., None, :]
     if held is not None:
-        rows = np.concatenate([rows, np.diag(held / size)])
-        right = np.concatenate([right, np.zeros(len(held))])
-    amounts = np.linalg.lstsq(rows, right, rcond=None)[0] / size
-    return amounts, data[far] - patterns[far] @ amounts
+        prior = np.eye(size.shape[-1]) * (held / size)[..., None]
+        rows = np.concatenate([rows, prior], axis=-2)
+        right = np.concatenate([right, np.zeros(size.shape)], axis=-1)
+    rounded = np.finfo(float).eps * max(rows.shape[-2:])
+    amounts = (np.linalg.pinv(rows, rcond=rounded) @ right[..., None])[..., 0] / size
+    return np.moveaxis(amounts, -1, 0), data - (patterns @ amounts[..., None])[..., 0]

@@ -79,7 +79,7 @@ class Step:
 
 
 class _Missed(NamedTuple):
-    """Residuals of held-out correctors at the BPMs that validate them, m, column by column.
+    """Residuals of held-out correctors, m, [column, monitor], NaN except at BPMs that validate.
 
     Attributes:
         inside, outside: in-plane, coupling.
@@ -87,21 +87,19 @@ class _Missed(NamedTuple):
         rolled: coupling, with a roll of the corrector, if it has one.
         squares, cross: squares in-plane and coupling, in units of the noise.
         spread: factor on the variance of `squares` by the error of the kick.
-        rf: of the RF's orbit.
+        rf: of the RF's orbit, [monitor].
         rf_squares: squares of these, in units of the noise.
-        rf_monitors: the BPMs of these, [monitor].
     """
 
-    inside: list[Array]
-    outside: list[Array]
-    jumped: list[Array]
-    rolled: list[Array]
-    squares: list[Array]
-    cross: list[Array]
-    spread: list[Array]
+    inside: Array
+    outside: Array
+    jumped: Array
+    rolled: Array
+    squares: Array
+    cross: Array
+    spread: Array
     rf: Array
     rf_squares: Array
-    rf_monitors: Flags
 
 
 def _missed(
@@ -115,53 +113,49 @@ def _missed(
         jitter: orbits of beam jitter, see `State`, whose amplitudes the near BPMs determine, too.
     """
     data, at, half = state.data, state.at, state.split.half
+    orbits = data.pick(data.orbits)
+    seen = np.isfinite(orbits) & state.good
+    columns = np.flatnonzero(validation & (seen & half).any(axis=1) & (seen & ~half).any(axis=1))
+    near, far = seen[columns] & half[columns], seen[columns] & ~half[columns]
+
+    def picked(readings: Array, block: int = 0) -> Array:
+        return data.pick(readings, block)[columns]
+
     read = at.seen(at.beam)
-    straight, across = data.pick(read), data.pick(read, 1)
-    orbits, orbits_across = data.pick(data.orbits), data.pick(data.orbits, 1)
-    jumps = data.pick(at.seen(at.jumps))
-    turned = state.allows("corrector_roll")
-    rolls = data.pick(at.seen(at.across), 1) if turned else np.zeros_like(straight)
-    variance, variance_across = (data.noise_of(block) ** 2 for block in (0, 1))
-    inside, jumped, outside, rolled, squares, spread = [], [], [], [], [], []
-    cross = []
+    straight = picked(read)
     moving = np.zeros((2, 0, data.shape[1])) if jitter is None else jitter
-    typical = np.median(data.noise, axis=0)
-
-    def still(left: Array, near: Flags, plane: int) -> Array:
-        """The residual without the jitter at near BPMs."""
-        orbits = moving[plane].T
-        held = np.full(orbits.shape[1], typical[plane])
-        amounts, _ = amplitudes(orbits, left, near, near, held)
-        return np.asarray(left - orbits @ amounts)
-
-    for c in np.flatnonzero(validation):
-        seen = np.isfinite(orbits[c]) & state.good
-        near, far = seen & half[c], seen & ~half[c]
-        if not (near.any() and far.any()):
-            continue
-        # equal weights: model discrepancy does not scale with the noise
-        moved = moving[data.plane[c]].T
-        held = np.append(0.0, np.full(moved.shape[1], typical[data.plane[c]]))
-        kick, miss = amplitudes(np.column_stack([straight[c], moved]), orbits[c], near, far, held)
-        inside.append(miss)
-        squares.append(miss**2 / variance[c, far])
-        # the error of the kick adds to that of the reading
-        spread.append(1 + straight[c, far] ** 2 / np.sum(straight[c, near] ** 2))
-        jumped.append(amplitudes(np.stack([straight[c], jumps[c]], 1), orbits[c], near, far)[1])
-        left = orbits_across[c] - kick[0] * across[c]
-        there = np.isfinite(left)
-        if moving.size and (near & there).any():
-            left = still(left, near & there, 1 - data.plane[c])
-        outside.append(left[far & there])
-        cross.append(outside[-1] ** 2 / variance_across[c, far & there])
-        if rolls[c].any() and (near & there).any():
-            rolled.append(amplitudes(rolls[c][:, None], left, near & there, far & there)[1])
-    scored = state.good & np.isfinite(orbits[-1]) & (~half[-1] if rf is None else rf)
-    left = orbits[-1] - straight[-1]
+    moving, typical = moving.swapaxes(1, 2), np.median(data.noise, axis=0)
+    held = np.broadcast_to(typical[:, None], (2, moving.shape[2]))
+    # equal weights: model discrepancy does not scale with the noise
+    plane = data.plane[columns]
+    patterns = np.concatenate([straight[..., None], moving[plane]], axis=2)
+    (kick, *_), left = amplitudes(
+        patterns, picked(data.orbits), near, np.pad(held[plane], ((0, 0), (1, 0)))
+    )
+    inside = np.where(far, left, np.nan)
+    # the error of the kick adds to that of the reading
+    spread = 1 + straight**2 / np.sum(straight**2, axis=1, where=near, keepdims=True)
+    both = np.stack([straight, picked(at.seen(at.jumps))], axis=2)
+    jumped = np.where(far, amplitudes(both, picked(data.orbits), near)[1], np.nan)
+    left = picked(data.orbits, 1) - kick[:, None] * picked(read, 1)
+    near, far = near & np.isfinite(left), far & np.isfinite(left)
+    left = amplitudes(moving[1 - plane], left, near, held[1 - plane])[1]
+    outside = np.where(far, left, np.nan)
+    rolled = np.full_like(outside, np.nan)
+    if state.allows("corrector_roll"):
+        rolls = picked(at.seen(at.across), 1)
+        known = far & np.any(near & (rolls != 0), axis=1, keepdims=True)
+        rolled = np.where(known, amplitudes(rolls[..., None], left, near)[1], np.nan)
+    left = orbits[-1] - data.pick(read)[-1]
+    scored = state.good & np.isfinite(left) & (~half[-1] if rf is None else rf)
     near = state.good & np.isfinite(left) & half[-1] & ~scored
-    of_rf = (still(left, near, 0) if moving.size and near.any() else left)[scored]
-    return _Missed(inside, outside, jumped, rolled, squares, cross, spread, of_rf,
-                   of_rf**2 / variance[-1, scored], scored)  # fmt: skip
+    left = amplitudes(moving[0], left, near, held[0])[1]
+    of_rf = np.where(scored, left, np.nan)
+    variance = [data.noise_of(block) ** 2 for block in (0, 1)]
+    return _Missed(
+        inside, outside, jumped, rolled, inside**2 / variance[0][columns],
+        outside**2 / variance[1][columns], spread, of_rf, of_rf**2 / variance[0][-1],
+    )  # fmt: skip
 
 
 def score(state: State, effect: str, parameters: int = 0) -> Step:
@@ -172,20 +166,20 @@ def score(state: State, effect: str, parameters: int = 0) -> Step:
         effect, parameters: of the step.
     """
     missed = _missed(state, state.split.held)
-    own, others = np.concatenate(missed.squares), np.concatenate([np.zeros(0), *missed.cross])
+    squares = {"in-plane": missed.squares / missed.spread, "coupling": missed.cross,
+               "RF": missed.rf_squares}  # fmt: skip
     return Step(
         effect,
         parameters,
         heldout_rms_in_plane=rms_of(missed.inside),
         heldout_rms_coupling=rms_of(missed.outside),
-        heldout_chi2_per_dof=float(np.mean(own)),
-        dispersion_rms=rms_of([missed.rf]),
+        heldout_chi2_per_dof=float(np.nanmean(missed.squares)),
+        dispersion_rms=rms_of(missed.rf),
         heldout_rms_position=rms_of(missed.jumped),
         heldout_rms_roll=rms_of(missed.rolled),
-        compared=(
-            Block("in-plane", float(np.sum(own / np.concatenate(missed.spread))), len(own)),
-            Block("coupling", float(np.sum(others)), len(others)),
-            Block("RF", float(np.sum(missed.rf_squares)), len(missed.rf)),
+        compared=tuple(
+            Block(name, float(np.nansum(own)), int(np.isfinite(own).sum()))
+            for name, own in squares.items()
         ),
     )
 
@@ -228,17 +222,15 @@ def inner(state: State, by_others: Array | None = None) -> Validated:
         _missed(one, state.split.inner, state.split.inner_rf, state.jitter)
         for one in (state, other)
     ]
-    sums = [
-        np.array([[[np.sum(own**2), len(own)] for own in pair]
-                  for pair in zip(one.inside, one.outside, strict=True)])
-        for one in missed
-    ]  # fmt: skip
-    rf = np.zeros((len(state.good), 2))
-    if by_others is not None:
-        rf = np.stack([np.nan_to_num(by_others) ** 2, np.isfinite(by_others)], axis=1)
-    rf[missed[0].rf_monitors] = np.stack([missed[0].rf ** 2, np.ones(len(missed[0].rf))], axis=1)
+    left = np.stack([[one.inside, one.outside] for one in missed])
+    columns = np.stack([np.nansum(left**2, axis=(0, 3)), np.isfinite(left).sum(axis=(0, 3))]).T
+    of_rf = (
+        missed[0].rf
+        if by_others is None
+        else np.where(np.isfinite(missed[0].rf), missed[0].rf, by_others)
+    )
+    rf = np.stack([np.nan_to_num(of_rf) ** 2, np.isfinite(of_rf)], axis=1)
     floor = (FLOOR * float(np.median(state.data.noise))) ** 2
-    columns = sums[0] + sums[1]
     columns[..., 0] += floor[:2] * columns[..., 1]
     rf[:, 0] += floor[2] * rf[:, 1]
     return Validated(columns, rf)
