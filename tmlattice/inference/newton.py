@@ -315,5 +315,5 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
 def free_evidence(information: Array, values: Array) -> float:
     """Log evidence of free parameters at their best values, less that of their misfit (<= 0)."""
     inner = information @ values
-    found = free_scan(np.zeros(1, dtype=np.int64), information[None, None], inner[None, None])
+    found = free_scan(information[None, None], inner[None, None])
     return float(found.gain[0] - 0.5 * found.statistic[0])

@@ -71,13 +71,12 @@ def unnamed(
         taken: places that have one.
     """
     rate = problem.judgement.rate(kind)
-    place = int(free.gain.argmax())
-    where = int(free.places[place])
-    freedom = max(int(free.freedom[place]), 1)
-    seen = _detection(float(free.statistic[place]), rate, freedom, len(names))
+    where = int(free.gain.argmax())
+    freedom = max(int(free.freedom[where]), 1)
+    seen = _detection(float(free.statistic[where]), rate, freedom, len(names))
     if not seen.p_value < rate or where in taken:
         return []
-    gain = float(free.gain[place]) + problem.unknown_prior(len(names))
+    gain = float(free.gain[where]) + problem.unknown_prior(len(names))
     return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
 
 
@@ -356,7 +355,7 @@ def _options(search: Search, state: State, scans: Scans) -> list[Option]:
         ("kick", scans.kicks, problem.kick_places, state.kicks),
         ("monitor", scans.monitors, problem.monitors, state.monitors),
     ):
-        if len(free.places):
+        if len(free.gain):
             options += unnamed(problem, kind, free, names, taken)
     if search.unnamed:
         options += outlier(problem, state.fit.point, len(state.outliers))
@@ -390,8 +389,7 @@ def _taken(search: Search, state: State, option: Option, scans: Scans) -> State:
         named = (*state.named, Identified(option.detection, option.alternatives))
         return replace(state, fit=option.alternatives[0].fit, named=named)
     if option.kind == "kick":
-        place = int(np.flatnonzero(scans.kicks.places == option.where)[0])
-        kicks = {**state.fit.kicks, option.where: scans.kicks.amounts[place]}
+        kicks = {**state.fit.kicks, option.where: scans.kicks.amounts[option.where]}
         found = fit(state.problem, state.fit.causes, state.fit.nuisances, kicks)
         return replace(state, fit=found, kicks={**state.kicks, option.where: option.detection})
     dropped = state.dropped.copy()
