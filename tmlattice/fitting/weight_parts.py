@@ -14,12 +14,11 @@ from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.effects import CATALOGUE, RingEffect, directions, names
 from tmlattice.fitting.launches import with_noise
 from tmlattice.inference.newton import fit
-from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
 from tmlattice.maps import LayerMaps, TaylorMap
 from tmlattice.measurement import Measurement
 from tmlattice.network.generators import field_matrix
-from tmlattice.observe.data import of_measurement
+from tmlattice.observe.data import Whitening, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.metric import behind
 

@@ -19,8 +19,8 @@ from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.newton import ITERATIONS, fit
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.validation import Half, HeldOut, cross_predicted
-from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening, each_shot
-from tmlattice.observe.data import Data
+from tmlattice.inference.whitening import Projection, Root
+from tmlattice.observe.data import EXACT, Data, Whitening, each_shot
 from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
 from tmlattice.observe.sections import TWO
