@@ -200,7 +200,7 @@ def held_out_shots(
     assert isinstance(judge, FirstTurns)
     assert isinstance(part.problem, FirstTurns)
     dropped = found.dropped.reshape(part.problem.valid.shape)
-    judge = replace(judge, data=same_monitors(judge.data, part.problem.data, dropped), white=None)
+    judge = replace(judge, data=same_monitors(judge.data, part.problem.data, dropped))
     scored = []
     for i, stage in enumerate(stages):
         model = judge.model
