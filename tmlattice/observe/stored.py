@@ -19,8 +19,7 @@ from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.rf import NO_RF, Cavities, cavities
-from tmlattice.beam.rf import rf_of as rf_in
+from tmlattice.beam.rf import NO_RF, Cavities, cavities, rf_of
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import (
     Cause,
@@ -298,7 +297,7 @@ def cavities_of(ring: Ring, model: ResponseModel) -> Cavities:
     Raises:
         UnstableRingError: the RF cannot replace the energy loss.
     """
-    rf = ring.memory.setdefault("rf", rf_in(ring))
+    rf = ring.memory.setdefault("rf", rf_of(ring))
     loss = sum(element.errors.loss for element in model.ring.elements)
     try:
         return cavities(ring, rf, model.layers.layer_of, loss, model.frequency)
@@ -448,9 +447,12 @@ def seen_by(
     return Moved(orbit, tunes * shown.tunes, modes)
 
 
-def rf_of(settings: Settings) -> float:
-    """Relative RF frequency of a shot's settings."""
-    return float(settings.get("rf", {}).get("frequency_relative", 0.0))
+def states_of(settings: Sequence[Settings], shots: int) -> tuple[tuple[Settings, float], ...]:
+    """Settings and relative RF frequency of each shot; without settings, those of the design."""
+    return tuple(
+        (own, float(own.get("rf", {}).get("frequency_relative", 0.0)))
+        for own in settings or ({},) * shots
+    )
 
 
 def stacked(states: Sequence[Moved], name: str) -> Array:
