@@ -381,8 +381,7 @@ def fit_distributed_errors(
     """
 
     def at(inner: Problem, point: Point, amounts: Array) -> DistributedProblem:
-        slopes = signatures_of(inner, point, known.hypotheses)
-        slopes *= chain_factors(known, amounts)[:, None]
+        slopes = slopes_of(inner, point, known, amounts)
         shift = ((amounts - known.amounts) @ slopes).reshape(inner.valid.shape)
         spread = known.correlated(known.rms[:, None] * slopes).reshape(-1, *inner.valid.shape)
         return DistributedProblem(
@@ -492,11 +491,12 @@ def _with_nuisances(errors: FittedErrors, nuisances: Array) -> FittedErrors:
     return replace(errors, fitted=before)
 
 
-def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
-    """d reading / d amount in units of the readings' noise, [error, flat]; 0 where missing.
+def slopes_of(problem: Problem, point: Point, known: DistributedErrors, amounts: Array) -> Array:
+    """d reading / d amount at some amounts, [error, flat]; 0 where missing.
 
     The noise is put back, so that readings can be dropped later: `as_rows` of ones gives it.
     """
+    hypotheses = known.hypotheses
     unit = problem.as_rows(np.ones(problem.valid.shape))
     linearised_at, there = problem.everywhere().metric(point), unit > 0
     out = np.zeros((len(hypotheses), problem.valid.size))
@@ -505,6 +505,7 @@ def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesi
         some = slice(start, start + count)
         rows = linearised_at.rows(hypotheses[some])
         out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
+    out *= chain_factors(known, amounts)[:, None]
     return out
 
 

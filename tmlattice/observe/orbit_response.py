@@ -412,9 +412,11 @@ def response_change(
     noise = np.hypot(before.noise, after.noise * np.abs(np.median(scale)))
     noise = np.sqrt(_as_the_beam(errors.monitors, noise**2, power=2))
     kicks = np.append(before.kicks[:-1] * errors.kick[:-1], before.kicks[-1])
+    own = zip(columns, errors.angle.tolist(), strict=False)
+    rolls = [Cause("corrector_roll", name, angle) for name, angle in own if angle]
     there = replace(
         before,
-        ring=apply(before.ring, (*errors.ring, *_rolls(columns, errors.angle))),
+        ring=apply(before.ring, (*errors.ring, *rolls)),
         kicks=kicks,
         noise=noise,
         energy=errors.energy,
@@ -449,11 +451,3 @@ def _as_stepped(data: ResponseData) -> Array:
         return there.bend().straight
     except UnstableRingError:
         return there.straight
-
-
-def _rolls(columns: Sequence[str], roll: Array) -> list[Cause]:
-    return [
-        Cause("corrector_roll", name, float(value))
-        for name, value in zip(columns, roll, strict=False)
-        if value
-    ]

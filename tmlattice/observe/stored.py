@@ -116,20 +116,14 @@ class Steady(Problem):
         own = point.causes[cause]
         effect, amount = find(own.effect), own.amount
         if effect.multiplies and abs(1 + amount) < MIN_STRENGTH:
-            return self._difference(point, cause, MIN_STRENGTH)
+            before, behind = point.causes[:cause], point.causes[cause + 1 :]
+            low, high = (
+                self.at((*before, replace(own, amount=amount + side), *behind), point.nuisances)
+                for side in (-MIN_STRENGTH, MIN_STRENGTH)
+            )
+            return np.asarray((low.residual - high.residual) / (2 * MIN_STRENGTH))
         (slope,) = self.signatures(point.view, point.nuisances, [(own.effect, own.element)])
         return self.as_rows(effect.chain(amount) * slope)
-
-    def _difference(self, point: Point, cause: int, h: float) -> Array:
-        own = point.causes[cause]
-        ends = [
-            self.at(
-                (*point.causes[:cause], replace(own, amount=own.amount + side),
-                 *point.causes[cause + 1 :]), point.nuisances,
-            ).residual
-            for side in (h, -h)
-        ]  # fmt: skip
-        return np.asarray((ends[1] - ends[0]) / (2 * h))
 
     def moved(self, nuisances: Array, change: Array) -> Array:
         """Return the nuisances after a change; they are linear."""
