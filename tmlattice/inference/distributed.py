@@ -718,13 +718,11 @@ class Sums:
     Attributes:
         gram: with each other, [error, error].
         inner: with the residual, [error].
-        keep: a few rows.
-        some: slopes in these, nuisances not projected out, [error, row].
+        some: slopes in the rows of `sampled_rows`, nuisances not projected out, [error, row].
     """
 
     gram: Array
     inner: Array
-    keep: Indices
     some: Array
 
 
@@ -766,9 +764,10 @@ def posterior(
         return replace(_posterior_at(known, stored, sums), amounts=made.amounts)
     assert point.projection is not None
     _, belongs = families_of(known)
+    keep = sampled_rows(len(point.residual))
     found = components_of_rows(
-        point.residual[sums.keep] + (stored - known.amounts) @ sums.some,
-        point.projection.matrix()[sums.keep],
+        point.residual[keep] + (stored - known.amounts) @ sums.some,
+        point.projection.matrix()[keep],
         known.correlated(known.rms[:, None] * sums.some), belongs, prior=known.scales,
     )  # fmt: skip
     least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
@@ -826,4 +825,4 @@ def sums_at(
         here = column[rows]
         some[np.ix_(visible, here[here >= 0])] = own[:, here >= 0]
     gram -= along @ along.T
-    return Sums(gram, inner, keep, some)
+    return Sums(gram, inner, some)

@@ -147,8 +147,7 @@ MAX_MISFIT = 0.05
 
 
 def read(measured: OrbitResponse) -> bool:
-    """Whether an orbit of an RF step was measured: its numbers do not repeat, as those of no
-    readings do."""
+    """Whether an orbit of an RF step was measured: the numbers of a computed one may repeat."""
     if measured.rf is None or measured.rf.orbit is None:
         return False
     orbit = measured.rf.orbit[:, 0]
