@@ -13,9 +13,9 @@ from tmlattice.inference import scan as scanning
 from tmlattice.inference.alternatives import linear_evidence
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import fit
-from tmlattice.inference.whitening import Projection, Whitening
+from tmlattice.inference.whitening import Projection
 from tmlattice.machine import simulate
-from tmlattice.observe.data import of_measurement
+from tmlattice.observe.data import Whitening, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.noise import estimate
 

@@ -24,7 +24,7 @@ from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response as simulated
 from tmlattice.measurement import OrbitResponse, read_measurement, write_measurement
 from tmlattice.network import TaylorNetwork
-from tmlattice.observe.noise import Places, estimated_noise
+from tmlattice.observe.noise import estimated_noise
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data, split_columns
 from tmlattice.optics import ring_tunes, twiss
@@ -96,17 +96,22 @@ def test_noise_that_nobody_states_is_learnt_from_neighbours(small_ring, rng, noi
     """Also where every monitor stands twice, under two names."""
     exact = ResponseModel(small_ring)
     monitors = [m.name for m in small_ring.monitors]
-    s = np.array([m.s for m in small_ring.monitors])
     names = [f"v{i}" for i in range(16)]
     orbits = 1e-5 * exact.response(names)
     read = orbits + noise * rng.standard_normal(orbits.shape)
     measured = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), monitors, read)
-    kicked = np.array([small_ring[name].s for name in names])
-    found = estimated_noise(measured, Places(s, kicked, small_ring.length))[0, 1]
+    found = estimated_noise(small_ring, measured)[0, 1]
     assert 0.6 < found / noise < 1.5  # of 16 columns
     both = [name + own for name in monitors for own in ("", " again")]
+
+    class Twice(dict):
+        """A ring in which every monitor has two names."""
+
+        length = small_ring.length
+
+    ring = Twice({name: small_ring[name.removesuffix(" again")] for name in (*both, *names)})
     twice = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), both, np.repeat(read, 2, axis=1))
-    assert estimated_noise(twice, Places(np.repeat(s, 2), kicked, small_ring.length))[0, 1] == found
+    assert estimated_noise(ring, twice)[0, 1] == found
 
 
 def test_what_the_fit_may_not_mend_is_warned_about(small_ring):

@@ -43,7 +43,7 @@ def test_tails_forgive_what_gauss_does_not():
 
 def test_an_amount_without_a_size_is_even_in_its_logarithm():
     """A decade holds a quarter of four, of both signs; beyond the largest fault it is thin."""
-    prior = AmountPrior(decades=4.0)
+    prior = AmountPrior()
 
     def density(amount):
         return np.exp(prior.log_density(Cause("corrector_calibration", "c", amount)))

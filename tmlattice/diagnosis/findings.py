@@ -203,10 +203,10 @@ def unexplained(ring: Ring, left: FreeScan, p_value: float, judgement: Judgement
     taken: set[float] = set()
     for i in np.argsort(-left.gain)[:200]:
         statistic, freedom = float(left.statistic[i]), max(int(left.freedom[i]), 1)
-        chance = look_elsewhere(statistic, freedom, len(left.places))
+        chance = look_elsewhere(statistic, freedom, len(left.gain))
         if len(places) == 3 or chance > judgement.false_alarm:
             break
-        (start, end), _ = between(ring, [ring.magnets[int(left.places[i])].s])
+        (start, end), _ = between(ring, [ring.magnets[int(i)].s])
         if start not in taken:
             taken.add(start)
             places.append({"s_from": start, "s_to": end, "statistic": statistic})

@@ -100,7 +100,7 @@ def prepare(
     data, estimated = _with_noise(data, start)
     data, floor = _above_the_floor(data)
     messages = (*messages, *floor)
-    problem = replace(problem, data=data, white=None)
+    problem = replace(problem, data=data)
     before = _on_its_way(problem, start.nuisances, ring)
     hypotheses = tuple(_determined(ring, model.hypotheses(chosen), data))
     return Prepared(problem, before, hypotheses, dead, estimated, messages)

@@ -16,12 +16,7 @@ from tmlattice.diagnosis.views import PartView, numbers_read
 from tmlattice.effects import Cause, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import CombinedProblem
-from tmlattice.inference.distributed import (
-    DistributedProblem,
-    FittedErrors,
-    chain_factors,
-    signatures_of,
-)
+from tmlattice.inference.distributed import DistributedProblem, FittedErrors, slopes_of
 from tmlattice.inference.judgement import SIGNIFICANT
 from tmlattice.inference.newton import STEP_SHARES, Fit, fit_nuisances
 from tmlattice.inference.problem import Hypothesis, Point, Problem
@@ -200,7 +195,7 @@ def held_out_shots(
     assert isinstance(judge, FirstTurns)
     assert isinstance(part.problem, FirstTurns)
     dropped = found.dropped.reshape(part.problem.valid.shape)
-    judge = replace(judge, data=same_monitors(judge.data, part.problem.data, dropped), white=None)
+    judge = replace(judge, data=same_monitors(judge.data, part.problem.data, dropped))
     scored = []
     for i, stage in enumerate(stages):
         model = judge.model
@@ -230,8 +225,8 @@ def _unknown(small: FittedErrors, explained: Fit, other: FirstTurns, stage: Stag
         return None
     known = among.known
     amounts = np.array([cause.amount for cause in stage.static])
-    there = chain_factors(known, amounts)[:, None] * signatures_of(other, point, known.hypotheses)
-    there = known.correlated(known.rms[:, None] * there)
+    there = known.rms[:, None] * slopes_of(other, point, known, amounts)
+    there = known.correlated(there)
     here = explained.projection.out(among.white_rows)
     rows = there.T @ here
     unknown = there.T @ there - rows @ rows.T

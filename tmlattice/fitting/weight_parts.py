@@ -14,7 +14,6 @@ from tmlattice.beam.model import Hypothesis, Model
 from tmlattice.effects import CATALOGUE, RingEffect, directions, names
 from tmlattice.fitting.launches import with_noise
 from tmlattice.inference.newton import fit
-from tmlattice.inference.whitening import Whitening
 from tmlattice.lattice import Ring
 from tmlattice.maps import LayerMaps, TaylorMap
 from tmlattice.measurement import Measurement
@@ -127,8 +126,7 @@ class Trajectories:
             launch_sigma[:, 4] = 0.0
         data = replace(data, launch_sigma=launch_sigma)
         self.model = model = Model(ring, data.settings, dimension=n)
-        whitening = Whitening(data)
-        problem = FirstTurns(model=model, data=data, places={}, white=whitening)
+        problem = FirstTurns(model=model, data=data, places={})
         found = fit(problem, (), data.launches)
         self.launches, self.chi2 = found.nuisances, found.chi2
         self.readings = int(data.valid.sum())
@@ -136,7 +134,7 @@ class Trajectories:
         self.states = np.ascontiguousarray(paths.states)
 
         shots, count = data.shots, len(model.at)
-        G = (paths.beam_launch * whitening.weight[..., None]).reshape(shots, count, 2, n)
+        G = (paths.beam_launch * problem.whitening.weight[..., None]).reshape(shots, count, 2, n)
         Q = found.projection.Q[:, :-5].reshape(shots, count, 2, -1)
         # by a change of the launch before the monitors from each one on
         H = behind(np.einsum("smpi,smpj->smij", G, G))

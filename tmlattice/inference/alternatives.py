@@ -153,14 +153,10 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
     for cause in causes:
         there = (*others.causes, cause)
         if effect.whole:  # nonlinear: nuisances without it are no guide
-            point = fit_nuisances(problem, there, others.nuisances)
-            left.append(point.chi2)
+            left.append(fit_nuisances(problem, there, others.nuisances).chi2)
             continue
         point = problem.at(there, others.nuisances, others.kicks)
-        if point.lost:
-            left.append(np.inf)
-            continue
-        clean = others.projection.out(np.nan_to_num(point.residual, nan=1e3))
+        clean = np.full(1, np.inf) if point.lost else others.projection.out(point.residual)
         left.append(float(clean @ clean))
     return causes[int(np.argmin(left))]
 

@@ -296,9 +296,8 @@ class _CombinedMetric(Metric):
         ):
             out = np.zeros((len(hypotheses), size))
             seen = [i for i, h in enumerate(hypotheses) if active and part.sees(h)]
-            for start in range(0, len(seen), metric.chunk):
-                some = seen[start : start + metric.chunk]
-                out[some] = metric.rows([hypotheses[i] for i in some])
+            if seen:
+                out[seen] = metric.rows([hypotheses[i] for i in seen])
             parts.append(out)
         return np.concatenate(parts, axis=1)
 

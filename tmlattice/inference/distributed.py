@@ -327,28 +327,22 @@ class FittedErrors:
     Attributes:
         problem: with these errors.
         plain: without them, with the noise as estimated.
+        before: fit of the nuisances alone.
         sizes, errors: rms by effect; relative error of each that was estimated.
         log_evidence: over no distributed errors.
         log_marginal: log marginal likelihood of the sampled rows.
         outlier_evidence: log evidence that the one cause is a fault rather than a member of its
             family of errors; None: not computed.
-        fitted: see `before`.
     """
 
     problem: DistributedProblem
     plain: Problem
+    before: Fit
     sizes: Mapping[str, float]
     errors: Mapping[str, float] = field(default_factory=dict)
     log_evidence: float = 0.0
     log_marginal: float = 0.0
     outlier_evidence: float | None = None
-    fitted: Fit | None = None
-
-    @property
-    def before(self) -> Fit:
-        """Fit of the nuisances alone."""
-        assert self.fitted is not None
-        return self.fitted
 
 
 def fit_distributed_errors(
@@ -381,8 +375,7 @@ def fit_distributed_errors(
     """
 
     def at(inner: Problem, point: Point, amounts: Array) -> DistributedProblem:
-        slopes = signatures_of(inner, point, known.hypotheses)
-        slopes *= chain_factors(known, amounts)[:, None]
+        slopes = slopes_of(inner, point, known, amounts)
         shift = ((amounts - known.amounts) @ slopes).reshape(inner.valid.shape)
         spread = known.correlated(known.rms[:, None] * slopes).reshape(-1, *inner.valid.shape)
         return DistributedProblem(
@@ -407,10 +400,9 @@ def fit_distributed_errors(
         stored = linearised_at if stored is None else stored
         inner, point, amounts = linearise(problem, known, linearised_at, stored, causes, nuisances)
         among = at(inner, point, amounts)
-    fitted = FittedErrors(among, problem, sizes_of(known))
     if learn:
-        fitted = _scaled(fitted, point, causes, noisy, weigh)
-    return _with_nuisances(fitted, point.nuisances)
+        return _scaled(among, problem, point, causes, noisy, weigh)
+    return FittedErrors(among, problem, _without_causes(among, point), sizes_of(known))
 
 
 def full_chi2(errors: FittedErrors, found: Fit, dropped: Flags) -> float:
@@ -442,14 +434,15 @@ def rescaled(
         causes, nuisances, noisy: see `fit_distributed_errors`.
     """
     point = fit_nuisances(errors.problem.inner, causes, nuisances)
-    return _with_nuisances(_scaled(errors, point, causes, noisy, False), point.nuisances)
+    return _scaled(errors.problem, errors.plain, point, causes, noisy)
 
 
 def _scaled(
-    errors: FittedErrors, point: Point, causes: Sequence[Cause], noisy: bool, weigh: bool
-) -> FittedErrors:
+    problem: DistributedProblem, plain: Problem, point: Point, causes: Sequence[Cause],
+    noisy: bool, weigh: bool = False,
+) -> FittedErrors:  # fmt: skip
     """Estimate the scales, and the noise, at a point of the problem without distributed errors."""
-    problem, inner, known = errors.problem, errors.problem.inner, errors.problem.known
+    inner, known = problem.inner, problem.known
     assert point.projection is not None
     names, belongs = families_of(known)
     keep = sampled_rows(len(point.residual))
@@ -466,15 +459,16 @@ def _scaled(
         whole = moved + amount / known.rms[i] * rows[i]
         other = components_of_rows(whole, directions, rows, belongs, noise)
         outlier_evidence = found.log_marginal - other.log_marginal
-    plain, scale = errors.plain, found.scale[belongs]
+    scale = found.scale[belongs]
     if noise:
         plain, inner = (own.noisier(found.noise) for own in (plain, inner))
     known = replace(known, rms=known.rms * scale)
     spread = problem.spread * scale.reshape(-1, *[1] * (problem.spread.ndim - 1))
     opened = (belongs, found.covariance)
+    problem = replace(problem, inner=inner, known=known, spread=spread, open=opened)
+    errors = dict(zip(names, found.error.tolist(), strict=True))
     return FittedErrors(
-        replace(problem, inner=inner, known=known, spread=spread, open=opened), plain,
-        sizes_of(known), dict(zip(names, found.error.tolist(), strict=True)),
+        problem, plain, _without_causes(problem, point), sizes_of(known), errors,
         found.log_evidence, found.log_marginal, outlier_evidence,
     )  # fmt: skip
 
@@ -484,19 +478,20 @@ def sizes_of(known: DistributedErrors) -> dict[str, float]:
     return {name: rms for (name, _), rms in zip(known.hypotheses, known.rms.tolist(), strict=True)}
 
 
-def _with_nuisances(errors: FittedErrors, nuisances: Array) -> FittedErrors:
-    """Fit the nuisances alone."""
-    before = fit(errors.problem, (), nuisances)
+def _without_causes(problem: Problem, point: Point) -> Fit:
+    """Fit the nuisances alone, from those of a point."""
+    before = fit(problem, (), point.nuisances)
     if before.point.lost:
         raise UnstableRingError(f"{before.point.lost} with distributed errors, without the causes")
-    return replace(errors, fitted=before)
+    return before
 
 
-def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesis]) -> Array:
-    """d reading / d amount in units of the readings' noise, [error, flat]; 0 where missing.
+def slopes_of(problem: Problem, point: Point, known: DistributedErrors, amounts: Array) -> Array:
+    """d reading / d amount at some amounts, [error, flat]; 0 where missing.
 
     The noise is put back, so that readings can be dropped later: `as_rows` of ones gives it.
     """
+    hypotheses = known.hypotheses
     unit = problem.as_rows(np.ones(problem.valid.shape))
     linearised_at, there = problem.everywhere().metric(point), unit > 0
     out = np.zeros((len(hypotheses), problem.valid.size))
@@ -505,6 +500,7 @@ def signatures_of(problem: Problem, point: Point, hypotheses: Sequence[Hypothesi
         some = slice(start, start + count)
         rows = linearised_at.rows(hypotheses[some])
         out[some, problem.valid.ravel()] = rows[:, there] / unit[there]
+    out *= chain_factors(known, amounts)[:, None]
     return out
 
 
@@ -717,13 +713,11 @@ class Sums:
     Attributes:
         gram: with each other, [error, error].
         inner: with the residual, [error].
-        keep: a few rows.
-        some: slopes in these, nuisances not projected out, [error, row].
+        some: slopes in the rows of `sampled_rows`, nuisances not projected out, [error, row].
     """
 
     gram: Array
     inner: Array
-    keep: Indices
     some: Array
 
 
@@ -765,9 +759,10 @@ def posterior(
         return replace(_posterior_at(known, stored, sums), amounts=made.amounts)
     assert point.projection is not None
     _, belongs = families_of(known)
+    keep = sampled_rows(len(point.residual))
     found = components_of_rows(
-        point.residual[sums.keep] + (stored - known.amounts) @ sums.some,
-        point.projection.matrix()[sums.keep],
+        point.residual[keep] + (stored - known.amounts) @ sums.some,
+        point.projection.matrix()[keep],
         known.correlated(known.rms[:, None] * sums.some), belongs, prior=known.scales,
     )  # fmt: skip
     least = np.where(found.error[belongs] < unsure, 0.0, known.rms)
@@ -825,4 +820,4 @@ def sums_at(
         here = column[rows]
         some[np.ix_(visible, here[here >= 0])] = own[:, here >= 0]
     gram -= along @ along.T
-    return Sums(gram, inner, keep, some)
+    return Sums(gram, inner, some)

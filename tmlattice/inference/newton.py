@@ -307,13 +307,8 @@ def _finished(problem: Problem, point: Point, slopes: Slopes, rows: Array, outco
     for values in point.kicks.values():
         part = slice(at, at + len(values))
         at += len(values)
-        log_evidence += free_evidence(gram[part, part], values)
+        own_gram = gram[part, part]
+        found = free_scan(own_gram[None, None], (own_gram @ values)[None, None])
+        log_evidence += float(found.gain[0] - 0.5 * found.statistic[0])  # less that of the misfit
         log_evidence += problem.unknown_prior(len(problem.kick_places))
     return Fit(point, covariance, float(log_evidence), outcome, slopes)
-
-
-def free_evidence(information: Array, values: Array) -> float:
-    """Log evidence of free parameters at their best values, less that of their misfit (<= 0)."""
-    inner = information @ values
-    found = free_scan(np.zeros(1, dtype=np.int64), information[None, None], inner[None, None])
-    return float(found.gain[0] - 0.5 * found.statistic[0])

@@ -113,69 +113,10 @@ class Slopes(NamedTuple):
         return np.asarray((self.rows.transpose(1, 0, 2) @ own).transpose(1, 0, 2))
 
 
-class Sums(NamedTuple):
-    """Sums over readings, for the errors of all families in turn.
-
-    Attributes:
-        square: J^T W J, the upper triangle, [error, error].
-        monitors: with the monitors' derivatives, [error, plane, monitor].
-        columns: with the columns' derivatives, [error, column].
-        vector: J^T W residual, [error].
-    """
-
-    square: Array
-    monitors: Array
-    columns: Array
-    vector: Array
-
-
 def whole(ring: Sequence[Slopes], shape: tuple[int, ...]) -> Array:
     """Return all derivatives in one array, [error, column, monitor]."""
     parts = [own.rows if own.now is None else own.rows * own.now for own in ring]
     return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, *shape)), *parts])
-
-
-def weighed_sums(
-    ring: Sequence[Slopes],
-    residual: Array,
-    weight: Array,
-    plane: Indices,
-    by_monitor: Array,
-    by_column: Array,
-) -> Sums:
-    """Return sums over all readings; see `normal.normal_equations` for the arguments.
-
-    `residual` is finite here. Memory beyond the derivatives is that of `AT_ONCE` readings.
-    """
-    columns, monitors = residual.shape
-    ends = np.cumsum([0, *(len(own.rows) for own in ring)])
-    errors = int(ends[-1])
-    out = Sums(np.zeros((errors, errors), order="F"), np.zeros((errors, 2, monitors)),
-               np.zeros((errors, columns)), np.zeros(errors))  # fmt: skip
-    if not errors:
-        return out
-    step = min(max(AT_ONCE // monitors, 1), columns)
-    buffer = np.empty(errors * step * monitors)
-    root = np.sqrt(weight)
-    square, by_monitor, by_column = out.square, weight * by_monitor, weight * by_column
-    scales = [
-        [np.ascontiguousarray(a if own.now is None else a * own.now)
-         for a in (root, by_monitor, by_column)]
-        for own in ring
-    ]  # fmt: skip
-    for low in range(0, columns, step):
-        some = slice(low, min(low + step, columns))
-        count = some.stop - low
-        weighed = buffer[: errors * count * monitors].reshape(errors, count, monitors)
-        for own, scale, begin, end in zip(ring, scales, ends, ends[1:], strict=False):
-            mine = slice(begin, end)
-            weights, u, v = (factor[some] for factor in scale)
-            _weigh(own.rows[:, some], weights, u, v, plane[some], weighed[mine],
-                   out.monitors[mine], out.columns[mine, some])  # fmt: skip
-        flat = weighed.reshape(errors, -1)
-        square = dsyrk(1.0, flat.T, beta=1.0, c=square, trans=1, lower=0, overwrite_c=1)
-        out.vector[:] += flat @ (root[some] * residual[some]).ravel()
-    return out._replace(square=square)
 
 
 # `reassoc`: the sum may follow the vector unit's order.
@@ -187,7 +128,8 @@ def _weigh(rows, root, by_monitor, by_column, plane, weighed, monitors, columns)
         rows: [error, column, monitor].
         root, by_monitor, by_column: factors of the derivatives, [column, monitor].
         plane: [column].
-        weighed, monitors, columns: results, see `Sums`; weighed is root times rows.
+        weighed: result, root times rows, [error, column, monitor].
+        monitors, columns: sums, [error, plane, monitor] and [error, column].
     """
     for i in range(rows.shape[0]):
         for c in range(rows.shape[1]):
@@ -232,30 +174,51 @@ def normal_equations(
         by_monitor: d reading / d monitor's parameter, [column, monitor].
         by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
         by_ring: d reading / d error, [error, column, monitor], or those of each family; may be
-            empty.
-        taken: L of `inference.common.common`, the readings' common modes, [column, monitor,
-            pattern]; None: no common modes.
+            empty. Memory beyond them is that of `AT_ONCE` readings.
+        taken: L of `common`, the readings' common modes, [column, monitor, pattern]; None: no
+            common modes.
     """
     columns, monitors = residual.shape
     ring = (Slopes(np.asarray(by_ring)),) if isinstance(by_ring, np.ndarray) else tuple(by_ring)
     y = np.where(weight > 0, residual, 0.0)
-    sums = weighed_sums(ring, y, weight, plane, by_monitor, by_column)
     m, end = 2 * monitors, 2 * monitors + columns
-    A = np.zeros((end + len(sums.vector),) * 2)
-    b = np.zeros(len(A))
+    ends = np.cumsum([0, *(len(own.rows) for own in ring)])
+    errors = int(ends[-1])
+    square = np.zeros((errors, errors), order="F")  # the upper triangle
+    of_monitors, of_columns = np.zeros((errors, 2, monitors)), np.zeros((errors, columns))
+    b = np.zeros(end + errors)
     wu, wv = weight * by_monitor, weight * by_column
+    root = np.sqrt(weight)
+    scales = [
+        [np.ascontiguousarray(a if own.now is None else a * own.now) for a in (root, wu, wv)]
+        for own in ring
+    ]
+    step = min(max(AT_ONCE // monitors, 1), columns)
+    buffer = np.empty(errors * step * monitors)
+    for low in range(0, columns, step) if errors else ():
+        some = slice(low, min(low + step, columns))
+        count = some.stop - low
+        weighed = buffer[: errors * count * monitors].reshape(errors, count, monitors)
+        for own, scale, begin, last in zip(ring, scales, ends, ends[1:], strict=False):
+            mine = slice(begin, last)
+            weights, u, v = (factor[some] for factor in scale)
+            _weigh(own.rows[:, some], weights, u, v, plane[some], weighed[mine],
+                   of_monitors[mine], of_columns[mine, some])  # fmt: skip
+        flat = weighed.reshape(errors, -1)
+        square = dsyrk(1.0, flat.T, beta=1.0, c=square, trans=1, lower=0, overwrite_c=1)
+        b[end:] += flat @ (root[some] * y[some]).ravel()
+    A = np.zeros((len(b), len(b)))
     for p in (0, 1):
         at, rows = 2 * np.arange(monitors) + p, plane == p
         A[at, at] = (wu * by_monitor)[rows].sum(axis=0)
         A[np.ix_(at, m + np.flatnonzero(rows))] = (wu * by_column)[rows].T
-        A[at, end:] = sums.monitors[:, p].T
+        A[at, end:] = of_monitors[:, p].T
         b[at] = (wu * y)[rows].sum(axis=0)
-    own = np.arange(m, end)
-    A[own, own] = (wv * by_column).sum(axis=1)
-    A[own, end:] = sums.columns.T
-    b[own] = (wv * y).sum(axis=1)
-    A[end:, end:] = sums.square
-    b[end:] = sums.vector
+    at = np.arange(m, end)
+    A[at, at] = (wv * by_column).sum(axis=1)
+    A[at, end:] = of_columns.T
+    b[at] = (wv * y).sum(axis=1)
+    A[end:, end:] = square
     if taken is not None:
         shared = shared_by(plane, by_monitor, by_column, ring, taken).reshape(len(A), -1)
         A -= shared @ shared.T

@@ -54,19 +54,21 @@ class Student:
         return float(shape - np.log(self.width))
 
 
+DECADES = 4.0
+"""Powers of ten of a log-uniform amount."""
+
+
 @dataclass(frozen=True)
 class AmountPrior:
     """Prior of the amount of one fault.
 
     Attributes:
-        tails: its distribution; None: log-uniform in |amount| over `decades` up to the largest
+        tails: its distribution; None: log-uniform in |amount| over `DECADES` up to the largest
             fault, thin beyond it.
-        decades: powers of ten.
         bound: largest possible amount.
     """
 
     tails: Student | None = None
-    decades: float = 4.0
     bound: float = np.inf
 
     def log_density(self, cause: Cause) -> float:
@@ -80,7 +82,7 @@ class AmountPrior:
         if self.tails is not None:
             return self.tails.peak - float(self.tails.penalty(size))
         size = max(size, 1e-300)
-        density = -np.log(2 * size * self.decades * np.log(10))
+        density = -np.log(2 * size * DECADES * np.log(10))
         return float(density - 8 * max(np.log(size / effect.largest), 0.0))
 
     def precision(self, cause: Cause) -> float:
@@ -175,10 +177,6 @@ class Group:
         chances = np.concatenate([(1 - faulty) * chances, np.full(count, faulty / count)])
         return chances, np.concatenate([core, np.geomspace(least, self.largest, count)])
 
-    def share(self, squares: Array, rms: float) -> Array:
-        """Weight of a parameter with this expected square: 1 for Gauss, less in the tails."""
-        return rms**2 * Student(rms, self.freedom).precision(np.sqrt(squares))
-
     def learn(self, squares: Array, left: Array) -> "Group":
         """Return the group after a Fisher-scoring step of its log scale.
 
@@ -199,5 +197,7 @@ class Group:
             step = (shown - known - own) / (2 * known + self.guessed**-2)
             rms = rms * float(np.exp(np.clip(step, -MAX_STEP, MAX_STEP)))
             rms = min(max(rms, SMALLEST), self.most)
-        each = rms / np.sqrt(self.share(squares + left * now**2, rms))
+        expected = np.sqrt(squares + left * now**2)
+        share = rms**2 * Student(rms, self.freedom).precision(expected)  # less than 1 in the tails
+        each = rms / np.sqrt(share)
         return replace(self, rms=rms, each=np.minimum(each, self.most), first=self.guess)

@@ -130,22 +130,19 @@ class FreeScan:
     """Statistics of free kicks at places, or of free readings of monitors.
 
     Attributes:
-        places: layers, or monitors, [place].
-        gain: in log evidence, [place].
+        gain: in log evidence, [place]; a place is a layer, or a monitor.
         statistic: fall of chi-square, [place].
         freedom: number of parameters, [place].
         amounts: best values, [place, parameter], zero where there is none.
     """
 
-    places: Indices
     gain: Array
     statistic: Array
     freedom: Indices
     amounts: Array
 
 
-_NOTHING = np.zeros(0)
-NO_SCAN = FreeScan(np.zeros(0, np.int64), _NOTHING, _NOTHING, np.zeros(0, np.int64), _NOTHING)
+NO_SCAN = FreeScan(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 0)))
 """Scan of no places."""
 
 
@@ -167,11 +164,10 @@ def evidence_of_scale(values: Array, information: Array) -> Array:
     return np.asarray(logsumexp(gains, axis=0) - np.log(len(_RATIOS)))
 
 
-def free_scan(places: Indices, gram: Array, inner: Array) -> FreeScan:
+def free_scan(gram: Array, inner: Array) -> FreeScan:
     """Statistics of groups of parameters.
 
     Args:
-        places: [place].
         gram: information, [place, block, p, p]; parameters of different blocks are independent.
         inner: signatures times residual, [place, block, p].
     """
@@ -184,7 +180,6 @@ def free_scan(places: Indices, gram: Array, inner: Array) -> FreeScan:
     information = np.where(seen, values / top, 0.0).reshape(len(gram), -1)
     amounts = np.einsum("kbpq,kbq->kbp", vectors, np.where(seen, along / safe, 0.0))
     return FreeScan(
-        places,
         evidence_of_scale(scaled, information),
         (scaled**2).sum(axis=1),
         seen.reshape(len(gram), -1).sum(axis=1),
@@ -194,11 +189,10 @@ def free_scan(places: Indices, gram: Array, inner: Array) -> FreeScan:
 
 def scan_kicks(metric: Metric, layers: Sequence[int], residual: Array) -> FreeScan:
     """Scan a free kick (px, py) in every active shot, in the middle of each layer's magnet."""
-    places = np.asarray(layers)
-    return free_scan(places, *metric.free_kicks(places, metric.projection.out(residual)))
+    clean = metric.projection.out(residual)
+    return free_scan(*metric.free_kicks(np.asarray(layers), clean))
 
 
 def scan_monitors(metric: Metric, residual: Array) -> FreeScan:
     """Scan monitors with free readings in every active shot and turn."""
-    gram, inner = metric.free_monitors(metric.projection.out(residual))
-    return free_scan(np.arange(len(gram)), gram, inner)
+    return free_scan(*metric.free_monitors(metric.projection.out(residual)))

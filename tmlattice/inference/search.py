@@ -19,7 +19,7 @@ from tmlattice.arrays import Flags
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Alternative, Detection, alternatives, linear_evidence
 from tmlattice.inference.newton import AGAIN, Fit, Outcome, fit
-from tmlattice.inference.problem import Hypothesis, Point, Problem
+from tmlattice.inference.problem import Hypothesis, Metric, Point, Problem
 from tmlattice.inference.scan import (
     NO_SCAN,
     FreeScan,
@@ -71,13 +71,12 @@ def unnamed(
         taken: places that have one.
     """
     rate = problem.judgement.rate(kind)
-    place = int(free.gain.argmax())
-    where = int(free.places[place])
-    freedom = max(int(free.freedom[place]), 1)
-    seen = _detection(float(free.statistic[place]), rate, freedom, len(names))
+    where = int(free.gain.argmax())
+    freedom = max(int(free.freedom[where]), 1)
+    seen = _detection(float(free.statistic[where]), rate, freedom, len(names))
     if not seen.p_value < rate or where in taken:
         return []
-    gain = float(free.gain[place]) + problem.unknown_prior(len(names))
+    gain = float(free.gain[where]) + problem.unknown_prior(len(names))
     return [Option(kind, f"{kind} at {names[where]}", gain, seen, where=where)]
 
 
@@ -199,7 +198,7 @@ class State:
 AnyState = TypeVar("AnyState", bound=State)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Explanation(State):
     """Final explanation with its scans.
 
@@ -211,10 +210,10 @@ class Explanation(State):
         beyond: one cause more, refitted and not accepted.
     """
 
-    before: Fit = None  # type: ignore[assignment]
-    first: Scan = None  # type: ignore[assignment]
+    before: Fit
+    first: Scan
     first_kicks: FreeScan = NO_SCAN
-    scan: Scan = None  # type: ignore[assignment]
+    scan: Scan
     left: FreeScan = NO_SCAN
     full: bool = False
     beyond: tuple[Alternative, ...] = ()
@@ -308,20 +307,16 @@ def _weighed(search: Search, one: State, other: State) -> float:
 
 
 # --- looking ----
-def _scan(search: Search, state: State) -> Scan:
+def _scan(search: Search, state: State, about: Metric) -> Scan:
     return scan(
-        state.problem.metric(state.fit.point),
-        search.hypotheses,
-        state.fit.residual,
-        effective=state.effective,
-        seed=search.seed,
+        about, search.hypotheses, state.fit.residual, effective=state.effective, seed=search.seed
     )
 
 
 def _scan_all(search: Search, state: State) -> tuple[State, Scans]:
     problem, residual = state.problem, state.fit.residual
     about = problem.metric(state.fit.point)
-    named = scan(about, search.hypotheses, residual, effective=state.effective, seed=search.seed)
+    named = _scan(search, state, about)
     kicks = monitors = NO_SCAN
     if search.unnamed and len(problem.kick_places):
         kicks = scan_kicks(about, range(len(problem.kick_places)), residual)
@@ -337,15 +332,13 @@ def _options(search: Search, state: State, scans: Scans) -> list[Option]:
     options = []
     statistic = float(scans.named.statistic.max(initial=0.0))
     rate = thresholds.rate("named")
-    detection = Detection(statistic, scans.named.threshold(rate), scans.named.p_value(statistic))
+    detection = _detection(statistic, rate, 1, scans.named.effective)
     top = scans.named.hypotheses[int(scans.named.statistic.argmax())] if statistic > 0 else None
     if top is not None and top not in search.established and detection.p_value < rate:
         freedom = problem.certainty(state.fit.point, top)
-        detection = Detection(
-            statistic,
-            chi2.estimated(detection.threshold, freedom),
-            scans.named.p_value(chi2.known(statistic, freedom)),
-        )
+        known = chi2.known(statistic, freedom)
+        threshold = chi2.estimated(detection.threshold, freedom)
+        detection = Detection(statistic, threshold, scans.named.p_value(known))
     if detection.p_value < rate or (search.by_marginal_likelihood and statistic > 0):
         tried = alternatives(problem, state.fit, scans.named, search.hypotheses)
         if tried and (search.by_marginal_likelihood or tried[0].fit.chi2 < state.fit.chi2):
@@ -356,7 +349,7 @@ def _options(search: Search, state: State, scans: Scans) -> list[Option]:
         ("kick", scans.kicks, problem.kick_places, state.kicks),
         ("monitor", scans.monitors, problem.monitors, state.monitors),
     ):
-        if len(free.places):
+        if len(free.gain):
             options += unnamed(problem, kind, free, names, taken)
     if search.unnamed:
         options += outlier(problem, state.fit.point, len(state.outliers))
@@ -390,8 +383,7 @@ def _taken(search: Search, state: State, option: Option, scans: Scans) -> State:
         named = (*state.named, Identified(option.detection, option.alternatives))
         return replace(state, fit=option.alternatives[0].fit, named=named)
     if option.kind == "kick":
-        place = int(np.flatnonzero(scans.kicks.places == option.where)[0])
-        kicks = {**state.fit.kicks, option.where: scans.kicks.amounts[place]}
+        kicks = {**state.fit.kicks, option.where: scans.kicks.amounts[option.where]}
         found = fit(state.problem, state.fit.causes, state.fit.nuisances, kicks)
         return replace(state, fit=found, kicks={**state.kicks, option.where: option.detection})
     dropped = state.dropped.copy()
@@ -486,7 +478,7 @@ def _better(
     alone = without.fit
     if alone.log_evidence >= evidence:
         return without
-    scanned = _scan(search, without)
+    scanned = _scan(search, without, without.problem.metric(alone.point))
     tried = alternatives(without.problem, alone, scanned, search.hypotheses, count)
     if tried and tried[0].fit.log_evidence > evidence:
         named = (*without.named, Identified(seen, tried))
@@ -511,12 +503,12 @@ def _cause_revised(
         return state
     if not search.keep and alone.log_evidence > now.log_evidence:
         return without
-    about = _scan(search, without)
+    scanned = _scan(search, without, state.problem.metric(alone.point))
     if quick:
-        leader = about.hypotheses[int(linear_evidence(state.problem, about).argmax())]
+        leader = scanned.hypotheses[int(linear_evidence(state.problem, scanned).argmax())]
         if leader == hypothesis:
             return state
-    tried = alternatives(state.problem, alone, about, search.hypotheses, 12)
+    tried = alternatives(state.problem, alone, scanned, search.hypotheses, 12)
     if hypothesis not in [one.hypothesis for one in tried]:
         order = (*rest, now.causes[k])
         kept = fit(state.problem, order, now.nuisances, now.kicks, slopes=now.slopes)

@@ -178,18 +178,19 @@ def _explained(
     before: Sequence[Residuals], after: Sequence[Residuals]
 ) -> tuple[float | None, tuple[float, float] | None]:
     """Explained share of the gap and its interval; the noise of both models is the same."""
-    one, other = _together(before), _together(after)
-    if len(one.residual) != len(other.residual):
+    # two models may group the same readings differently
+    one, other = (np.concatenate([part.residual for part in parts]) for parts in (before, after))
+    if len(one) != len(other):
         return None, None  # the beam is lost in one of them
-    V = other.noise
+    V_one, V = (block_diag(*(part.noise for part in parts)) for parts in (before, after))
     twice = float(np.vdot(V, V))
-    moved_one, moved_other = V @ one.residual, V @ other.residual
-    bottom = float(one.residual @ one.residual - np.trace(one.noise))
-    top = float(other.residual @ other.residual - np.trace(V))
+    moved_one, moved_other = V @ one, V @ other
+    bottom = float(one @ one - np.trace(V_one))
+    top = float(other @ other - np.trace(V))
     # variances of the noise-free squares; the noise's own part is subtracted
-    spread_bottom = 2 * twice + 4 * max(float(one.residual @ moved_one) - twice, 0.0)
-    spread_top = 2 * twice + 4 * max(float(other.residual @ moved_other) - twice, 0.0)
-    shared = 2 * twice + 4 * (float(one.residual @ moved_other) - twice)
+    spread_bottom = 2 * twice + 4 * max(float(one @ moved_one) - twice, 0.0)
+    spread_top = 2 * twice + 4 * max(float(other @ moved_other) - twice, 0.0)
+    shared = 2 * twice + 4 * (float(one @ moved_other) - twice)
     if bottom < SIGNIFICANT * np.sqrt(spread_bottom):
         return None, None
     left = max(top, 0.0) / bottom
@@ -197,9 +198,3 @@ def _explained(
     width = 1.96 * float(np.sqrt(max(variance, 0.0)))
     explained = 1 - left
     return float(explained), (float(explained - width), float(min(explained + width, 1.0)))
-
-
-def _together(parts: Sequence[Residuals]) -> Residuals:
-    """Return all parts as one: two models may group the same readings differently."""
-    residual = np.concatenate([part.residual for part in parts])
-    return Residuals(residual, block_diag(*(part.noise for part in parts)))

@@ -1,9 +1,4 @@
-"""Readings in units of their noise, with the launches projected out.
-
-Noise is independent, and, if asked for, correlated by distributed errors that are the same in all
-shots: C = sigma^2 + sum_h tau_h^2 s_h s_h^T. Launches are nuisance parameters: their directions are
-projected out of data and signatures. Prior knowledge of a launch adds rows: [shot, 2 readings + 5
-coordinates], flattened.
+"""Rows that distributed errors correlate are made white, and nuisances are projected out of them.
 
 Inverse root of a covariance 1 + S^T S, which whitens rows with distributed errors. The cheaper of
 two roots is used: the Cholesky factor (rows x rows), or, if errors are fewer than rows, the
@@ -15,20 +10,15 @@ which costs errors^2 x rows once and errors x rows for each row that is whitened
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
-from copy import copy
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag, eigh
 
-from tmlattice.arrays import TINY, Array, Flags
+from tmlattice.arrays import TINY, Array
 from tmlattice.inference.normal import inverse_of_lower, lower_factor
 
-EXACT = 1e-12
-"""m, rad or relative: rms of a launch coordinate that is known exactly."""
 ROUNDING = 1e-13
 """Share of a direction below which it is rounding, given the directions before it."""
 SMALLEST_SHARE = 1e-12
@@ -144,152 +134,11 @@ def directions_of(spread: Array) -> tuple[Array, Array]:
     return values, (vectors[:, kept] / np.sqrt(values)).T @ spread
 
 
-class Readings(Protocol):
-    """Data of a whitening, see `observe.data.Data`."""
-
-    @property
-    def valid(self) -> Flags:
-        """Valid readings, [shot, reading, 2]."""
-
-    @property
-    def sigma(self) -> Array:
-        """Noise of each reading, m, [shot, reading, 2]."""
-
-    @property
-    def launches(self) -> Array:
-        """Nominal launches, [shot, 5]."""
-
-    @property
-    def launch_sigma(self) -> Array:
-        """rms of the launches; inf: unknown, 0: exact, [shot, 5]."""
-
-
-class Whitening:
-    """Division by the noise, or by the Cholesky factor of its covariance.
-
-    Args:
-        data: readings and their noise, launches and their priors.
-
-    Attributes:
-        columns: free coordinates of the launch.
-        rows: length of a whitened vector.
-    """
-
-    def __init__(self, data: Readings) -> None:
-        self.weight = np.where(data.valid, 1.0 / data.sigma, 0.0)
-        self.shots = len(data.valid)
-        sigma = np.maximum(data.launch_sigma, EXACT)
-        self.columns = np.flatnonzero((data.launch_sigma > 0).any(axis=0))
-        self._prior = np.where(np.isfinite(sigma), 1.0 / sigma, 0.0)  # [shot, 5]
-        self._prior[:, (data.launch_sigma == 0).all(axis=0)] = 0.0
-        self._nominal = data.launches
-        self.rows = self.shots * (self.weight[0].size + 5)
-        self._inverse: Array | None = None  # of the Cholesky factor: faster than solving
-
-    def correlated(self, root: Array) -> "Whitening":
-        """Return the whitening of readings that distributed errors correlate.
-
-        Args:
-            root: W of `inference.root` over all rows, those of the launches too, [row, row].
-        """
-        other = copy(self)
-        readings = np.arange(self.rows).reshape(self.shots, -1)[:, :-5].ravel()
-        other.__dict__.pop("precision", None)
-        other._inverse = root[np.ix_(readings, readings)]
-        return other
-
-    @property
-    def dense(self) -> bool:
-        """Whether readings of different shots are correlated."""
-        return self._inverse is not None
-
-    @cached_property
-    def precision(self) -> Array:
-        """Inverse covariance of readings in units of their own noise, all shots, [row, row]."""
-        assert self._inverse is not None
-        return np.asarray(self._inverse.T @ self._inverse)
-
-    def projected_precision(self, projection: "Projection") -> Array:
-        """The precision less what launches explain, in units of the readings' noise, [row, row]."""
-        assert self._inverse is not None
-        _, rows, width = projection.Q.shape
-        Q = projection.Q[0].reshape(self.shots, rows // self.shots, width)[:, :-5]
-        along = self._inverse.T @ Q.reshape(len(self._inverse), width)
-        return np.asarray(self.precision - along @ along.T)
-
-    def back(self, rows: Array) -> Array:
-        """Adjoint of `signature`: whitened rows [..., shot, reading * 2] as [..., shot, reading,
-        2], 1 / m."""
-        flat = rows.reshape(*rows.shape[:-2], -1)
-        if self._inverse is not None:
-            flat = flat @ self._inverse
-        return np.asarray(self.weight * flat.reshape(*rows.shape[:-2], *self.weight.shape))
-
-    def _flat(self, x: Array) -> Array:
-        rows = (self.weight * x).reshape(*x.shape[:-3], -1)
-        if self._inverse is None:
-            return np.asarray(rows)
-        flat = rows.reshape(-1, rows.shape[-1])
-        return np.asarray(flat @ self._inverse.T).reshape(rows.shape)
-
-    def signature(self, x: Array) -> Array:
-        """x [..., shot, reading, 2] in m as rows [..., row]; zero in the launch's rows."""
-        flat = self._flat(x)
-        out = np.zeros((*flat.shape[:-1], self.shots, self.weight[0].size + 5))
-        out[..., :-5] = flat.reshape(*flat.shape[:-1], self.shots, -1)
-        return out.reshape(*flat.shape[:-1], -1)
-
-    def residual(self, difference: Array, launches: Array) -> Array:
-        """Readings less model [shot, reading, 2], and nominal less fitted launches, as rows."""
-        rows = self.signature(difference).reshape(self.shots, -1)
-        rows[:, -5:] = self._prior * (self._nominal - launches)
-        return rows.reshape(-1)
-
-    def launch(self, slopes: Array) -> Array:
-        """d rows / d free launch coordinates from d readings / d launch [shot, reading, 2, 5].
-
-        Returns:
-            [shot, row of the shot, column]; where shots are correlated, one block for all:
-            [1, row, shot * column].
-        """
-        p = len(self.columns)
-        if p == 0:  # every launch is known exactly
-            blocks = 1 if self.dense else self.shots
-            return np.zeros((blocks, self.rows // blocks, 0))
-        moved = np.moveaxis(slopes[..., self.columns], -1, 0)  # [column, shot, reading, 2]
-        if not self.dense:
-            parts = self.signature(moved).reshape(p, self.shots, -1)
-            for i, column in enumerate(self.columns):
-                parts[i, :, -5 + column] = self._prior[:, column]
-            return np.ascontiguousarray(np.moveaxis(parts, 0, 2))
-        (alone,) = each_shot(moved[None], range(self.shots))
-        rows = self.signature(alone).reshape(self.shots, p, self.shots, -1)
-        for shot in range(self.shots):
-            for i, column in enumerate(self.columns):
-                rows[shot, i, shot, -5 + column] = self._prior[shot, column]
-        return np.ascontiguousarray(rows.reshape(self.shots * p, -1).T)[None]
-
-
-def each_shot(moved: Array, shots: Iterable[int]) -> Array:
-    """Return changes [place, parameter, shot, ...] of a single shot each, zero in the others,
-    [place, single shot, parameter, shot, ...].
-
-    Args:
-        moved: changes of all shots.
-        shots: the single ones.
-    """
-    shots = list(shots)
-    alone = np.zeros((len(moved), len(shots), *moved.shape[1:]))
-    for i, shot in enumerate(shots):
-        alone[:, i, :, shot] = moved[:, :, shot]
-    return alone
-
-
 class Projection:
     """Directions of the launches among whitened rows, by blocks of rows.
 
     Args:
-        directions: d rows / d launch coordinates by block, see `Whitening.launch`.
+        directions: d rows / d launch coordinates by block, see `observe.data.Whitening.launch`.
 
     Attributes:
         Q: orthonormal directions, [block, row, direction].

@@ -1,7 +1,15 @@
-"""Data of a diagnosis: readings, their noise, launches."""
+"""Data of a diagnosis: readings, their noise, launches; and these as rows.
 
-from collections.abc import Sequence
+Noise is independent, and, if asked for, correlated by distributed errors that are the same in all
+shots: C = sigma^2 + sum_h tau_h^2 s_h s_h^T. Launches are nuisance parameters: their directions are
+projected out of data and signatures. Prior knowledge of a launch adds rows: [shot, 2 readings + 5
+coordinates], flattened.
+"""
+
+from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,8 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from tmlattice.arrays import Array, Flags
 from tmlattice.effects import Settings
 from tmlattice.errors import MeasurementError
+from tmlattice.inference.whitening import Projection
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
+
+EXACT = 1e-12
+"""m, rad or relative: rms of a launch coordinate that is known exactly."""
 
 
 @dataclass(frozen=True)
@@ -179,3 +191,124 @@ def first_turn(
         known[:, 4] = width[:, 5]
     sigma = np.maximum(np.nan_to_num(sigma, nan=1.0), NOISE_FLOOR)
     return replace(data, sigma=sigma, launch_sigma=known)
+
+
+class Whitening:
+    """Division by the noise, or by the Cholesky factor of its covariance.
+
+    Args:
+        data: readings and their noise, launches and their priors.
+
+    Attributes:
+        columns: free coordinates of the launch.
+        rows: length of a whitened vector.
+    """
+
+    def __init__(self, data: Data) -> None:
+        self.weight = np.where(data.valid, 1.0 / data.sigma, 0.0)
+        self.shots = len(data.valid)
+        sigma = np.maximum(data.launch_sigma, EXACT)
+        self.columns = np.flatnonzero((data.launch_sigma > 0).any(axis=0))
+        self._prior = np.where(np.isfinite(sigma), 1.0 / sigma, 0.0)  # [shot, 5]
+        self._prior[:, (data.launch_sigma == 0).all(axis=0)] = 0.0
+        self._nominal = data.launches
+        self.rows = self.shots * (self.weight[0].size + 5)
+        self._inverse: Array | None = None  # of the Cholesky factor: faster than solving
+
+    def correlated(self, root: Array) -> "Whitening":
+        """Return the whitening of readings that distributed errors correlate.
+
+        Args:
+            root: W of `inference.whitening` over all rows, those of the launches too, [row, row].
+        """
+        other = copy(self)
+        readings = np.arange(self.rows).reshape(self.shots, -1)[:, :-5].ravel()
+        other.__dict__.pop("precision", None)
+        other._inverse = root[np.ix_(readings, readings)]
+        return other
+
+    @property
+    def dense(self) -> bool:
+        """Whether readings of different shots are correlated."""
+        return self._inverse is not None
+
+    @cached_property
+    def precision(self) -> Array:
+        """Inverse covariance of readings in units of their own noise, all shots, [row, row]."""
+        assert self._inverse is not None
+        return np.asarray(self._inverse.T @ self._inverse)
+
+    def projected_precision(self, projection: Projection) -> Array:
+        """The precision less what launches explain, in units of the readings' noise, [row, row]."""
+        assert self._inverse is not None
+        _, rows, width = projection.Q.shape
+        Q = projection.Q[0].reshape(self.shots, rows // self.shots, width)[:, :-5]
+        along = self._inverse.T @ Q.reshape(len(self._inverse), width)
+        return np.asarray(self.precision - along @ along.T)
+
+    def back(self, rows: Array) -> Array:
+        """Adjoint of `signature`: whitened rows [..., shot, reading * 2] as [..., shot, reading,
+        2], 1 / m."""
+        flat = rows.reshape(*rows.shape[:-2], -1)
+        if self._inverse is not None:
+            flat = flat @ self._inverse
+        return np.asarray(self.weight * flat.reshape(*rows.shape[:-2], *self.weight.shape))
+
+    def _flat(self, x: Array) -> Array:
+        rows = (self.weight * x).reshape(*x.shape[:-3], -1)
+        if self._inverse is None:
+            return np.asarray(rows)
+        flat = rows.reshape(-1, rows.shape[-1])
+        return np.asarray(flat @ self._inverse.T).reshape(rows.shape)
+
+    def signature(self, x: Array) -> Array:
+        """x [..., shot, reading, 2] in m as rows [..., row]; zero in the launch's rows."""
+        flat = self._flat(x)
+        out = np.zeros((*flat.shape[:-1], self.shots, self.weight[0].size + 5))
+        out[..., :-5] = flat.reshape(*flat.shape[:-1], self.shots, -1)
+        return out.reshape(*flat.shape[:-1], -1)
+
+    def residual(self, difference: Array, launches: Array) -> Array:
+        """Readings less model [shot, reading, 2], and nominal less fitted launches, as rows."""
+        rows = self.signature(difference).reshape(self.shots, -1)
+        rows[:, -5:] = self._prior * (self._nominal - launches)
+        return rows.reshape(-1)
+
+    def launch(self, slopes: Array) -> Array:
+        """d rows / d free launch coordinates from d readings / d launch [shot, reading, 2, 5].
+
+        Returns:
+            [shot, row of the shot, column]; where shots are correlated, one block for all:
+            [1, row, shot * column].
+        """
+        p = len(self.columns)
+        if p == 0:  # every launch is known exactly
+            blocks = 1 if self.dense else self.shots
+            return np.zeros((blocks, self.rows // blocks, 0))
+        moved = np.moveaxis(slopes[..., self.columns], -1, 0)  # [column, shot, reading, 2]
+        if not self.dense:
+            parts = self.signature(moved).reshape(p, self.shots, -1)
+            for i, column in enumerate(self.columns):
+                parts[i, :, -5 + column] = self._prior[:, column]
+            return np.ascontiguousarray(np.moveaxis(parts, 0, 2))
+        (alone,) = each_shot(moved[None], range(self.shots))
+        rows = self.signature(alone).reshape(self.shots, p, self.shots, -1)
+        for shot in range(self.shots):
+            for i, column in enumerate(self.columns):
+                rows[shot, i, shot, -5 + column] = self._prior[shot, column]
+        return np.ascontiguousarray(rows.reshape(self.shots * p, -1).T)[None]
+
+
+def each_shot(moved: Array, shots: Iterable[int]) -> Array:
+    """Return changes [place, parameter, shot, ...] of a single shot each, zero in the others,
+    [place, single shot, parameter, shot, ...].
+
+    Args:
+        moved: changes of all shots.
+        shots: the single ones.
+    """
+    shots = list(shots)
+    alone = np.zeros((len(moved), len(shots), *moved.shape[1:]))
+    for i, shot in enumerate(shots):
+        alone[:, i, :, shot] = moved[:, :, shot]
+    return alone

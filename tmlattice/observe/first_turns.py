@@ -9,6 +9,7 @@ shot, in the middle of a layer's magnet; its parameters are [active shot * 2].
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -19,8 +20,8 @@ from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.newton import ITERATIONS, fit
 from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
 from tmlattice.inference.validation import Half, HeldOut, cross_predicted
-from tmlattice.inference.whitening import EXACT, Projection, Root, Whitening, each_shot
-from tmlattice.observe.data import Data
+from tmlattice.inference.whitening import Projection, Root
+from tmlattice.observe.data import EXACT, Data, Whitening, each_shot
 from tmlattice.observe.metric import DenseMetric, IndependentMetric, TurnMetric
 from tmlattice.observe.noise import local_misfit
 from tmlattice.observe.sections import TWO
@@ -34,23 +35,18 @@ class FirstTurns(Problem):
     Attributes:
         model: the ring of these shots.
         data: readings.
-        white: the whitening, if known.
     """
 
     model: Model = field(repr=False)
     data: Data = field(repr=False)
-    white: Whitening | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", _bounded(self.data, self.model))
-        if self.white is None:
-            object.__setattr__(self, "white", Whitening(self.data))
 
-    @property
+    @cached_property
     def whitening(self) -> Whitening:
         """Whitening by the noise of the readings."""
-        assert self.white is not None
-        return self.white
+        return Whitening(self.data)
 
     # --- the model ------------------------------------------------------------------------------
     @property
@@ -83,7 +79,8 @@ class FirstTurns(Problem):
     def at(self, causes: Sequence[Cause], nuisances: Array, kicks: Kicks = NO_KICKS) -> Point:
         """Return trajectories and residual; `view` are the `Paths`."""
         paths = self.model.paths(nuisances, (*self.fixed, *causes), self._of_shots(kicks))
-        residual = self._residual(paths.readings, nuisances)
+        difference = np.where(self.data.valid, self.data.readings - paths.readings, 0.0)
+        residual = self.whitening.residual(difference, nuisances)
         projection, lost = None, ""
         if np.isfinite(residual).all():
             projection = Projection(self.whitening.launch(paths.launch))
@@ -148,7 +145,7 @@ class FirstTurns(Problem):
         data = replace(data, active=np.ones(len(shots), dtype=bool))
         known = self.model.assembly.known
         model = Model(self.model.design, data.settings, data.turns, known, active=data.active)
-        return replace(self, model=model, data=data, white=None), nuisances[shots]
+        return replace(self, model=model, data=data), nuisances[shots]
 
     def everywhere(self) -> "FirstTurns":
         """Return the problem with causes that act in all shots."""
@@ -230,8 +227,7 @@ class FirstTurns(Problem):
 
     def noisier(self, factors: Array) -> "FirstTurns":
         """Return the problem with the noise of each plane scaled."""
-        data = replace(self.data, sigma=self.data.sigma * factors)
-        return replace(self, data=data, white=None)
+        return replace(self, data=replace(self.data, sigma=self.data.sigma * factors))
 
     def disagreement(self, point: Point) -> float:
         """Median misfit of each reading with the prediction from the two monitors before it."""
@@ -252,12 +248,7 @@ class FirstTurns(Problem):
         """Return the problem without some readings; the noise is estimated anew."""
         if not dropped.any():
             return self
-        return replace(self, data=self.data.without(dropped), white=None)
-
-    # --- outside the search ---------------------------------------------------------------------
-    def _residual(self, readings: Array, launches: Array) -> Array:
-        difference = np.where(self.data.valid, self.data.readings - readings, 0.0)
-        return self.whitening.residual(difference, launches)
+        return replace(self, data=self.data.without(dropped))
 
 
 def held_out_residuals(problem: FirstTurns, unknown: Array | None = None) -> HeldOut:
@@ -303,7 +294,7 @@ def held_out_residuals(problem: FirstTurns, unknown: Array | None = None) -> Hel
         among = None if unknown is None else unknown[np.ix_(order, order)]
         found = cross_predicted(first, second, off[shots].ravel(), known.ravel(), among)
         parts.append(found)
-        residuals[shots] = _scattered(found.residual, scored)
+        residuals.flat[index[shots][scored]] = found.residual
     return HeldOut(residuals, tuple(parts))
 
 
@@ -329,9 +320,3 @@ def _bounded(data: Data, model: Model) -> Data:
     sigma = data.launch_sigma.copy()
     sigma[:, :4] = np.where(few, np.minimum(sigma[:, :4], width), sigma[:, :4])
     return replace(data, launch_sigma=sigma)
-
-
-def _scattered(values: Array, where: Flags) -> Array:
-    whole = np.full(where.shape, np.nan)
-    whole[where] = values
-    return whole

@@ -312,11 +312,6 @@ def _scattered(readings: Array) -> float:
     return math.lgamma(len(read) + 1) - math.lgamma(ends + 1) - math.lgamma(len(read) - ends + 1)
 
 
-def _worse(launch: Array) -> float:
-    """The usual mean square [shot, plane] of the worse plane."""
-    return float(np.median(launch, axis=0).max()) if len(launch) else float("nan")
-
-
 @dataclass(frozen=True)
 class OfTurns(Search):
     """Search for global errors of first turns, of which some shots and turns are used.
@@ -424,8 +419,10 @@ class OfTurns(Search):
         moved = (sections.kicked**2).sum(axis=2)  # none where nothing was read
         kicks = KICKS / np.median(moved[moved > 0]) if moved.any() else KICKS[:1]
         parts = [own.cost(square, kicks) for own in (sections, *joints)]
+        of_launch = np.full(2, np.nan)
         if launch is not None:  # in m and rad; the information of launches differs
             parts.append(np.maximum(launch.cost(1.0, square * kicks), 0.0))
+            of_launch = np.array([np.median(each, axis=0).max(), launch.level(True)])
         costs = np.concatenate(parts, axis=1)
         best = costs[costs.sum(axis=1).argmin()]
         unit = 1 / square if data.noise is None else ratio**2
@@ -433,7 +430,7 @@ class OfTurns(Search):
             np.concatenate([best, [noise**2 / 2, orbit**2 / 2, _scattered(passes.readings)]]),
             blur,
             unit * np.array([found.level, sections.level()]),
-            np.full(2, np.nan) if launch is None else np.array([_worse(each), launch.level(True)]),
+            of_launch,
         )
 
     def predicted(self) -> tuple[Array, Array]:

@@ -15,7 +15,8 @@ import numpy as np
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model, Paths
 from tmlattice.inference.problem import Hypothesis, Metric, Products, effects_on_readings
-from tmlattice.inference.whitening import Projection, Whitening, each_shot
+from tmlattice.inference.whitening import Projection
+from tmlattice.observe.data import Whitening, each_shot
 
 
 def behind(values: Array) -> Array:
@@ -57,13 +58,7 @@ class TurnMetric(Metric):
 
     # --- what has no name -----------------------------------------------------------------------
     def free_kicks(self, layers: Indices, clean: Array) -> tuple[Array, Array]:
-        """Information of a kick (px, py) in every active shot in the middle of layers' magnets, and
-        its product with data.
-
-        Returns:
-            [layer, block, p, p] and [layer, block, p]; parameters of different blocks are
-            independent.
-        """
+        """See `Metric`; of kicks (px, py) in each active shot, in the middle of layers' magnets."""
         grams, inners = [], []
         count = max(self.chunk // len(self.shots), 1)
         for start in range(0, len(layers), count):

@@ -5,8 +5,6 @@ each plane. The remainder has the noise of three readings with known weights; th
 monitors is robust to some errors. Two names of one signal, of monitors at one place, count once.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -147,43 +145,28 @@ NEIGHBOURS = 4
 """Neighbours of a monitor: two for the orbit, one for the energy, one more."""
 
 
-class Places(NamedTuple):
-    """Positions of monitors and correctors, m, and the length of the ring."""
-
-    monitors: Array
-    correctors: Array
-    length: float
-
-
-def places(ring: Ring, measured: OrbitResponse) -> Places:
-    """Return the positions of a measurement's monitors and correctors."""
-    s = [
-        np.array([ring[name].s for name in names])
-        for names in (measured.monitors, measured.correctors)
-    ]
-    return Places(s[0], s[1], ring.length)
-
-
-def estimated_noise(measured: OrbitResponse, where: Places) -> Array:
+def estimated_noise(ring: Ring, measured: OrbitResponse) -> Array:
     """rms of one orbit change, m, [monitor, 2], the same for all monitors of a plane.
 
     Args:
+        ring: for the positions; one signal under two names counts once (see `noise`).
         measured: in beam order.
-        where: positions; one signal under two names counts once (see `noise`).
 
     Raises:
         MeasurementError: too few monitors or columns.
     """
     planes = np.array([int(p == "y") for p in measured.planes])
+    at = np.array([ring[name].s for name in measured.monitors])
+    correctors = np.array([ring[name].s for name in measured.correctors])
     found = []
     for p in (0, 1):
         own = measured.response[planes == p, :, p]
         seen = np.isfinite(own).mean(axis=0) > 0.5 if len(own) else np.zeros(0, dtype=bool)
-        read, s = own[:, seen], where.monitors[seen]
+        read, s = own[:, seen], at[seen]
         copied = (np.diff(read, axis=1) == 0).all(axis=0) & (np.diff(s) < SAME_PLACE)
         alone = ~np.append(False, copied)[: len(s)]
-        kicked = where.correctors[planes == p]
-        found.append(_residual_noise(read[:, alone], s[alone], kicked, where.length))
+        kicked = correctors[planes == p]
+        found.append(_residual_noise(read[:, alone], s[alone], kicked, ring.length))
     sizes = np.array(found)
     if not np.isfinite(sizes).any():
         raise MeasurementError(
@@ -209,7 +192,7 @@ def completed(ring: Ring, measured: OrbitResponse) -> Array:
             blank = np.isnan(noise) & (np.arange(2) == p)
             noise = np.where(blank, np.median(noise[there, p]), noise)
     if np.isnan(noise).any():
-        noise = np.where(np.isnan(noise), estimated_noise(measured, places(ring, measured)), noise)
+        noise = np.where(np.isnan(noise), estimated_noise(ring, measured), noise)
     return noise
 
 
@@ -219,7 +202,7 @@ def stated_and_estimated(ring: Ring, measured: OrbitResponse) -> Array | None:
     if measured.noise is None:
         return None
     try:
-        shown = estimated_noise(measured, places(ring, measured))
+        shown = estimated_noise(ring, measured)
     except MeasurementError:
         return None
     there = [own[np.isfinite(own)] for own in measured.noise.T]

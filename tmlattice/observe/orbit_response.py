@@ -16,6 +16,7 @@ to the response of the model with the errors of the first.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -358,7 +359,14 @@ def alike(
         MeasurementError: too few in common, or other planes.
         UnknownNameError: an element that is not in the ring.
     """
-    before, after = (_as_the_ring_names_them(ring, one) for one in (before, after))
+    before, after = (
+        replace(
+            one,
+            monitors=tuple(ring[name].name for name in one.monitors),
+            correctors=tuple(ring[name].name for name in one.correctors),
+        )
+        for one in (before, after)
+    )
     columns = [name for name in before.correctors if name in set(after.correctors)]
     monitors = [name for name in before.monitors if name in set(after.monitors)]
     for what, own, all_of in (
@@ -374,14 +382,6 @@ def alike(
     if other:
         raise MeasurementError(f"corrector '{other[0]}' kicks in another plane in the reference")
     return first, second
-
-
-def _as_the_ring_names_them(ring: Ring, measured: OrbitResponse) -> OrbitResponse:
-    monitors, correctors = (
-        tuple(ring[name].name for name in names)
-        for names in (measured.monitors, measured.correctors)
-    )
-    return replace(measured, monitors=monitors, correctors=correctors)
 
 
 def response_change(
@@ -407,15 +407,20 @@ def response_change(
     noise = np.hypot(before.noise, after.noise * np.abs(np.median(scale)))
     noise = np.sqrt(_as_the_beam(errors.monitors, noise**2, power=2))
     kicks = np.append(before.kicks[:-1] * errors.kick[:-1], before.kicks[-1])
+    own = zip(columns, errors.angle.tolist(), strict=False)
+    rolls = [Cause("corrector_roll", name, angle) for name, angle in own if angle]
     there = replace(
         before,
-        ring=apply(before.ring, (*errors.ring, *_rolls(columns, errors.angle))),
+        ring=apply(before.ring, (*errors.ring, *rolls)),
         kicks=kicks,
         noise=noise,
         energy=errors.energy,
         orbit_kicks=orbit_kicks,
     )
-    orbits = _as_stepped(there) + change
+    stepped = Predicted(there, Errors.none(there))
+    with suppress(UnstableRingError):  # no beam is stored with a step: it stays linear
+        stepped = stepped.bend()
+    orbits = stepped.straight + change
     rf = before.measured.rf
     if rf is not None and rf.orbit is not None:
         rf = replace(rf, orbit=orbits[-1])
@@ -435,20 +440,3 @@ def _as_the_beam(monitors: Array, read: Array, power: int = 1) -> Array:
     both = np.einsum("mij,...mj->...mi", np.linalg.inv(monitors) ** power, read)
     alone = read / np.diagonal(monitors, axis1=1, axis2=2) ** power
     return np.where(np.isnan(both), alone, both)
-
-
-def _as_stepped(data: ResponseData) -> Array:
-    """Orbit changes of the ring for these steps, which are in both measurements."""
-    there = Predicted(data, Errors.none(data))
-    try:
-        return there.bend().straight
-    except UnstableRingError:
-        return there.straight
-
-
-def _rolls(columns: Sequence[str], roll: Array) -> list[Cause]:
-    return [
-        Cause("corrector_roll", name, float(value))
-        for name, value in zip(columns, roll, strict=False)
-        if value
-    ]

@@ -13,11 +13,10 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.beam.stored import Moved
-from tmlattice.effects import Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import ClosedOrbit, Dispersion
-from tmlattice.observe.stored import Stored, rf_of, stacked
+from tmlattice.observe.stored import Stored, stacked, states_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +50,8 @@ def closed_orbits(ring: Ring, measured: ClosedOrbit, places: Mapping[str, float]
         UnknownNameError: a monitor that is not in the ring.
     """
     whole = measured.in_order_of([monitor.name for monitor in ring.monitors])
-    settings: tuple[Settings, ...] = whole.settings or ({},) * len(whole.orbit)
     return Orbits(
-        ring=ring, places=places, states=tuple((one, rf_of(one)) for one in settings),
+        ring=ring, places=places, states=states_of(whole.settings, len(whole.orbit)),
         **_of_monitors(whole.orbit, whole.noise, "a closed orbit"),
     )  # fmt: skip
 

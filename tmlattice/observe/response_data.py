@@ -139,15 +139,6 @@ def _without_blanks(measured: OrbitResponse) -> OrbitResponse:
     return measured if response is measured.response else replace(measured, response=response)
 
 
-def _computed(data: ResponseData) -> bool:
-    """Whether the RF's orbit is the design's."""
-    try:
-        design = data.design.rf_change(data.kicks[-1])[data.at]
-    except UnstableRingError:
-        return False
-    return of_design(data.orbits[-1], design, data.noise)
-
-
 MAX_DISTINCT, MIN_DISTINCT = 0.5, 0.75
 """Share of distinct numbers: at most, in a computed orbit; at least, in the correctors' orbits,
 which have the same number of digits."""
@@ -156,35 +147,24 @@ MAX_MISFIT = 0.05
 
 
 def read(measured: OrbitResponse) -> bool:
-    """Whether an orbit of an RF step was measured."""
+    """Whether an orbit of an RF step was measured: the numbers of a computed one may repeat."""
     if measured.rf is None or measured.rf.orbit is None:
         return False
+    orbit = measured.rf.orbit[:, 0]
     in_x = [plane == "x" for plane in measured.planes]
-    return not computed(measured.rf.orbit[:, 0], measured.response[in_x, :, 0])
-
-
-def computed(orbit: Array, response: Array) -> bool:
-    """Whether the numbers of an RF orbit repeat as no readings do.
-
-    Args:
-        orbit: in x, m, [monitor], NaN where missing.
-        response: of the correctors that kick in x, m, [column, monitor].
-    """
-    columns = [_differ(own) for own in response]
+    columns = [_differ(own) for own in measured.response[in_x, :, 0]]
     if np.isfinite(orbit).sum() < ENOUGH or not columns:
+        return True
+    return _differ(orbit) > MAX_DISTINCT or bool(np.median(columns) < MIN_DISTINCT)
+
+
+def _computed(data: ResponseData) -> bool:
+    """Whether the RF's orbit is the design's: nearer to it than readings are to the truth."""
+    try:
+        design = data.design.rf_change(data.kicks[-1])[data.at]
+    except UnstableRingError:
         return False
-    return _differ(orbit) <= MAX_DISTINCT and bool(np.median(columns) >= MIN_DISTINCT)
-
-
-def of_design(orbit: Array, design: Array, noise: Array) -> bool:
-    """Whether an RF orbit is the design's: nearer to it than readings are to the truth.
-
-    Args:
-        orbit: m, [monitor, 2], NaN where missing.
-        design: orbit of the design, m, [monitor, 2].
-        noise: of a reading, m, [monitor, 2].
-    """
-    apart = (orbit - design)[:, 0] / noise[:, 0]
+    apart = (data.orbits[-1] - design)[:, 0] / data.noise[:, 0]
     apart = apart[np.isfinite(apart)]
     return len(apart) >= ENOUGH and bool(np.sqrt(np.mean(apart**2)) < MAX_MISFIT)
 

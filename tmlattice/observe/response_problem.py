@@ -20,7 +20,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import AT_ONCE, Array, Flags, Indices
+from tmlattice.arrays import AT_ONCE, Array, Indices
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
 from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
@@ -147,18 +147,15 @@ class ResponseMetric(SteadyMetric):
         done = super().quick(hypotheses, data, found)
         on_ring = effects_on_ring(hypotheses)
         if len(on_ring):
-            here = _Here(self.point.view, self.problem.used, self.problem.sigma)
-            sums = here.sums(data)
-            for part in np.split(
-                on_ring, range(here.slopes.at_once, len(on_ring), here.slopes.at_once)
-            ):
-                some = here.read([hypotheses[i] for i in part])
-                found.put(part, here.squares(some), 0.0, some.products(sums))
+            sums, count = self.sums(data), self.slopes.at_once
+            for part in np.split(on_ring, range(count, len(on_ring), count)):
+                some = self.read([hypotheses[i] for i in part])
+                found.put(part, self.squares(some), 0.0, some.products(sums))
         return np.concatenate([done, on_ring])
 
     def pieces(self, hypotheses: Sequence[Hypothesis]) -> Iterator[tuple[Indices, Array]]:
         """Yield signatures at some monitors at a time, from the factors of all ring errors."""
-        view, on_ring = self.point.view, effects_on_ring(hypotheses)
+        view, on_ring = self.view, effects_on_ring(hypotheses)
         of_monitors = [
             (which, at, view.of_monitors(effect))
             for effect, which, at in effects_on_readings(hypotheses, self.problem.monitors)
@@ -166,8 +163,7 @@ class ResponseMetric(SteadyMetric):
         others = np.concatenate([on_ring, *(which for which, _, _ in of_monitors)])
         rest = np.setdiff1d(np.arange(len(hypotheses)), others)
         whole = self.rows([hypotheses[int(i)] for i in rest])
-        here = _Here(view, self.problem.used, self.problem.sigma)
-        some = here.read([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
+        some = self.read([hypotheses[int(i)] for i in on_ring]) if len(on_ring) else None
         used = self.problem.used
         row = np.zeros(used.shape, dtype=np.intp)
         row[used] = np.arange(np.count_nonzero(used))
@@ -180,7 +176,7 @@ class ResponseMetric(SteadyMetric):
                 there = used[:, at]
                 own = np.zeros((len(hypotheses), np.count_nonzero(there)))
                 if some is not None:
-                    own[on_ring] = here.at(int(at), some)[:, there]
+                    own[on_ring] = self.at(int(at), some)[:, there]
                 for which, places, slope in of_monitors:
                     own[which[places == at]] = (slope[:, at] / self.problem.sigma[at])[there]
                 own[rest] = whole[:, row[:, at][there]]
@@ -188,20 +184,12 @@ class ResponseMetric(SteadyMetric):
             rows = [row[:, at][used[:, at]] for at in group]
             yield np.concatenate(rows), np.concatenate(out, axis=1)
 
-
-@dataclass(frozen=True)
-class _Here:
-    """A response with its monitors' errors and its columns' steps, in units of the noise.
-
-    Attributes:
-        view: the response.
-        used: fitted readings, [column, monitor, 2].
-        sigma: noise, m, [monitor, 2].
-    """
-
-    view: Predicted
-    used: Flags
-    sigma: Array
+    # --- from factors, in units of the noise ----------------------------------------------------
+    @property
+    def view(self) -> Predicted:
+        """The response at the point."""
+        view: Predicted = self.point.view
+        return view
 
     @property
     def slopes(self) -> ResponseSlopes:
@@ -220,7 +208,7 @@ class _Here:
 
     def seen(self, slopes: Array) -> Array:
         """Readings over noise of orbit slopes at all monitors, [..., monitor, 2, n]."""
-        own = self.view.errors.monitors / self.sigma[:, :, None]
+        own = self.view.errors.monitors / self.problem.sigma[:, :, None]
         return np.asarray(own @ slopes[..., self.view.data.at, :, :])
 
     @cached_property
@@ -249,9 +237,9 @@ class _Here:
         behind = np.repeat(np.arange(len(self.readings)) >= self.first[:, None], 2, axis=1)
         seen = np.empty((len(data), len(G), n))
         before, added = np.empty((2, len(data), columns, n))
-        whole = np.zeros(self.used.shape)
+        whole = np.zeros(self.problem.used.shape)
         for d, row in enumerate(data):
-            whole[self.used] = row
+            whole[self.problem.used] = row
             D = whole.reshape(columns, -1) * self.scale[:, None]
             late = np.where(behind, D, 0.0)
             seen[d] = D.T @ self.slopes.start + late.T @ self.slopes.launch_kick
@@ -261,7 +249,7 @@ class _Here:
     def squares(self, some: Factors) -> Array:
         """Squares of signatures, [error]."""
         slopes, n = self.slopes, self.readings.shape[2]
-        used = self.used.reshape(len(self.scale), -1)
+        used = self.problem.used.reshape(len(self.scale), -1)
         columns, read = (np.asarray(used.any(axis=axis)) for axis in (1, 0))
         return np.asarray(
             _squares(

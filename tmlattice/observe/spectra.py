@@ -555,9 +555,10 @@ def _shot(
     data = np.where(there, signals[usable], 0.0)
     planes = np.tile([0, 1], len(signals) // 2)[usable]
     fit = betatron_lines(data, there, planes, near)
-    off = np.abs(fit.residual) / _robust(fit.residual, there)[:, None]
-    usual = np.median(off, axis=0)  # of all monitors it is the beam, but in a few turns
-    outlier = off > OUTLIER * np.clip(usual, 1.0, max(OUTLIER * np.median(usual), 1.0))
+    usual = chi2.typical(np.where(there, fit.residual, np.nan), axis=1)
+    off = np.abs(fit.residual) / usual[:, None]
+    common = np.median(off, axis=0)  # of all monitors it is the beam, but in a few turns
+    outlier = off > OUTLIER * np.clip(common, 1.0, max(OUTLIER * np.median(common), 1.0))
     if outlier.any() and outlier.mean() < 0.05:
         warn(f"readings more than {OUTLIER:g} times the noise from the fit are rejected")
         there = there & ~outlier
@@ -579,11 +580,6 @@ def _moves(signals: Array, there: Flags) -> Flags:
     high = np.where(there, signals, -np.inf).max(axis=1)
     low = np.where(there, signals, np.inf).min(axis=1)
     return np.asarray(high > low)
-
-
-def _robust(residual: Array, there: Flags) -> Array:
-    """Robust rms of the residual of each signal."""
-    return np.asarray(chi2.typical(np.where(there, residual, np.nan), axis=1))
 
 
 # --- reported doubts ------------------------------------------------------------------------------

@@ -19,8 +19,7 @@ from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.rf import NO_RF, Cavities, cavities
-from tmlattice.beam.rf import rf_of as rf_in
+from tmlattice.beam.rf import NO_RF, Cavities, cavities, rf_of
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import (
     Cause,
@@ -117,20 +116,14 @@ class Steady(Problem):
         own = point.causes[cause]
         effect, amount = find(own.effect), own.amount
         if effect.multiplies and abs(1 + amount) < MIN_STRENGTH:
-            return self._difference(point, cause, MIN_STRENGTH)
+            before, behind = point.causes[:cause], point.causes[cause + 1 :]
+            low, high = (
+                self.at((*before, replace(own, amount=amount + side), *behind), point.nuisances)
+                for side in (-MIN_STRENGTH, MIN_STRENGTH)
+            )
+            return np.asarray((low.residual - high.residual) / (2 * MIN_STRENGTH))
         (slope,) = self.signatures(point.view, point.nuisances, [(own.effect, own.element)])
         return self.as_rows(effect.chain(amount) * slope)
-
-    def _difference(self, point: Point, cause: int, h: float) -> Array:
-        own = point.causes[cause]
-        ends = [
-            self.at(
-                (*point.causes[:cause], replace(own, amount=own.amount + side),
-                 *point.causes[cause + 1 :]), point.nuisances,
-            ).residual
-            for side in (h, -h)
-        ]  # fmt: skip
-        return np.asarray((ends[1] - ends[0]) / (2 * h))
 
     def moved(self, nuisances: Array, change: Array) -> Array:
         """Return the nuisances after a change; they are linear."""
@@ -298,7 +291,7 @@ def cavities_of(ring: Ring, model: ResponseModel) -> Cavities:
     Raises:
         UnstableRingError: the RF cannot replace the energy loss.
     """
-    rf = ring.memory.setdefault("rf", rf_in(ring))
+    rf = ring.memory.setdefault("rf", rf_of(ring))
     loss = sum(element.errors.loss for element in model.ring.elements)
     try:
         return cavities(ring, rf, model.layers.layer_of, loss, model.frequency)
@@ -448,9 +441,12 @@ def seen_by(
     return Moved(orbit, tunes * shown.tunes, modes)
 
 
-def rf_of(settings: Settings) -> float:
-    """Relative RF frequency of a shot's settings."""
-    return float(settings.get("rf", {}).get("frequency_relative", 0.0))
+def states_of(settings: Sequence[Settings], shots: int) -> tuple[tuple[Settings, float], ...]:
+    """Settings and relative RF frequency of each shot; without settings, those of the design."""
+    return tuple(
+        (own, float(own.get("rf", {}).get("frequency_relative", 0.0)))
+        for own in settings or ({},) * shots
+    )
 
 
 def stacked(states: Sequence[Moved], name: str) -> Array:

@@ -8,11 +8,11 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.effects import Settings, apply
+from tmlattice.effects import apply
 from tmlattice.errors import MeasurementError
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TuneReading
-from tmlattice.observe.stored import Stored, rf_of, stacked
+from tmlattice.observe.stored import Stored, stacked, states_of
 from tmlattice.optics import ring_tunes, short_way
 
 DELTA = 5e-4
@@ -54,13 +54,13 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
         MeasurementError: a chromaticity that no error of the ring explains.
     """
     shots = len(measured.tune)
-    settings: tuple[Settings, ...] = measured.settings or ({},) * shots
+    states = states_of(measured.settings, shots)
     model = ResponseModel(ring)
     step = abs(DELTA / model.rf_start[5])
     # delta is the relative deviation of the momentum, p that of the energy over p0 c: beta delta
     energies = 2 * step * float(model.rf_start[5]) / ring.beta
     design = np.array(
-        [StoredBeam(ResponseModel(apply(ring, (), one), 6, rf_of(one))).tunes for one in settings]
+        [StoredBeam(ResponseModel(apply(ring, (), one), 6, rf)).tunes for one, rf in states]
     )
     near = design + short_way(measured.tune - design)
     slopes = np.full((shots, 2), np.nan)
@@ -83,7 +83,7 @@ def tune_readings(ring: Ring, measured: TuneReading, places: Mapping[str, float]
     there = np.isfinite(data)
     return TuneReadings(
         ring=ring,
-        states=tuple((one, rf_of(one) + h) for one in settings for h in (0.0, step, -step)),
+        states=tuple((one, rf + h) for one, rf in states for h in (0.0, step, -step)),
         values=np.where(there, data, 0.0),
         sigma=errors,
         read_by=np.full(data.shape, -1),

@@ -33,13 +33,21 @@ from numpy.typing import NDArray
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.effects import Settings, find
+from tmlattice.effects import find
 from tmlattice.errors import MeasurementError, first_of
 from tmlattice.inference.problem import Hypothesis, Metric, Point, Products, effects_on_ring
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines
-from tmlattice.observe.stored import Beams, SteadyMetric, Stored, rf_of, seen_by, stacked
+from tmlattice.observe.stored import (
+    Beams,
+    ModelCache,
+    SteadyMetric,
+    Stored,
+    seen_by,
+    stacked,
+    states_of,
+)
 from tmlattice.optics import short_way
 
 TUNE = 3e-4
@@ -484,23 +492,11 @@ def many_turns(
         UnknownNameError: a monitor that is not in the ring.
     """
     names = [monitor.name for monitor in ring.monitors]
-    settings: tuple[Settings, ...] = measured.settings or ({},) * len(measured.shots)
     count, shots = len(names), len(measured.shots)
-    shape = (shots, 8 * count - LINES)
-    blank = ManyTurns(
-        ring=ring,
-        states=tuple((one, rf_of(one)) for one in settings),
-        values=np.zeros(shape),
-        sigma=np.ones(shape),
-        read_by=np.tile(np.append(np.repeat(np.arange(count), 8), [-1] * -LINES), (shots, 1)),
-        used=np.zeros(shape, dtype=bool),
-        places=places,
-        shift=Shift.none(shots, count),
-        chromatic=(np.zeros((shots, 2, 2)), np.zeros((shots, 2, count, 2, 2), dtype=complex)),
-    )
-    beams = blank.view(()).beams
+    states, cache = states_of(measured.settings, shots), ModelCache()
+    beams = [cache.beam(ring, *state, (), feels_rf=True) for state in states]
     design = np.array([beam.tunes for beam in beams])
-    found, shift = spectrum, blank.shift
+    found, shift = spectrum, Shift.none(shots, count)
     at = np.array([monitor.s for monitor in ring.monitors]) / ring.length
     each = {id(beam): _chromatic(beam, at) for beam in beams}
     of_tunes, of_modes = (
@@ -536,11 +532,15 @@ def many_turns(
             else "no betatron line is significant"
             + (f": {'; '.join(found.warnings)}" if found.warnings else "; kick the beam harder")
         )
-    return replace(
-        blank,
+    return ManyTurns(
+        ring=ring,
+        states=states,
         values=np.where(there, data, 0.0),
         sigma=np.where(there, errors, 1.0),
+        read_by=np.tile(np.append(np.repeat(np.arange(count), 8), [-1] * -LINES), (shots, 1)),
         used=there,
+        places=places,
+        cache=cache,
         shift=shift,
         chromatic=(of_tunes, of_modes),
         warnings=(*found.warnings, *large),

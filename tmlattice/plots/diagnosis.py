@@ -185,10 +185,10 @@ def thresholds(diagnosis: Diagnosis) -> tuple[float, float]:
     rate = diagnosis.provenance["options"]["false_alarm"]
     free = explanation.first_kicks
     named = explanation.first.threshold(rate * DEFAULT.shares["named"])
-    if not len(free.places):
+    if not len(free.gain):
         return named, named
     freedom = max(int(np.median(free.freedom)), 1)
-    return named, free_threshold(rate * DEFAULT.shares["kick"], freedom, len(free.places))
+    return named, free_threshold(rate * DEFAULT.shares["kick"], freedom, len(free.gain))
 
 
 def _draw_scan(ax: Axes, diagnosis: Diagnosis, size: float) -> None:
@@ -224,7 +224,7 @@ def _scan_legend(ax: Axes, scale: float) -> None:
 def free_kicks(diagnosis: Diagnosis) -> tuple[Array, Array]:
     """Places of free kicks along the ring, m, and their statistics as they are drawn."""
     free = diagnosis.explanation.first_kicks
-    s = np.array([magnet.s for magnet in diagnosis.ring.magnets])[free.places]
+    s = np.array([magnet.s for magnet in diagnosis.ring.magnets])[: len(free.gain)]
     order = np.argsort(s)
     return s[order], np.maximum(free.statistic[order], FLOOR)
 
