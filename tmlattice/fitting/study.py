@@ -132,7 +132,7 @@ def run_case(
         true = matrix_tunes(ring_matrix(machine))
     except UnstableRingError:
         return dataclasses.replace(empty, problem=UNSTABLE)
-    design = _network_of(ring)
+    design = ring.remembered(NETWORK, lambda: TaylorNetwork.from_ring(ring))
     optics = one_turn_optics(design)
     start = np.asarray(launch, dtype=float)
     phases = np.pi * np.arange(shots)[:, None] / shots * np.ones(2)
@@ -178,13 +178,6 @@ def run_case(
 
 def _pair(values: Array) -> Pair:
     return float(values[0]), float(values[1])
-
-
-def _network_of(ring: Ring) -> TaylorNetwork:
-    if NETWORK not in ring.memory:
-        ring.memory[NETWORK] = TaylorNetwork.from_ring(ring)
-    network: TaylorNetwork = ring.memory[NETWORK]
-    return network
 
 
 @cache

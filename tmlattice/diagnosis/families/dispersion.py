@@ -77,11 +77,9 @@ class _Kicks(Family):
         names = tuple(data.measured.correctors)
         planes = data.plane.tobytes()
         key = (self.name, data.at.tobytes(), float(data.kicks[-1]), read, names, planes)
-        memory = data.ring.memory
-        if key not in memory:
-            memory[key] = patterns_of_kicks(Predicted(data, Errors.none(data)), self.plane)
-        found: Patterns = memory[key]
-        return found
+        return data.ring.remembered(
+            key, lambda: patterns_of_kicks(Predicted(data, Errors.none(data)), self.plane)
+        )
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
@@ -119,14 +117,8 @@ class _Kicks(Family):
             at_correctors=errors.at_correctors + values @ patterns.at_correctors,
         )
 
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """No causes: single kicks are degenerate."""
-        return []
-
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """No effect of the catalogue."""
+        """No causes: single kicks are degenerate."""
         return [{} for _ in range(self.size(data))]
 
 
@@ -265,11 +257,9 @@ class OrbitFamily(RingFamily):
 
     def patterns(self, data: ResponseData) -> OrbitPatterns:
         """The patterns in the design."""
-        memory = data.ring.memory
-        if self.name not in memory:
-            memory[self.name] = orbit_patterns(data.design, self.plane, self.effects)
-        found: OrbitPatterns = memory[self.name]
-        return found
+        return data.ring.remembered(
+            self.name, lambda: orbit_patterns(data.design, self.plane, self.effects)
+        )
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""

@@ -4,8 +4,8 @@ All pieces of a magnet share one number.
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +29,6 @@ FURTHEST = 0.05
 
 
 class _Magnets(RingFamily):
-    effect: ClassVar[str]
-
     @abstractmethod
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The pieces of each magnet, and the share of each piece in the magnet's number."""
@@ -41,21 +39,27 @@ class _Magnets(RingFamily):
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """The cause of every piece; the same in each round."""
-        memory, key = data.ring.memory, ("moves", type(self), data.measured.correctors)
-        if key not in memory:
-            memory[key] = [
-                {(self.effect, place): share for place, share in pieces.items()}
+        return data.ring.remembered(
+            ("moves", type(self), data.measured.correctors),
+            lambda: [
+                {(self.effects[0], place): share for place, share in pieces.items()}
                 for pieces in self.shares(data)
-            ]
-        known: list[dict[Hypothesis, float]] = memory[key]
-        return known
+            ],
+        )
+
+
+def _by_type(magnets: Iterable[dict[str, float]]) -> list[dict[str, float]]:
+    """The pieces of each type of magnet, from those of each magnet."""
+    types: dict[str, dict[str, float]] = {}
+    for pieces in magnets:
+        types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
+    return list(types.values())
 
 
 class QuadrupoleGradient(_Magnets):
     """Gradients of single quadrupoles, relative to the design's."""
 
-    name = effect = "quadrupole_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("quadrupole_gradient",)
+    name, effects = "quadrupole_gradient", ("quadrupole_gradient",)
     block, variable, trust = 0, "gradient", 0.01
     rms, tails, most = 3e-3, TAILS, LARGEST_GRADIENT
 
@@ -71,8 +75,11 @@ class QuadrupoleGradient(_Magnets):
 class FamilyGradient(QuadrupoleGradient):
     """The common error of a family's quadrupoles, by their supply."""
 
-    name = "family_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("family_gradient",)
+    name, effects = "family_gradient", ("family_gradient",)
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """The gradients of single quadrupoles, whose numbers it shares."""
+        return QuadrupoleGradient().moves(data)
 
     def count(self, data: ResponseData) -> int:
         """Number of families."""
@@ -100,24 +107,20 @@ class _Thin(_Magnets):
 class BendGradient(_Magnets):
     """Gradients of combined-function bends, relative to the design's: one number per type."""
 
-    name = effect = "bend_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
+    name, effects = "bend_gradient", ("bend_gradient",)
     block, variable, trust = 0, "bend_gradient", 0.01
     rms = 3e-3
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The bends of each type: single ones are degenerate with neighbouring quadrupoles."""
-        types: dict[str, dict[str, float]] = {}
-        for own in magnets(data.ring, ("bend",), powered=True):
-            types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
-        return list(types.values())
+        bends = magnets(data.ring, ("bend",), powered=True)
+        return _by_type({e.name: e.k1 for e in own} for own in bends)
 
 
 class SkewGradient(_Thin):
     """Skew gradients of rolled quadrupoles, and of sextupoles: by windings, or a vertical orbit."""
 
-    name = effect = "skew_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("skew_gradient",)
+    name, effects = "skew_gradient", ("skew_gradient",)
     block, variable, trust = 1, "skew", 1e-3  # 1/m: larger steps move the tunes
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
@@ -136,8 +139,7 @@ class SkewGradient(_Thin):
 class OtherGradient(_Thin):
     """Gradients outside quadrupoles: by the orbit in sextupoles, and of wigglers."""
 
-    name = effect = "gradient_absolute"
-    effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
+    name, effects = "gradient_absolute", ("gradient_absolute",)
     block, variable, trust = 0, "other", 3e-3
     rms, tails = 1e-4, TAILS
 
@@ -148,15 +150,14 @@ class OtherGradient(_Thin):
 class VerticalFocusing(_Thin):
     """Gradients of insertion devices, in wigglers and in straights."""
 
-    name = effect = "vertical_focusing"
-    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    name, effects = "vertical_focusing", ("vertical_focusing",)
     block, variable, trust = 0, "device", 3e-3
     rms, tails = 1e-4, 1.0
 
     @property
     def title(self) -> str:
         """The name of its effect, and where: `EdgeFocusing` has the same effect."""
-        return f"{self.effect} in straights"
+        return f"{self.name} in straights"
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return self._devices(ring, straights(ring))
@@ -190,8 +191,7 @@ class EdgeFocusing(_Thin):
     not at all. Errors are hardly larger than that, and negligible for small angles.
     """
 
-    name, effect = "edge_focusing", "vertical_focusing"
-    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    name, effects = "edge_focusing", ("vertical_focusing",)
     block, variable, trust, single = 0, "edge", 3e-3, False
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
@@ -199,10 +199,7 @@ class EdgeFocusing(_Thin):
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The bends of each type: single ones have no edge errors of their own."""
-        types: dict[str, dict[str, float]] = {}
-        for pieces in super().shares(data):
-            types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
-        return list(types.values())
+        return _by_type(super().shares(data))
 
     def groups(self, data: ResponseData) -> list[Group]:
         """The prior of types, relative to a rectangular magnet's edges."""
@@ -224,8 +221,7 @@ class CorrectorPosition(_Magnets):
     A single corrector there has no number, because no other one could confirm it.
     """
 
-    name = effect = "corrector_position"
-    effects: ClassVar[tuple[str, ...]] = ("corrector_position",)
+    name, effects = "corrector_position", ("corrector_position",)
     block, variable, trust = 0, "position", 0.02
     rms, most = 5e-3, FURTHEST
 
