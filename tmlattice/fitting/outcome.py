@@ -99,13 +99,6 @@ class MethodFit(Speaks):
         }
 
 
-def trusted(methods: Sequence[MethodFit]) -> MethodFit | None:
-    """Return the recommended method: one with a residual of noise alone and stated errors, the one
-    of fewest magnets first; None if there is none."""
-    good = [m for m in methods if m.method != "adam" and m.tunes is not None and m.explains]
-    return min(good, key=lambda m: m.method not in SPARSE_METHODS, default=None)
-
-
 def errors(tunes: Array | None, true: Array | None) -> tuple[Array | None, Array | None]:
     """Return errors, absolute (the short way round the circle) and relative, [2] each."""
     if tunes is None or true is None:
@@ -121,18 +114,6 @@ def pair(value: Array | None) -> list[float] | None:
 
 ALIKE = 3.0
 """Joint standard errors within which two methods' tunes are the same."""
-
-
-def advice(methods: Sequence[MethodFit]) -> str:
-    """Return a few sentences: the recommended method, and why the others differ."""
-    best = trusted(methods)
-    sentences = [_recommended(methods, best)]
-    for method in methods:
-        if method.method == "adam":
-            sentences.append(_recipe(method))
-        elif method is not best and best is not None:
-            sentences.append(_compared(method, best))
-    return " ".join(one for one in sentences if one)
 
 
 def _recommended(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
@@ -282,8 +263,11 @@ class TuneFit(Speaks):
 
     @property
     def trusted(self) -> MethodFit | None:
-        """Recommended method; None if none explains the readings."""
-        return trusted(self.methods)
+        """Recommended method: one with a residual of noise alone and stated errors, the one of
+        fewest magnets first; None if none explains the readings."""
+        good = [m for m in self.methods
+                if m.method != "adam" and m.tunes is not None and m.explains]  # fmt: skip
+        return min(good, key=lambda m: m.method not in SPARSE_METHODS, default=None)
 
     @property
     def best(self) -> MethodFit:
@@ -294,8 +278,15 @@ class TuneFit(Speaks):
 
     @property
     def advice(self) -> str:
-        """Recommendation in a few sentences."""
-        return advice(self.methods)
+        """A few sentences: the recommended method, and why the others differ."""
+        best = self.trusted
+        sentences = [_recommended(self.methods, best)]
+        for method in self.methods:
+            if method.method == "adam":
+                sentences.append(_recipe(method))
+            elif method is not best and best is not None:
+                sentences.append(_compared(method, best))
+        return " ".join(one for one in sentences if one)
 
     def as_json(self) -> dict[str, Any]:
         """Return the result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""

@@ -159,10 +159,10 @@ def compare(first: Any, second: Any) -> Differences:
     kinds = [_kind(name, own) for name, own in zip(names, (one, other), strict=True)]
     if kinds[0] != kinds[1]:
         raise MeasurementError(
-            f"'{names[0]}' is {_WORDS[kinds[0]]} and '{names[1]}' is {_WORDS[kinds[1]]}: compare "
-            "two of one kind"
+            f"'{names[0]}' is {_KINDS[kinds[0]][1]} and '{names[1]}' is {_KINDS[kinds[1]][1]}: "
+            "compare two of one kind"
         )
-    rows, notes = _COMPARED[kinds[0]](one, other)
+    rows, notes = _KINDS[kinds[0]][2](one, other)
     order = sorted(rows, key=lambda row: -abs(row.pull) if math.isfinite(row.pull) else 1.0)
     return Differences(kinds[0], (names[0], names[1]), tuple(order), tuple(notes))
 
@@ -189,15 +189,8 @@ def _name(given: Any, own: Any) -> str:
     return str(getattr(own, "name", type(own).__name__))
 
 
-_WORDS = {
-    "diagnoses": "a diagnosis",
-    "lattices": "a lattice",
-    "orbit responses": "an orbit response",
-}
-
-
 def _kind(name: str, own: Any) -> str:
-    for kind, cls in zip(_WORDS, (Diagnosis, Ring, OrbitResponse), strict=True):
+    for kind, (cls, _, _) in _KINDS.items():
         if isinstance(own, cls):
             return kind
     raise MeasurementError(
@@ -344,8 +337,9 @@ def _of_orbits(
         yield _row("response per kick, relative", name, 1.0, scale, "relative", sigma)
 
 
-_COMPARED: dict[str, Callable[[Any, Any], Found]] = {
-    "diagnoses": _diagnoses,
-    "lattices": _lattices,
-    "orbit responses": _responses,
+_KINDS: dict[str, tuple[type, str, Callable[[Any, Any], Found]]] = {
+    "diagnoses": (Diagnosis, "a diagnosis", _diagnoses),
+    "lattices": (Ring, "a lattice", _lattices),
+    "orbit responses": (OrbitResponse, "an orbit response", _responses),
 }
+"""Class, words and comparison of what can be compared."""
