@@ -24,7 +24,7 @@ from tmlattice.diagnosis.findings import (
     verdict_of,
     with_consequences,
 )
-from tmlattice.diagnosis.kinds import Measured, Part, PartOptions, kind_of, part_of, stacked
+from tmlattice.diagnosis.kinds import Part, PartOptions, kind_of, part_of, stacked
 from tmlattice.diagnosis.next_measurement import leading, next_kind, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
 from tmlattice.diagnosis.result import MOST, Diagnosis, Finding, NextMeasurement
@@ -61,7 +61,7 @@ from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
 from tmlattice.inference.validation import Misfit
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement
+from tmlattice.measurement import AnyMeasurement, Measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import ring_tunes
 from tmlattice.speaks import listed, micrometres
@@ -72,7 +72,7 @@ log = logging.getLogger(__name__)
 
 def diagnose_together(
     ring: Ring,
-    measured: Mapping[str, Measured],
+    measured: Mapping[str, AnyMeasurement],
     *,
     reference: Mapping[str, Any] | None = None,
     background: str | Mapping[str, float | None] | None = None,
@@ -170,7 +170,7 @@ def diagnose_together(
     )  # fmt: skip
 
 
-def _named(label: str, measured: Measured, options: PartOptions) -> Part:
+def _named(label: str, measured: AnyMeasurement, options: PartOptions) -> Part:
     try:
         return part_of(label, measured, options)
     except MeasurementError as error:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.kinds import KINDS
@@ -521,7 +521,7 @@ class Diagnosis(Speaks):
                 "lost": gap.lost,
             }
         return {
-            "noise": float(np.sqrt(np.mean(np.square(self.noise)))),
+            "noise": rms(self.noise),
             "readings_noise": {
                 "x": self.noise[0],
                 "y": self.noise[1],

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.batch import MADE_BY, fingerprint, run_batch
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
@@ -159,11 +159,10 @@ def run_case(
         [seed, 1]).random((4, 2)))  # fmt: skip
     try:
         miss = TaylorNetwork.from_ring(machine).readings(new) - fit.network.readings(new)
-        prediction = float(np.sqrt(np.mean(miss**2)))
+        prediction = rms(miss)
     except TmlatticeError:
         prediction = None  # lost at five times the amplitude in one of them
-    left = measurement.readings[:, 0] - design.readings(launches)
-    before = float(np.sqrt(np.mean(left**2)))
+    before = rms(measurement.readings[:, 0] - design.readings(launches))
     return dataclasses.replace(
         known,
         absolute_error=_pair(absolute),

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.arrays import rms
 from tmlattice.beam.chain import Chain
 from tmlattice.diagnosis.load import DOCUMENT, FORMAT, load
 from tmlattice.diagnosis.result import Diagnosis
@@ -273,10 +274,9 @@ def _of_rings(one: Ring, other: Ring) -> Iterator[Difference]:
             yield _row(name, None, a, b, unit, math.nan)
     if len(betas) == 2 and betas[0].shape == betas[1].shape:
         beat = np.sqrt(np.mean((betas[1] / betas[0] - 1) ** 2, axis=0))
-        for plane, rms in zip("xy", beat.tolist(), strict=True):
-            if rms > ROUNDING:
-                yield Difference(f"beta beating {plane}, rms", None, 0.0, rms, rms, math.nan,
-                                 "relative")  # fmt: skip
+        for plane, size in zip("xy", beat.tolist(), strict=True):
+            if size > ROUNDING:
+                yield _row(f"beta beating {plane}, rms", None, 0.0, size, "relative", math.nan)
 
 
 # --- orbit responses ------------------------------------------------------------------------------
@@ -324,9 +324,6 @@ def _of_orbits(
     more = np.full(a.shape, np.nan) if second.noise is None else second.noise**2
     a, b, own = a[read], b[read], own[read]
     variance = own + more[read] * (kicks[0] / kicks[1]) ** 2
-
-    def rms(values: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(values**2)))
 
     expected = float(np.sqrt(np.mean(variance)))
     yield Difference(ORBIT, name, rms(a), rms(b), rms(b - a), expected, "m")

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from tmlattice.arrays import rms
 from tmlattice.diagnosis.response.common_factors import Reason
 from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis
@@ -109,11 +110,9 @@ def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
                 unknown.setdefault(degenerate_text(effect, support), []).append(name)
         said, parts = f"{words(effect)}: {len(found)}", []
         if known:
-            rms = float(np.sqrt(np.mean(np.square([amount for amount, _ in known]))))
-            said += (
-                f", {len(known)} determined by the data, rms {amount_text(effect, rms)}; largest "
-                "(share from the data):"
-            )
+            typical = amount_text(effect, rms([amount for amount, _ in known]))
+            said += f", {len(known)} determined by the data, rms {typical}; "
+            said += "largest (share from the data):"
             known.sort(key=lambda row: -abs(row[0]))
             parts.append("; ".join(text for _, text in known[:SHOWN]))
         if unknown:

@@ -320,13 +320,14 @@ def noise_text(diagnosis: Diagnosis) -> str:
     return f"{x} in x, {y} in y" + (" (estimated)" if diagnosis.noise_estimated else "")
 
 
-def tune_texts(diagnosis: Diagnosis) -> tuple[str, str]:
-    """Fractions of Qx, Qy before and after."""
+def tune_row(diagnosis: Diagnosis) -> tuple[str, str, str]:
+    """Row of the fractions of Qx, Qy: (name, before, after)."""
+    name = "tunes without orbit errors" if diagnosis.by_families else "fractional tunes Qx, Qy"
     before, after = (
         "unstable" if q is None else f"{q[0]:.4f}, {q[1]:.4f}"
         for q in (diagnosis.tunes["before"], diagnosis.tunes["after"])
     )
-    return before, after
+    return name, before, after
 
 
 def sensitivity_rows(

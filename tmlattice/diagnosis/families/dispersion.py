@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import (
     dispersion_behind,
@@ -148,7 +148,7 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
     for family in (HorizontalKicks(), VerticalKicks()):
         own = values.get(family.variable, np.zeros(0))
         if own.any():
-            size = _rms(own, family.patterns(data).rf)
+            size = rms(own @ family.patterns(data).rf)
             yield (
                 f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from a "
                 f"{FIELDS[family.plane]} but from kicks of the closed orbit (errors of bends, "
@@ -158,11 +158,6 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
 
 FIELDS = ("gradient", "skew gradient")
 """Field by which a closed orbit acts, by plane."""
-
-
-def _rms(values: Array, patterns: Array) -> float:
-    """Rms of a sum of patterns."""
-    return float(np.sqrt(np.mean((values @ patterns) ** 2)))
 
 
 def fitted_orbit_kicks(at: Predicted) -> Array | None:
@@ -313,7 +308,7 @@ def orbits_in_sextupoles(values: Mapping[str, Array], data: ResponseData) -> Ite
         data: the response.
     """
     sizes = [
-        f"{1e3 * _rms(own, family.patterns(data).orbits):.2g} mm in {'xy'[family.plane]}"
+        f"{1e3 * rms(own @ family.patterns(data).orbits):.2g} mm in {'xy'[family.plane]}"
         for family in (HorizontalOrbit(), VerticalOrbit())
         if (own := values.get(family.variable, np.zeros(0))).any()
     ]

@@ -5,7 +5,7 @@ All pieces of a magnet share one number.
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -93,8 +93,10 @@ class FamilyGradient(QuadrupoleGradient):
 class _Thin(_Magnets):
     """Integrated fields; each piece has its share of the magnet's length."""
 
+    kinds: ClassVar[tuple[str, ...]]
+
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("quadrupole",))
+        return magnets(ring, self.kinds)
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         out = []
@@ -122,9 +124,7 @@ class SkewGradient(_Thin):
 
     name, effects = "skew_gradient", ("skew_gradient",)
     block, variable, trust = 1, "skew", 1e-3  # 1/m: larger steps move the tunes
-
-    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("quadrupole", "sextupole"))
+    kinds = ("quadrupole", "sextupole")
 
     def groups(self, data: ResponseData) -> list[Group]:
         """The priors of quadrupoles and sextupoles, each with its scale."""
@@ -142,9 +142,7 @@ class OtherGradient(_Thin):
     name, effects = "gradient_absolute", ("gradient_absolute",)
     block, variable, trust = 0, "other", 3e-3
     rms, tails = 1e-4, TAILS
-
-    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("sextupole", "wiggler"))
+    kinds = ("sextupole", "wiggler")
 
 
 class VerticalFocusing(_Thin):
@@ -193,9 +191,7 @@ class EdgeFocusing(_Thin):
 
     name, effects = "edge_focusing", ("vertical_focusing",)
     block, variable, trust, single = 0, "edge", 3e-3, False
-
-    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("bend",))
+    kinds = ("bend",)
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The bends of each type: single ones have no edge errors of their own."""
