@@ -25,3 +25,9 @@ def rms(values: ArrayLike) -> float:
     """Root mean square of all values; NaN of none."""
     size = np.asarray(values)
     return float(np.sqrt(np.mean(size**2))) if size.size else float("nan")
+
+
+def pair(values: ArrayLike) -> tuple[float, float]:
+    """Two values, such as of x and y, as numbers."""
+    x, y = np.asarray(values, dtype=float).tolist()
+    return x, y

@@ -201,11 +201,8 @@ class Targets(Weighted):
         wanted: names of `TARGETS`, optionally with another tolerance.
 
     Attributes:
-        names: of the wanted targets, in the order of `TARGETS`.
-        tolerance: of these, in their units.
         step: relative change of the RF frequency that changes the goal's energy by `ENERGY`.
         goal: its optics.
-        s: of the BPMs, m.
 
     Raises:
         TmlatticeError: threading together with other targets.

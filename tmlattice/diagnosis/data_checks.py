@@ -552,7 +552,7 @@ def in_the_lattice(ring: Ring, measured: Some) -> tuple[Some, list[str]]:
         ("BPMs", "monitors", monitors.__getitem__), ("correctors", "correctors", ring.index),
     ):  # fmt: skip
         names = getattr(own, kept, ())
-        unknown = [name for name in names if not _has(ring, monitors, name)]
+        unknown = [n for n in names if monitors.find(n) is None and _hint(ring.index, n)]
         if not unknown:
             continue
         fix = _hint(find, unknown[0])
@@ -570,14 +570,9 @@ def in_the_lattice(ring: Ring, measured: Some) -> tuple[Some, list[str]]:
 
 
 def _hint(find: Callable[[str], object], name: str) -> str:
-    """The message about an unknown name."""
+    """The message about an unknown name; empty of a known one."""
     try:
         find(name)
     except UnknownNameError as error:
         return str(error)
     return ""
-
-
-def _has(ring: Ring, monitors: Names, name: str) -> bool:
-    """Whether the ring has an element of this name."""
-    return monitors.find(name) is not None or not _hint(ring.index, name)

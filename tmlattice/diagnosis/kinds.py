@@ -216,7 +216,7 @@ def _problem(data: ResponseData, options: PartOptions) -> Response:
 
 
 def _of_stored(
-    make: Callable[..., Problem], shots: bool = False
+    make: Callable[..., Stored], shots: bool = False
 ) -> Callable[[str, str, Any, PartOptions], Part]:
     """A kind of a stored beam; with `shots`, some are held out if there are enough of them."""
 
@@ -230,8 +230,7 @@ def _of_stored(
                 measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
             )
         problem = make(options.ring, measured, options.places)
-        if isinstance(problem, Stored):
-            raise_if_wrong(options.ring, measured, problem)
+        raise_if_wrong(options.ring, measured, problem)
         messages = problem.warnings if isinstance(problem, ManyTurns) else ()
         judges = held and make(options.ring, held, options.places)
         return Part(label, kind, problem, judges, messages=messages)

@@ -10,6 +10,7 @@ which amount (`Effect.stands_for`). The pieces of a magnet are one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -171,17 +172,13 @@ def _is_element(ring: Ring, name: str) -> bool:
     return any(element.name == name for element in ring.elements)
 
 
-def _members(ring: Ring, name: str | None) -> list[Element]:
-    """The element of this name, or of the family's."""
-    own = [element for element in ring.elements if element.name == name]
-    families = (effect for effect in CATALOGUE.values() if isinstance(effect, FamilyEffect))
-    shared = (effect.members(ring, name) for effect in families)
-    return own or [ring.elements[i] for i in next((some for some in shared if some), ())]
-
-
 def element_kind(ring: Ring, name: str | None) -> Kind | None:
     """The kind of an element, or of a family's members; None for the beam."""
-    return next((element.kind for element in _members(ring, name)), None)
+    own = (i for i, element in enumerate(ring.elements) if element.name == name)
+    families = (effect for effect in CATALOGUE.values() if isinstance(effect, FamilyEffect))
+    shared = (i for effect in families for i in effect.members(ring, name))
+    first = next(chain(own, shared), None)
+    return None if first is None else ring.elements[first].kind
 
 
 def _strength(ring: Ring, cause: Cause) -> Strength | None:

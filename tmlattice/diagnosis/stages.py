@@ -208,8 +208,7 @@ def held_out_shots(
             model = model.knowing([*problem.fixed, *stage.static])
         unknown = None
         if small is not None and i:
-            explained = found.before if i == since and i < len(stages) - 1 else found.fit
-            explained = explained if stage.causes or found.fit.causes == () else found.before
+            explained = found.fit if stage.causes or not found.fit.causes else found.before
             about = replace(judge, model=model)
             unknown = _unknown(small, explained, about, stage)
         scored.append(held_out_residuals(replace(judge, model=model, fixed=stage.causes), unknown))

@@ -140,13 +140,9 @@ def outliers(
 def numbers(amounts: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...], float]]:
     """Amounts with their errors; those of several places with one number (a magnet's pieces)
     together."""
-    found: dict[tuple[float, float], list[Cause]] = {}
-    sigmas: list[float] = []
+    found: dict[tuple[float, float], tuple[list[Cause], float]] = {}
     for cause, sigma in amounts:
         one = bool(cause.amount) and sigma > 0
         own = (round(cause.amount / sigma, 9), sigma) if one else (float(len(found)), -1.0)
-        if own not in found:
-            found[own] = []
-            sigmas.append(sigma)
-        found[own].append(cause)
-    return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
+        found.setdefault(own, ([], sigma))[0].append(cause)
+    return [(tuple(own), sigma) for own, sigma in found.values()]

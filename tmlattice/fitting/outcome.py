@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.fitting.adam import FitResult
+from tmlattice.fitting.adam import FitResult, tunes_text
 from tmlattice.fitting.sparse import MAX_MISFIT
 from tmlattice.late import Method
 from tmlattice.lattice import Ring
@@ -53,9 +53,8 @@ class MethodFit(Speaks):
     problem: str | None = None
 
     def _told(self) -> tuple[str, dict[str, str]]:
-        tunes = "none" if self.tunes is None else " ".join(f"{q:.6f}" for q in self.tunes)
         return self.method, {
-            "tunes": tunes,
+            "tunes": tunes_text(self.tunes) or "none",
             "leaves": f"{1e6 * self.rms:.4g} µm",
             "noise": f"{1e6 * self.noise:.4g} µm",
             "named": ", ".join(self.named),
@@ -227,11 +226,9 @@ class TuneFit(Speaks):
     )
 
     def _told(self) -> tuple[str, dict[str, str]]:
-        def both(tunes: Array | None) -> str:
-            return "" if tunes is None else " ".join(f"{q:.6f}" for q in tunes)
-
-        rows = {"design tunes": both(self.design_tunes), "true tunes": both(self.true_tunes)}
-        rows |= {f"tunes of {m.method}": both(m.tunes) or "none" for m in self.methods}
+        rows = {"design tunes": tunes_text(self.design_tunes),
+                "true tunes": tunes_text(self.true_tunes)}  # fmt: skip
+        rows |= {f"tunes of {m.method}": tunes_text(m.tunes) or "none" for m in self.methods}
         rows["trusted"] = "none" if self.trusted is None else self.trusted.method
         what = self.source if self.change is None else f"{self.magnet} {100 * self.change:+g} %"
         return f"of {last_part(self.ring.name)}, {what}", rows

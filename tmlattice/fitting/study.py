@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array, rms
-from tmlattice.batch import MADE_BY, fingerprint, run_batch
+from tmlattice.arrays import Array, pair, rms
+from tmlattice.batch import fingerprint, run_batch
+from tmlattice.diagnosis.records import decoded
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
 from tmlattice.fitting.experiment import (
@@ -140,7 +141,7 @@ def run_case(
     # independent noise for each magnet, so that the cases are independent
     generator = np.random.default_rng([seed, zlib.crc32(empty.magnet.encode())])
     measurement = first_turn_of(machine, launches, noise, generator)
-    known = dataclasses.replace(empty, true_tunes=_pair(true))
+    known = dataclasses.replace(empty, true_tunes=pair(true))
     kind, _, regularization = method.partition("-")
     options: dict[str, Any] = {"candidates": [magnet]} if kind == "known" else {}
     if kind == "adam":
@@ -165,18 +166,14 @@ def run_case(
     before = rms(measurement.readings[:, 0] - design.readings(launches))
     return dataclasses.replace(
         known,
-        absolute_error=_pair(absolute),
-        relative_error=_pair(relative),
-        tune_sigma=None if fit.tune_sigma is None else _pair(fit.tune_sigma),
+        absolute_error=pair(absolute),
+        relative_error=pair(relative),
+        tune_sigma=None if fit.tune_sigma is None else pair(fit.tune_sigma),
         orbit_rms=(before, found.rms),
         prediction_rms=prediction,
         found=tuple(fit.changes) if method in ("sparse", "known") else None,
         seconds=fit.seconds,
     )
-
-
-def _pair(values: Array) -> Pair:
-    return float(values[0]), float(values[1])
 
 
 @cache
@@ -225,10 +222,8 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
 def _case(job: tuple[str, str], values: dict[str, Any]) -> Case:
     if "error" in values:  # the code, or the worker, failed
         return Case(job[0], float("nan"), job[1], 0, problem=values["error"])
-    plain: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != MADE_BY
-    }
-    return Case(**plain)
+    case: Case = decoded(Case, values)
+    return case
 
 
 def study_tune_fit(

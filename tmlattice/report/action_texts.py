@@ -110,10 +110,11 @@ def consequence_text(finding: Finding) -> str:
         return ""
     effect, consequences = find(finding.effect), finding.consequences
     if consequences is None:
-        if effect.natural or not isinstance(effect, RingEffect):
-            nothing = "no effect on the stored beam"
+        if effect.natural:
+            return ""
+        if not isinstance(effect, RingEffect):
             reads = "; its readings are wrong" if isinstance(effect, ReadingEffect) else ""
-            return "" if effect.natural else nothing + reads
+            return f"no effect on the stored beam{reads}"
         return "none while it is set to zero" if effect.acts_on_settings else ""
     found, corrected = _beam_text(consequences.found, consequences), _after_text(consequences)
     return f"estimated: {found}\nafter the correction: {corrected}"

@@ -5,7 +5,7 @@
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
@@ -281,23 +281,14 @@ def _of_rings(one: Ring, other: Ring) -> Iterator[Difference]:
 
 # --- orbit responses ------------------------------------------------------------------------------
 def _responses(one: OrbitResponse, other: OrbitResponse) -> Found:
-    """Each corrector's orbits per kick, at the first one's kick."""
+    """Each corrector's orbits per kick, and the RF's per step, at the first one's."""
     monitors = [name for name in one.monitors if name in set(other.monitors)]
     if not monitors:
         raise MeasurementError("the two orbit responses have no BPM in common; check the names")
-    first, second = (own.select(monitors=monitors) for own in (one, other))
-    place = {name: i for i, name in enumerate(second.correctors)}
-    rows: list[Difference] = []
-    for i, name in enumerate(first.correctors):
-        if name in place:
-            j = place[name]
-            kicks = float(first.kicks[i]), float(second.kicks[j])
-            rows += _of_orbits(name, first, second, (first.response[i], second.response[j]), kicks)
-    if first.rf is not None and second.rf is not None:
-        orbits = (first.rf.orbit, second.rf.orbit)
-        if orbits[0] is not None and orbits[1] is not None:
-            steps = first.rf.step, second.rf.step
-            rows += _of_orbits("rf", first, second, (orbits[0], orbits[1]), steps)
+    here, there = (_columns(own.select(monitors=monitors)) for own in (one, other))
+    rows = [
+        row for name in here if name in there for row in _of_orbits(name, here[name], there[name])
+    ]
     notes = []
     for which, own, other_names in (
         ("first", one.correctors, set(other.correctors)),
@@ -309,22 +300,28 @@ def _responses(one: OrbitResponse, other: OrbitResponse) -> Found:
     return rows, notes
 
 
-def _of_orbits(
-    name: str,
-    first: OrbitResponse,
-    second: OrbitResponse,
-    orbits: tuple[np.ndarray, np.ndarray],
-    kicks: Sequence[float],
-) -> Iterator[Difference]:
-    a, b = orbits[0], orbits[1] * kicks[0] / kicks[1]
+Column = tuple[np.ndarray, np.ndarray, float]
+"""Orbit and variance of its readings, [monitor, 2], and kick, or step of the RF."""
+
+
+def _columns(own: OrbitResponse) -> dict[str, Column]:
+    """The columns of a response by the corrector; `rf`: that of the RF."""
+    variance = np.full(own.response.shape[1:], np.nan) if own.noise is None else own.noise**2
+    columns = zip(own.correctors, own.response, own.kicks.tolist(), strict=True)
+    found: dict[str, Column] = {name: (orbit, variance, kick) for name, orbit, kick in columns}
+    if own.rf is not None and own.rf.orbit is not None:
+        found["rf"] = (own.rf.orbit, variance, own.rf.step)
+    return found
+
+
+def _of_orbits(name: str, first: Column, second: Column) -> Iterator[Difference]:
+    (a, own, kick), (b, more, other_kick) = first, second
+    b = b * kick / other_kick
     read = np.isfinite(a) & np.isfinite(b)
     if not read.any():
         return
-    own = np.full(a.shape, np.nan) if first.noise is None else first.noise**2
-    more = np.full(a.shape, np.nan) if second.noise is None else second.noise**2
     a, b, own = a[read], b[read], own[read]
-    variance = own + more[read] * (kicks[0] / kicks[1]) ** 2
-
+    variance = own + more[read] * (kick / other_kick) ** 2
     expected = float(np.sqrt(np.mean(variance)))
     yield Difference(ORBIT, name, rms(a), rms(b), rms(b - a), expected, "m")
     square = float(a @ a) - float(np.nansum(own))  # without what the noise adds to it

@@ -1,7 +1,4 @@
-"""Sentences and rows of a report, for the terminal (`plain.report_text`) and the HTML page.
-
-The same sentences and rows are in the terminal (`plain.report_text`) and in the HTML page.
-"""
+"""Sentences and rows of a report, for the terminal (`plain.report_text`) and the HTML page."""
 
 import re
 import textwrap

@@ -12,7 +12,7 @@ patterns: the combinations of usual errors of bends and quadrupoles that focus m
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -138,6 +138,17 @@ class VerticalKicks(_Kicks):
     title = "kicks in the vertical dispersion"
 
 
+AnyFamily = TypeVar("AnyFamily", bound=Family)
+
+
+def _fitted(values: Mapping[str, Array], *families: AnyFamily) -> Iterator[tuple[AnyFamily, Array]]:
+    """Yield the families with fitted numbers that are not all zero, and these."""
+    for family in families:
+        own = values.get(family.variable, np.zeros(0))
+        if own.any():
+            yield family, own
+
+
 def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
     """Yield a message for each plane in which kicks contribute to the RF's orbit.
 
@@ -145,15 +156,13 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
         values: fitted, by variable.
         data: the response.
     """
-    for family in (HorizontalKicks(), VerticalKicks()):
-        own = values.get(family.variable, np.zeros(0))
-        if own.any():
-            size = rms(own @ family.patterns(data).rf)
-            yield (
-                f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from a "
-                f"{FIELDS[family.plane]} but from kicks of the closed orbit (errors of bends, "
-                "quadrupole offsets, correctors), which the data do not separate"
-            )
+    for family, own in _fitted(values, HorizontalKicks(), VerticalKicks()):
+        size = rms(own @ family.patterns(data).rf)
+        yield (
+            f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from a "
+            f"{FIELDS[family.plane]} but from kicks of the closed orbit (errors of bends, "
+            "quadrupole offsets, correctors), which the data do not separate"
+        )
 
 
 FIELDS = ("gradient", "skew gradient")
@@ -184,11 +193,7 @@ def dispersion_beside(
         values: fitted, by variable.
         data: the response.
     """
-    found = [
-        (family, values[family.variable])
-        for family in (HorizontalKicks(), VerticalKicks())
-        if values.get(family.variable, np.zeros(0)).any()
-    ]
+    found = [*_fitted(values, HorizontalKicks(), VerticalKicks())]
     if not found:
         return {}
     model = data.design
@@ -309,8 +314,7 @@ def orbits_in_sextupoles(values: Mapping[str, Array], data: ResponseData) -> Ite
     """
     sizes = [
         f"{1e3 * rms(own @ family.patterns(data).orbits):.2g} mm in {'xy'[family.plane]}"
-        for family in (HorizontalOrbit(), VerticalOrbit())
-        if (own := values.get(family.variable, np.zeros(0))).any()
+        for family, own in _fitted(values, HorizontalOrbit(), VerticalOrbit())
     ]
     if sizes:
         yield (

@@ -5,7 +5,8 @@ All pieces of a magnet share one number.
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from typing import ClassVar, NamedTuple
+from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
@@ -273,30 +274,30 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
 
     Args:
         ring: the ring.
-        `beside`: whether straights next to such a wiggler are included.
+        beside: whether straights next to such a wiggler are included.
     """
-    found, ways = list[Element](), list[Element]()
-    within, bends = list[_Placed](), list[float]()
-    begin = np.inf  # the first straight ends at the first magnet of the turn
-    for element, s in _around(ring):
-        if not _parts(element):
-            within.append(_Placed(element, s))
+    own = ring.elements
+    parting = [i for i, e in enumerate(own) if _parts(e)]
+    if not parting:
+        return []
+    # one turn from a magnet to itself: from no bend if possible, so that no wiggler is split
+    first = min(parting, key=lambda i: own[i].kind == "bend")
+    turn = [(e, e.s) for e in own[first:]] + [(e, e.s + ring.length) for e in own[: first + 1]]
+    found, ways, bends = list[Element](), list[Element](), list[float]()
+    at = [i for i, (element, _) in enumerate(turn) if _parts(element)]
+    for i, j in pairwise(at):
+        (before, start), (behind, end) = turn[i], turn[j]
+        start, end = start + before.length / 2, end - behind.length / 2
+        if end - start > STRAIGHT:
+            ways += _middle(turn[i + 1 : j], (start + end) / 2)
+        if before.kind == "bend":
+            bends.append(before.angle)
+        if behind.kind == "bend" and j != at[-1]:
             continue
-        end = s - element.length / 2
-        if end - begin > STRAIGHT:
-            ways += _middle(within, (begin + end) / 2)
-        within, begin = [], s + element.length / 2
-        if element.kind == "bend":
-            bends.append(element.angle)
-            continue
-        found += ways if beside else _outside(ways, bends)
+        if beside or not (bends and min(bends) < 0 < max(bends)):
+            found += ways
         ways, bends = [], []
-    return found + (ways if beside else _outside(ways, bends))
-
-
-class _Placed(NamedTuple):
-    element: Element
-    s: float  # m, one turn further behind the lattice's first element
+    return found
 
 
 def _parts(element: Element) -> bool:
@@ -304,34 +305,10 @@ def _parts(element: Element) -> bool:
     return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
 
 
-def _around(ring: Ring) -> list[_Placed]:
-    """One turn from a magnet to itself, both included; it starts at no bend if possible, so that a
-    wiggler of alternating bends is not split."""
-    own = ring.elements
-    magnets = sorted(
-        (i for i, e in enumerate(own) if _parts(e)), key=lambda i: (own[i].kind == "bend", i)
-    )
-    if not magnets:
-        return []
-    first = magnets[0]
-    return [
-        *(_Placed(e, e.s) for e in own[first:]),
-        *(_Placed(e, e.s + ring.length) for e in own[: first + 1]),
-    ]
-
-
-def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:
-    """Straights among these bends, without other magnets, except those of a wiggler."""
-    return [] if bends and min(bends) < 0 < max(bends) else list(ways)
-
-
-def _middle(within: Sequence[_Placed], middle: float) -> list[Element]:
-    markers = [own for own in within if own.element.kind == "marker"]
-    drifts = [
-        own.element
-        for own in within
-        if own.element.kind == "drift" and own.element.length >= STRAIGHT / 2
-    ]
+def _middle(within: Sequence[tuple[Element, float]], middle: float) -> list[Element]:
+    """The place in a straight, of its elements and their s, m."""
+    markers = [own for own in within if own[0].kind == "marker"]
     if markers:
-        return [min(markers, key=lambda own: abs(own.s - middle)).element]
+        return [min(markers, key=lambda own: abs(own[1] - middle))[0]]
+    drifts = [e for e, _ in within if e.kind == "drift" and e.length >= STRAIGHT / 2]
     return [max(drifts, key=lambda e: e.length)] if drifts else []
