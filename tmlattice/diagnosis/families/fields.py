@@ -176,7 +176,7 @@ class FocusingChange(VerticalFocusing):
     include straights next to wigglers of bends, whose focusing has no other number."""
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return self._devices(ring, straights(ring, beside=True))
+        return self._devices(ring, straights(ring, next_to_wigglers=True))
 
     def lowest(self, data: ResponseData) -> Array | float:
         """No bounds."""
@@ -257,7 +257,7 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
         correctors: names.
         planes: "x" or "y", of each.
     """
-    others = [e for e in ring.magnets if e.kind not in ("hcorrector", "vcorrector")]
+    others = [e for e in ring.elements if _parts(e)]
     places = np.array([e.s for e in others])
     behind = np.searchsorted(places, [ring[name].s for name in correctors]) % len(others)
     return [
@@ -266,7 +266,7 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
     ]
 
 
-def straights(ring: Ring, beside: bool = False) -> list[Element]:
+def straights(ring: Ring, next_to_wigglers: bool = False) -> list[Element]:
     """Return the marker nearest to the middle of each long straight, else its longest drift.
 
     A straight next to a wiggler of alternating bends has none, because its focusing is degenerate
@@ -274,7 +274,7 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
 
     Args:
         ring: the ring.
-        beside: whether straights next to such a wiggler are included.
+        next_to_wigglers: whether straights next to such a wiggler are included.
     """
     own = ring.elements
     parting = [i for i, e in enumerate(own) if _parts(e)]
@@ -294,7 +294,7 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
             bends.append(before.angle)
         if behind.kind == "bend" and j != at[-1]:
             continue
-        if beside or not (bends and min(bends) < 0 < max(bends)):
+        if next_to_wigglers or not (bends and min(bends) < 0 < max(bends)):
             found += ways
         ways, bends = [], []
     return found
