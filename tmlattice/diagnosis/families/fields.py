@@ -49,10 +49,10 @@ class _Magnets(RingFamily):
         )
 
 
-def _by_type(magnets: Iterable[dict[str, float]]) -> list[dict[str, float]]:
+def _by_type(each: Iterable[dict[str, float]]) -> list[dict[str, float]]:
     """The pieces of each type of magnet, from those of each magnet."""
     types: dict[str, dict[str, float]] = {}
-    for pieces in magnets:
+    for pieces in each:
         types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
     return list(types.values())
 
