@@ -1,7 +1,7 @@
-"""Types of numpy arrays, and their sizes, largest and smallest."""
+"""Types of numpy arrays, their sizes, largest and smallest, and their root mean square."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -19,3 +19,15 @@ INVISIBLE = 1e-9
 REDUNDANT = 1e-6
 """Share of the information on a number below which the others determine it: what remains may be the
 rounding of large sums."""
+
+
+def rms(values: ArrayLike) -> float:
+    """Root mean square of all values; NaN of none."""
+    size = np.asarray(values)
+    return float(np.sqrt(np.mean(size**2))) if size.size else float("nan")
+
+
+def pair(values: ArrayLike) -> tuple[float, float]:
+    """Two values, such as of x and y, as numbers."""
+    x, y = np.asarray(values, dtype=float).tolist()
+    return x, y

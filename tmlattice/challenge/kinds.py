@@ -14,7 +14,7 @@ from tmlattice.arrays import Array
 from tmlattice.beam.model import Model
 from tmlattice.challenge.case import BEFORE, Case, Truth, ring_of
 from tmlattice.challenge.draw import Draw
-from tmlattice.diagnosis.kinds import Measured, PartOptions, part_of, stacked
+from tmlattice.diagnosis.kinds import PartOptions, part_of, stacked
 from tmlattice.effects import Cause, Effect, LaunchEffect, Settings, find, modelled
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
@@ -26,6 +26,7 @@ from tmlattice.lattice import Ring
 from tmlattice.machine import simulate, stored_beam
 from tmlattice.machine.response import NOISE, simulate_response
 from tmlattice.machine.shots import stream
+from tmlattice.measurement import AnyMeasurement
 from tmlattice.observe.data import Data, joined, of_measurement
 from tmlattice.observe.first_turns import FirstTurns
 
@@ -81,7 +82,7 @@ class CaseSettings:
 # --- the machine ----------------------------------------------------------------------------------
 def measure(
     kind: str, ring: Ring, causes: Sequence[Cause], noise: float, shots: int, **own: Any
-) -> Measured:
+) -> AnyMeasurement:
     """Return one measurement of a machine by AT."""
     fine = tuple(noise * rms for rms in NOISE)
     made: Mapping[str, Callable[[], Any]] = {
@@ -104,15 +105,15 @@ def measure(
             ring, causes, noise=fine, progress=False, **own
         ).measured,
     }  # fmt: skip
-    measured: Measured = made[kind]()
+    measured: AnyMeasurement = made[kind]()
     return measured
 
 
 # --- rows -----------------------------------------------------------------------------------------
 def problem_of(
     ring: Ring,
-    measured: Mapping[str, Measured],
-    before: Mapping[str, Measured],
+    measured: Mapping[str, AnyMeasurement],
+    before: Mapping[str, AnyMeasurement],
     background: Mapping[str, float],
 ) -> Problem:
     """Return measurements as a problem, with distributed errors of known sizes if there are any."""
@@ -220,7 +221,7 @@ def kinds_case(asked: CaseSettings, number: int, name: str) -> tuple[Case, Truth
     ring, background = asked.ring, dict(asked.background)
     pair = asked.tier == "P"
 
-    def machine(causes: Sequence[Cause], again: int) -> dict[str, Measured]:
+    def machine(causes: Sequence[Cause], again: int) -> dict[str, AnyMeasurement]:
         own: dict[str, Any] = {"seed": seed + again, "machine_seed": seed}
         if background:
             own["background"] = background
@@ -255,8 +256,8 @@ def _drawn(
     asked: CaseSettings,
     draw: Draw,
     ruler: Ruler,
-    machine: Callable[[Sequence[Cause]], dict[str, Measured]],
-) -> tuple[tuple[Cause, ...], dict[str, Measured]]:
+    machine: Callable[[Sequence[Cause]], dict[str, AnyMeasurement]],
+) -> tuple[tuple[Cause, ...], dict[str, AnyMeasurement]]:
     """Draw a fault, and measure it."""
     for _ in range(100):
         causes = _pair(asked, draw, ruler) if asked.tier == "P" else _single(asked, draw, ruler)

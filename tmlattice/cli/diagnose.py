@@ -34,11 +34,10 @@ from tmlattice.cli.progress import tell
 if TYPE_CHECKING:
     from tmlattice.correction import Correction, Knob
     from tmlattice.diagnosis import Diagnosis
-    from tmlattice.diagnosis.kinds import Measured
     from tmlattice.fitting.weights import WeightReading
     from tmlattice.inference.distributed import DistributedErrors
     from tmlattice.lattice import Ring
-    from tmlattice.measurement import Measurement
+    from tmlattice.measurement import AnyMeasurement, Measurement
 
 log = logging.getLogger(__name__)
 
@@ -256,7 +255,7 @@ def diagnose(
 
 def _read(
     paths: tuple[Path, ...], ring: "Ring", assumed: tuple[str, ...]
-) -> "tuple[dict[str, Measured], list[str]]":
+) -> "tuple[dict[str, AnyMeasurement], list[str]]":
     """Measurements by the names of their folders, by the whole path where two have one name; and
     what was assumed of files that are none.
 
@@ -268,7 +267,7 @@ def _read(
             raise click.UsageError(f"'{path}' is given twice; give each measurement once")
     names = [path.resolve().name for path in paths]
     twice = len(set(names)) < len(names)
-    found: dict[str, Measured] = {}
+    found: dict[str, AnyMeasurement] = {}
     said: list[str] = []
     for name, path in zip(names, paths, strict=True):
         found[str(path) if twice else name], own = read_data(path, ring, assumed)

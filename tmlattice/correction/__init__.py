@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import TINY
+from tmlattice.arrays import TINY, Array, Indices, pair
 from tmlattice.correction.estimate import Estimate, estimate_of
 from tmlattice.correction.first_turn import Threading, estimate_of_turns
 from tmlattice.correction.knobs import Knob, chosen_knobs, default_knobs, read_knobs
@@ -24,8 +24,6 @@ from tmlattice.lattice import Ring, load_ring
 from tmlattice.measurement import Measurement
 
 __all__ = ["Correction", "Knob", "Setting", "correct", "default_knobs", "read_knobs"]
-
-Array = np.ndarray
 
 DRAWS = 200
 """Draws from the posterior: the ends of an interval scatter by a tenth of its half width."""
@@ -108,7 +106,7 @@ def _estimate(diagnosis: Any, goal: Ring | None) -> Estimate:
 
 
 def _fields(
-    begin: Point, whole: Point, end: Point, aversion: float, order: Array
+    begin: Point, whole: Point, end: Point, aversion: float, order: Indices
 ) -> dict[str, Any]:
     """Fields of the result: the whole correction, and the safe one where all ends."""
     problem, targets = end.problem, end.problem.targets
@@ -129,7 +127,7 @@ def _fields(
     ]  # fmt: skip
     settings.sort(key=lambda own: -own.gain)
     stays = {
-        name: (_pair(rms_of(end.errors)[name]), _pair(np.median(own, axis=0)))
+        name: (pair(rms_of(end.errors)[name]), pair(np.median(own, axis=0)))
         for name, own in rms_of(end.open).items()
     }
     shown = targets.names[0] if "beta_beating" not in end.errors else "beta_beating"
@@ -155,7 +153,7 @@ def _fields(
         ),
         "gain": float(gain.mean()),
         "gain_error": float(gain.std()),
-        "tunes": {name: _pair(value % 1.0) for name, value in tunes.items()},
+        "tunes": {name: pair(value % 1.0) for name, value in tunes.items()},
         "shown": shown,
         "profile": profile,
         "s": tuple(targets.s.tolist()),
@@ -192,7 +190,7 @@ def _expected(amounts: Array, end: Point) -> dict[str, tuple[float, float]]:
     for name in end.problem.targets.names:
         change = np.tensordot(amounts - end.amounts, end.by_knobs[name], 1)
         errors = end.errors[name] + change + end.open[name]
-        found[name] = _pair(np.median(rms_of({name: errors})[name], axis=0))
+        found[name] = pair(np.median(rms_of({name: errors})[name], axis=0))
     return found
 
 
@@ -219,8 +217,3 @@ def _warnings(
         if near < SIGMAS * s:
             kind = "an integer" if round(2 * q) % 2 == 0 else "a half integer"
             yield f"the expected tune in {'xy'[plane]}, {q % 1:.4f} ± {s:.1g}, may be {kind}"
-
-
-def _pair(values: Array) -> tuple[float, float]:
-    x, y = np.asarray(values, dtype=float).tolist()
-    return x, y

@@ -14,8 +14,9 @@ from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import Diagnosis
+from tmlattice.diagnosis.load import changes_beam
 from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
-from tmlattice.effects import Cause, RingEffect, apply, find
+from tmlattice.effects import Cause, apply
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.newton import STEP_SHARES
@@ -47,8 +48,8 @@ class Estimate:
     def kept(self) -> Indices:
         """Indices in `known` of the errors of a stored beam's ring."""
         own = zip(self.known.hypotheses, self.known.rms.tolist(), strict=True)
-        return np.array([i for i, ((name, _), rms) in enumerate(own) if rms > 0 and _of_ring(name)],
-                        dtype=np.int64)  # fmt: skip
+        return np.array([i for i, ((name, _), rms) in enumerate(own)
+                         if rms > 0 and changes_beam(name)], dtype=np.int64)  # fmt: skip
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
@@ -133,14 +134,8 @@ def estimate_of(diagnosis: Diagnosis, known: DistributedErrors | None = None) ->
 def _each_alone(diagnosis: Diagnosis) -> DistributedErrors:
     sigma = {(c.effect, c.element): s for c, s, _ in diagnosis.supported if np.isfinite(s)}
     known = DistributedErrors.usual(list(sigma), {name: 1.0 for name, _ in sigma})
-    with_beam = tuple(c for c in diagnosis.causes if not _of_ring(c.effect))
+    with_beam = tuple(c for c in diagnosis.causes if not changes_beam(c.effect))
     return replace(known, rms=np.array(list(sigma.values())), causes=with_beam)
-
-
-def _of_ring(name: str) -> bool:
-    """Whether an effect changes the stored beam of a ring with these settings."""
-    effect = find(name)
-    return isinstance(effect, RingEffect) and not (effect.calibrates or effect.acts_on_settings)
 
 
 def read_estimate(path: Path, settings: Ring, ring: Ring) -> tuple[Estimate, tuple[str, ...]]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import Array, Indices
+from tmlattice.arrays import Array, Indices, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.errors import TmlatticeError, unknown_choice
@@ -201,11 +201,8 @@ class Targets(Weighted):
         wanted: names of `TARGETS`, optionally with another tolerance.
 
     Attributes:
-        names: of the wanted targets, in the order of `TARGETS`.
-        tolerance: of these, in their units.
         step: relative change of the RF frequency that changes the goal's energy by `ENERGY`.
         goal: its optics.
-        s: of the BPMs, m.
 
     Raises:
         TmlatticeError: threading together with other targets.
@@ -227,9 +224,9 @@ class Targets(Weighted):
         self.step = ENERGY / float(model.rf_start[5])
         self.goal = StoredOptics(model, self.step).values
         self.names = tuple(name for name in TARGETS if name in given)
-        rms = float(np.sqrt(np.mean(self.goal["dispersion"][:, 0] ** 2))) or 1.0
+        size = rms(self.goal["dispersion"][:, 0]) or 1.0
         self.tolerance = {
-            name: given[name] or TARGETS[name].tolerance * (rms if name == "dispersion" else 1.0)
+            name: given[name] or TARGETS[name].tolerance * (size if name == "dispersion" else 1.0)
             for name in self.names
         }
 

@@ -14,13 +14,13 @@ import numpy as np
 
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis.data_checks import in_the_lattice
-from tmlattice.diagnosis.kinds import Measured, kind_of
+from tmlattice.diagnosis.kinds import kind_of
 from tmlattice.diagnosis.result import Diagnosis, Finding, Member
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement, OrbitResponse, in_words
+from tmlattice.measurement import AnyMeasurement, Measurement, OrbitResponse, in_words
 from tmlattice.measurement.recorded import recorded
 from tmlattice.observe.spoilt import without_spoilt
 
@@ -42,9 +42,9 @@ which wait for one another (ALS, 41,000 readings, two cores: 71 s with two threa
 @by_name
 def diagnose(
     ring: Ring,
-    measurement: Measured | Mapping[str, Measured],
+    measurement: AnyMeasurement | Mapping[str, AnyMeasurement],
     *,
-    reference: Measured | Mapping[str, Measured] | None = None,
+    reference: AnyMeasurement | Mapping[str, AnyMeasurement] | None = None,
     holdout: float | None = None,
     effects: Sequence[str] | None = None,
     max_effects: int | None = None,

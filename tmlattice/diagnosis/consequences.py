@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, pair
 from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
@@ -100,7 +100,7 @@ def consequences(ring: Ring, causes: Sequence[Cause]) -> dict[Hypothesis, Conseq
 def _compared(
     design: StoredOptics | None, found: StoredOptics | None, corrected: StoredOptics | None
 ) -> Consequences:
-    tunes = None if design is None else _pair(design.tunes)
+    tunes = None if design is None else pair(design.tunes)
     return Consequences(tunes, _relative(design, found), _relative(design, corrected))
 
 
@@ -163,17 +163,12 @@ def _relative(design: StoredOptics | None, ring: StoredOptics | None) -> Beam | 
     beat = ring.beta / design.beta - 1
 
     def rms(values: Array) -> Pair:
-        return _pair(np.sqrt(np.mean(values**2, axis=0)))
+        return pair(np.sqrt(np.mean(values**2, axis=0)))
 
     return Beam(
-        tunes=_pair(ring.tunes),
+        tunes=pair(ring.tunes),
         beta_beat_rms=rms(beat),
-        beta_beat_max=_pair(np.abs(beat).max(axis=0)),
+        beta_beat_max=pair(np.abs(beat).max(axis=0)),
         dispersion_rms=rms(ring.dispersion - design.dispersion),
         orbit_rms=rms(ring.orbit),
     )
-
-
-def _pair(values: Array) -> Pair:
-    x, y = values.tolist()
-    return x, y

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.beam.rf import speed_of
 from tmlattice.by_name import by_name
 from tmlattice.diagnosis import signals
@@ -46,7 +46,7 @@ from tmlattice.measurement import (
     TurnByTurn,
 )
 from tmlattice.measurement.assume import ASSUMPTIONS, assume, in_beam_order, is_unit, read_of
-from tmlattice.measurement.kinds import STORED
+from tmlattice.measurement.kinds import KINDS, STORED
 from tmlattice.measurement.lost_beam import beam_lost, exact
 from tmlattice.measurement.monitors import Names
 from tmlattice.measurement.recorded import recorded
@@ -131,8 +131,7 @@ def check_data(
             checks += [note(name, spoilt[name]) if name in spoilt else fine(name, text)
                        for name, text in UNSPOILT.items()]  # fmt: skip
     checks += _whole(ring, data, radiation)
-    plain = "trajectory" if isinstance(data, Measurement) else "orbit_response"
-    kind = next((name for name, own in STORED.items() if isinstance(data, own.record)), plain)
+    kind = next(name for name, own in KINDS.items() if isinstance(data, own.record))
     provenance = {
         "package": __version__,
         "lattice": ring.name,
@@ -374,7 +373,7 @@ def _follows_nothing(shares: Array) -> NDArray[np.intp]:
         return read
     strange = np.cumsum(np.log(np.maximum(shares[read], 1e-9) / HALF)[::-1])[::-1]
     behind = read[strange.argmax() :]
-    left = float(np.sqrt(np.mean(shares[behind] ** 2)))
+    left = rms(shares[behind])
     lost = NOTHING_FROM <= len(behind) < len(read) and left > NO_BEAM
     return behind if lost else read[:0]
 
@@ -532,10 +531,8 @@ def _of_compared(ring: Ring, data: AnyMeasurement, problem: Any = None) -> list[
 MEANT = "did you mean"
 """Phrase in the message about a misspelt name."""
 
-Measured = TypeVar("Measured")
 
-
-def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]:
+def in_the_lattice(ring: Ring, measured: Some) -> tuple[Some, list[str]]:
     """The measurement without BPMs and correctors that are not in the lattice, and a sentence for
     each kind left out.
 
@@ -555,7 +552,7 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
         ("BPMs", "monitors", monitors.__getitem__), ("correctors", "correctors", ring.index),
     ):  # fmt: skip
         names = getattr(own, kept, ())
-        unknown = [name for name in names if not _has(ring, monitors, name)]
+        unknown = [n for n in names if monitors.find(n) is None and _hint(ring.index, n)]
         if not unknown:
             continue
         fix = _hint(find, unknown[0])
@@ -573,14 +570,9 @@ def in_the_lattice(ring: Ring, measured: Measured) -> tuple[Measured, list[str]]
 
 
 def _hint(find: Callable[[str], object], name: str) -> str:
-    """The message about an unknown name."""
+    """The message about an unknown name; empty of a known one."""
     try:
         find(name)
     except UnknownNameError as error:
         return str(error)
     return ""
-
-
-def _has(ring: Ring, monitors: Names, name: str) -> bool:
-    """Whether the ring has an element of this name."""
-    return monitors.find(name) is not None or not _hint(ring.index, name)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.model import Model
 from tmlattice.beam.rf import rf_of
@@ -22,6 +22,7 @@ from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.problem import Hypothesis, Problem
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
+    AnyMeasurement,
     ClosedOrbit,
     Dispersion,
     Measurement,
@@ -48,8 +49,6 @@ TURNS, AMPLITUDE = 1000, 3e-4
 """Amplitude of a kicked beam, m, at the BPMs where it is largest."""
 KICK, ENERGY_ORBIT = 1e-4, 1.3e-3
 """Kick of each corrector, rad; orbit change by the RF's step, m rms."""
-
-Measured = Measurement | OrbitResponse | TurnByTurn | ClosedOrbit | Dispersion | TuneReading
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,7 @@ class Part:
     shots: tuple[tuple[int | None, ...], tuple[int, ...]] = ((), ())
 
 
-def part_of(label: str, measured: Measured, options: PartOptions) -> Part:
+def part_of(label: str, measured: AnyMeasurement, options: PartOptions) -> Part:
     """Return a measurement as a part of a diagnosis.
 
     Raises:
@@ -119,6 +118,7 @@ def part_of(label: str, measured: Measured, options: PartOptions) -> Part:
         UnknownNameError: a monitor that the ring does not have.
     """
     name = kind_of(measured)
+    measured = corrected_data(options.ring, measured, options.assume)
     return KINDS[name].part(label, name, measured, options)
 
 
@@ -141,7 +141,7 @@ def stacked(parts: Sequence[Part], before: Sequence[Part], options: PartOptions)
     return replace(whole, places=options.places, judgement=options.judgement, starts=starts)
 
 
-def kind_of(measured: Measured) -> str:
+def kind_of(measured: AnyMeasurement) -> str:
     """The kind of a measurement, as its folder has it."""
     for name, kind in KINDS.items():
         if isinstance(measured, kind.record):
@@ -152,7 +152,6 @@ def kind_of(measured: Measured) -> str:
 # --- the kinds ----
 def _first_turns(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
     ring = options.ring
-    measured = corrected_data(ring, measured, options.assume)
     before, held = (
         corrected_data(ring, own, options.assume) for own in (options.reference, options.heldout)
     )
@@ -193,10 +192,8 @@ def _with_noise(measured: Measurement, noise: Array) -> Measurement:
 
 
 def _response(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
-    ring = options.ring
-    measured = corrected_data(ring, measured, options.assume)
-    messages = tuple(data_checks(ring, measured))
-    data = response_data(ring, measured)
+    messages = tuple(data_checks(options.ring, measured))
+    data = response_data(options.ring, measured)
     whole = _problem(data, options)
     if not options.holdout:
         return Part(label, kind, whole, messages=messages)
@@ -219,12 +216,11 @@ def _problem(data: ResponseData, options: PartOptions) -> Response:
 
 
 def _of_stored(
-    make: Callable[..., Problem], shots: bool = False
+    make: Callable[..., Stored], shots: bool = False
 ) -> Callable[[str, str, Any, PartOptions], Part]:
     """A kind of a stored beam; with `shots`, some are held out if there are enough of them."""
 
     def made(label: str, kind: str, measured: Any, options: PartOptions) -> Part:
-        measured = corrected_data(options.ring, measured, options.assume)
         held = None
         ids = list(measured.shots) if shots else []
         count = round(options.holdout * len(ids))
@@ -234,8 +230,7 @@ def _of_stored(
                 measured.select(shots=sorted(some)) for some in (drawn[:count], drawn[count:])
             )
         problem = make(options.ring, measured, options.places)
-        if isinstance(problem, Stored):
-            raise_if_wrong(options.ring, measured, problem)
+        raise_if_wrong(options.ring, measured, problem)
         messages = problem.warnings if isinstance(problem, ManyTurns) else ()
         judges = held and make(options.ring, held, options.places)
         return Part(label, kind, problem, judges, messages=messages)
@@ -258,7 +253,7 @@ def _propose_orbit(ring: Ring, options: PartOptions) -> Problem:
 def _propose_dispersion(ring: Ring, options: PartOptions) -> Problem:
     names, nothing = _no_orbit(ring)
     model, rf = ResponseModel(ring), rf_of(ring)
-    size = float(np.sqrt(np.mean(model.rf_response()[:, 0] ** 2)))
+    size = rms(model.rf_response()[:, 0])
     if not size:
         raise TmlatticeError("no dispersion")
     step = RfStep(
@@ -310,7 +305,8 @@ class Kind:
 
     Attributes:
         record: its class.
-        part: makes it a part of a diagnosis, of its label, kind, record and options.
+        part: makes it a part of a diagnosis, of its label, kind, record and options; assumed errors
+            of the record are corrected.
         quantities: of the stored beam that it contains.
         words: what to measure, as a sentence begins with it.
         proposal: problem of a simulated measurement with the usual noise; None: it is never

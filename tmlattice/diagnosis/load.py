@@ -119,7 +119,7 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
         noise=(decoded(float, noise["x"]), decoded(float, noise["y"])),
         noise_estimated=noise["estimated"],
         ring=ring,
-        corrected=apply(ring, [cause for cause in causes if _in_ring(cause)]),
+        corrected=apply(ring, [cause for cause in causes if changes_beam(cause.effect)]),
         causes=causes,
         errors=tuple(decoded(float, row["amount_sigma"]) for row in d["errors"]),
         view=StoredView(
@@ -138,6 +138,7 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
     return made
 
 
-def _in_ring(cause: Cause) -> bool:
-    effect = find(cause.effect)
+def changes_beam(name: str) -> bool:
+    """Whether an effect changes the stored beam of a ring with these settings."""
+    effect = find(name)
     return isinstance(effect, RingEffect) and not (effect.calibrates or effect.acts_on_settings)

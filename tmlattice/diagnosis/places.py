@@ -6,12 +6,9 @@ import numpy as np
 
 from tmlattice.lattice import Ring
 
-Span = tuple[tuple[float, float], tuple[str, ...]]
-"""The interval, m, and the names of its BPMs."""
 
-
-def between(ring: Ring, positions: Sequence[float]) -> Span:
-    """The interval from the last BPM before to the first one behind."""
+def between(ring: Ring, positions: Sequence[float]) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """The interval from the last BPM before to the first one behind, m, and their names."""
     s = np.array([monitor.s for monitor in ring.monitors])
     low, high = min(positions), max(positions)
     before = int(np.searchsorted(s, low, side="left")) - 1

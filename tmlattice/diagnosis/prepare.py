@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tmlattice.arrays import AT_ONCE, Array, Flags
+from tmlattice.arrays import AT_ONCE, Array, Flags, rms
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
 from tmlattice.effects import LaunchEffect, expected_radiation, find, modelled, names, rare
@@ -236,13 +236,13 @@ def _with_noise(data: Data, start: Fit) -> tuple[Data, bool]:
 
 def noise_of(data: Data) -> tuple[float, float]:
     """rms noise of a reading, m, (x, y); NaN for a plane without readings."""
-    x, y = (_rms(data.sigma[..., p][data.valid[..., p]]) for p in (0, 1))
+    x, y = (rms(data.sigma[..., p][data.valid[..., p]]) for p in (0, 1))
     return x, y
 
 
 def _above_the_floor(data: Data) -> tuple[Data, tuple[str, ...]]:
     """The data with noise not below the residual of second-order maps, and messages."""
-    floor = FLOOR * _rms(data.readings[data.valid])
+    floor = FLOOR * rms(data.readings[data.valid])
     if not (data.sigma[data.valid] < floor).any():
         return data, ()
     message = (
@@ -250,10 +250,6 @@ def _above_the_floor(data: Data) -> tuple[Data, tuple[str, ...]]:
         f"for such an orbit: {1e6 * floor:.2g} µm is taken"
     )
     return replace(data, sigma=np.maximum(data.sigma, floor)), (message,)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
 def same_monitors(other: Data, data: Data, dropped: Flags) -> Data:

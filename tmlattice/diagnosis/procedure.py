@@ -24,7 +24,7 @@ from tmlattice.diagnosis.findings import (
     verdict_of,
     with_consequences,
 )
-from tmlattice.diagnosis.kinds import Measured, Part, PartOptions, kind_of, part_of, stacked
+from tmlattice.diagnosis.kinds import Part, PartOptions, kind_of, part_of, stacked
 from tmlattice.diagnosis.next_measurement import leading, next_kind, next_measurement
 from tmlattice.diagnosis.prepare import noise_of
 from tmlattice.diagnosis.result import MOST, Diagnosis, Finding, NextMeasurement
@@ -61,7 +61,7 @@ from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
 from tmlattice.inference.validation import Misfit
 from tmlattice.lattice import Ring
-from tmlattice.measurement import Measurement
+from tmlattice.measurement import AnyMeasurement, Measurement
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import ring_tunes
 from tmlattice.speaks import listed, micrometres
@@ -72,7 +72,7 @@ log = logging.getLogger(__name__)
 
 def diagnose_together(
     ring: Ring,
-    measured: Mapping[str, Measured],
+    measured: Mapping[str, AnyMeasurement],
     *,
     reference: Mapping[str, Any] | None = None,
     background: str | Mapping[str, float | None] | None = None,
@@ -170,7 +170,7 @@ def diagnose_together(
     )  # fmt: skip
 
 
-def _named(label: str, measured: Measured, options: PartOptions) -> Part:
+def _named(label: str, measured: AnyMeasurement, options: PartOptions) -> Part:
     try:
         return part_of(label, measured, options)
     except MeasurementError as error:
@@ -282,7 +282,8 @@ def _report(
         return misfit_of([*zip(kept.parts[: len(parts)], stage.point.view, strict=False)])
 
     corrected = apply(ring, causes)
-    errors = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))[: len(causes)]
+    covariance = result.covariance[: len(causes), : len(causes)]
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Diagnosis(
         verdict=verdict,
         findings=tuple(
@@ -296,11 +297,8 @@ def _report(
         heldout=heldout,
         heldout_shots=() if turns is None else turns.shots[1],
         compared=compared,
-        covariance=result.covariance[: len(causes), : len(causes)],
-        correlations=correlations_of(
-            [(cause.effect, cause.element) for cause in causes],
-            found.fit.covariance[: len(causes), : len(causes)],
-        ),
+        covariance=covariance,
+        correlations=correlations_of([(c.effect, c.element) for c in causes], covariance),
         unexplained=unexplained(
             ring,
             NO_SCAN if small is not None and verdict == "distributed" else left,
@@ -381,19 +379,15 @@ def outlier_messages(
     parts: Sequence[Part], problem: CombinedProblem, found: Explanation
 ) -> Iterator[str]:
     """A message for each measurement with single readings that the search rejected."""
-    ends = np.cumsum([part.valid.size for part in problem.parts])
-    own: dict[int, list[int]] = {}
-    for reading in found.outliers:
-        flat = int(np.ravel(reading)[-1])
-        own.setdefault(int(np.searchsorted(ends, flat, side="right")), []).append(flat)
-    for index, (part, one) in enumerate(zip(parts, problem.parts, strict=False)):
-        if index not in own:
-            continue
+    flat = np.array([np.ravel(reading)[-1] for reading in found.outliers], dtype=np.int64)
+    for part, one in zip(parts, problem.parts, strict=False):
         owners = one.owner().ravel()
-        start = int(ends[index]) - one.valid.size
-        count = Counter(one.monitors[owners[flat - start]] for flat in own[index])
+        own = flat[(flat >= 0) & (flat < owners.size)]
+        flat = flat - owners.size
+        count = Counter(one.monitors[owner] for owner in owners[own])
         notes = [name if many == 1 else f"{name} ({many})" for name, many in count.items()]
-        yield f"{part.label}: outliers, rejected: {', '.join(notes)}"
+        if notes:
+            yield f"{part.label}: outliers, rejected: {', '.join(notes)}"
 
 
 # --- of first turns -------------------------------------------------------------------------------

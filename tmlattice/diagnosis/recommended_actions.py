@@ -9,7 +9,8 @@ which amount (`Effect.stands_for`). The pieces of a magnet are one.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -129,34 +130,28 @@ def recommended_actions(
     Returns:
         That of the first one first, the others by falling probability.
     """
-    found: dict[tuple[str, tuple[str, ...]], RecommendedAction] = {}
+    alike: dict[tuple[str, tuple[str, ...]], list[tuple[Cause, Cause, float]]] = {}
     for cause, share in zip(causes, np.asarray(probability).tolist(), strict=True):
         lead = leading(ring, cause)
         key = (lead.effect, pieces_of(ring, lead.element))
-        if (known := found.get(key)) is not None:
-            shares = dict(known.mechanisms)
-            thin = known.effect not in shares
-            # of the same effect, in other pieces, added up
+        alike.setdefault(key, []).append((cause, lead, share))
+    found = []
+    for (effect, pieces), own in alike.items():
+        shares: dict[str, float] = {}
+        for cause, _, share in own:  # of the same effect, in other pieces, added up
             shares[cause.effect] = shares.get(cause.effect, 0.0) + share
-            known = replace(
-                known, probability=known.probability + share, mechanisms=tuple(shares.items())
-            )
-            if thin and cause.effect == lead.effect and lead.element == known.element:
-                # its own fit is better than a converted thin one
-                known = replace(known, amount=lead.amount, strength=_strength(ring, lead))
-            found[key] = known
-            continue
+        cause, lead, _ = own[0]
         error = None
         if cause is causes[0] and sigma is not None:
             error = sigma * abs(lead.amount / cause.amount) if cause.amount else sigma
-        found[key] = RecommendedAction(
-            lead.effect, lead.element, key[1], element_kind(ring, lead.element), lead.amount,
-            error, share, ((cause.effect, share),), _strength(ring, lead),
-        )  # fmt: skip
-    if not found:
-        return ()
-    first, *rest = found.values()
-    return (first, *sorted(rest, key=lambda action: -action.probability))
+        # its own fit is better than a converted thin one
+        best = next((one for made_of, one, _ in own if made_of.effect == effect), lead)
+        best = best if best.element == lead.element else lead
+        found.append(RecommendedAction(
+            effect, lead.element, pieces, element_kind(ring, lead.element), best.amount, error,
+            sum(share for *_, share in own), tuple(shares.items()), _strength(ring, best),
+        ))  # fmt: skip
+    return (*found[:1], *sorted(found[1:], key=lambda action: -action.probability))
 
 
 def fewest(probability: Sequence[float] | Array, mass: float) -> int:
@@ -177,17 +172,13 @@ def _is_element(ring: Ring, name: str) -> bool:
     return any(element.name == name for element in ring.elements)
 
 
-def _members(ring: Ring, name: str | None) -> list[Element]:
-    """The element of this name, or of the family's."""
-    own = [element for element in ring.elements if element.name == name]
-    families = (effect for effect in CATALOGUE.values() if isinstance(effect, FamilyEffect))
-    shared = (effect.members(ring, name) for effect in families)
-    return own or [ring.elements[i] for i in next((some for some in shared if some), ())]
-
-
 def element_kind(ring: Ring, name: str | None) -> Kind | None:
     """The kind of an element, or of a family's members; None for the beam."""
-    return next((element.kind for element in _members(ring, name)), None)
+    own = (i for i, element in enumerate(ring.elements) if element.name == name)
+    families = (effect for effect in CATALOGUE.values() if isinstance(effect, FamilyEffect))
+    shared = (i for effect in families for i in effect.members(ring, name))
+    first = next(chain(own, shared), None)
+    return None if first is None else ring.elements[first].kind
 
 
 def _strength(ring: Ring, cause: Cause) -> Strength | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.diagnosis.assessment import Assessment, Block
 from tmlattice.diagnosis.consequences import Consequences
 from tmlattice.diagnosis.kinds import KINDS
@@ -325,7 +325,6 @@ class Diagnosis(Speaks):
     @cached_property
     def assessment(self) -> Assessment:
         """Whether the remainder is noise, a gap is explained, an effect is missing: each once."""
-        options = self.provenance["options"]
         return Assessment(
             self.verdict,
             self.compared,
@@ -337,11 +336,11 @@ class Diagnosis(Speaks):
             families=self.by_families,
             rejected=[own.effect for own in self.families if not own.kept],
             small_errors=bool(self.priors) and not self.by_families,
-            reference=bool(options.get("reference")),
+            reference=self.has_reference,
             change=self.since_reference,
             measured=self.measured,
             model=self.starting_model,
-            false_alarm=options.get("false_alarm", DEFAULT.false_alarm),
+            false_alarm=self.provenance["options"].get("false_alarm", DEFAULT.false_alarm),
         )
 
     @property
@@ -521,7 +520,7 @@ class Diagnosis(Speaks):
                 "lost": gap.lost,
             }
         return {
-            "noise": float(np.sqrt(np.mean(np.square(self.noise)))),
+            "noise": rms(self.noise),
             "readings_noise": {
                 "x": self.noise[0],
                 "y": self.noise[1],

@@ -97,7 +97,12 @@ def select(
         learn = False
     begun = start if sparse is None else sparse.fit
     tried: list[tuple[float, FittedErrors]] = []
-    for causes, weight in _starts(sparse if learn else None):
+    # causes together with which the scales are estimated, and the log prior of their amounts: the
+    # scales have several optima, since a strong fault is a cause, or makes them larger
+    starts: list[tuple[tuple[Cause, ...], float]] = [((), 0.0)]
+    if learn and sparse is not None and sparse.fit.causes and not sparse.fit.kicks:
+        starts.append((sparse.fit.causes, _log_prior(sparse.fit)))
+    for causes, weight in starts:
         with suppress(UnstableRingError):  # then they are not in the model
             small = fit_distributed_errors(
                 problem, prior, begun.nuisances, causes, learn=learn, noisy=noisy,
@@ -189,17 +194,6 @@ def _sparse(search: Search, start: Fit) -> Explanation:
             break
     assert found is not None
     return found
-
-
-def _starts(sparse: Explanation | None) -> list[tuple[tuple[Cause, ...], float]]:
-    """Causes together with which the scales are estimated, and the log prior of their amounts.
-
-    The scales have several optima: a strong fault is a cause, or makes them larger.
-    """
-    starts: list[tuple[tuple[Cause, ...], float]] = [((), 0.0)]
-    if sparse is not None and sparse.fit.causes and not sparse.fit.kicks:
-        starts.append((sparse.fit.causes, _log_prior(sparse.fit)))
-    return starts
 
 
 def _log_prior(result: Fit) -> float:

@@ -298,13 +298,11 @@ def few(ring: Ring, data: AnyMeasurement) -> Check | None:
             "monitors", f"'{ring.name}' has no BPM; name those elements of the lattice that "
             "are BPMs",
         )  # fmt: skip
-    if not isinstance(data, Measurement):
-        return None
-    there = np.isfinite(data.readings)
-    read = int(there.any(axis=(0, 1, 3)).sum())
-    if read < 2:
-        return wrong(
-            "monitors", f"{read} BPM was read; a trajectory needs two BPMs at least, and "
-            "more for a diagnosis: read more",
-        )  # fmt: skip
+    if isinstance(data, Measurement):
+        read = int(np.isfinite(data.readings).any(axis=(0, 1, 3)).sum())
+        if read < 2:
+            return wrong(
+                "monitors", f"{read} BPM was read; a trajectory needs two BPMs at least, and "
+                "more for a diagnosis: read more",
+            )  # fmt: skip
     return None

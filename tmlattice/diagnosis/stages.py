@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tmlattice.arrays import TINY, Array, Flags
+from tmlattice.arrays import TINY, Array, Flags, rms
 from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
@@ -116,7 +116,7 @@ def views_of(
         for row, point in zip(by_monitor, points, strict=True):
             left, _ = _left(own, point)
             for m in np.unique(owner[owner >= 0]):
-                row[m] = np.sqrt(np.mean(left[owner == m] ** 2))
+                row[m] = rms(left[owner == m])
         before, after = (misfit_of([(own, point)]) for point in points)
         count = int(own.valid.sum())
         views.append(
@@ -135,9 +135,9 @@ def misfit_of(pairs: Sequence[tuple[Problem, Point]], among: Sequence[Flags] = (
         left.append(own)
         metres = (problem.owner() >= 0)[problem.valid & some]
         sizes.append((own * noise)[metres])
-    every, size = np.concatenate(left), np.concatenate(sizes)
-    rms = float(np.sqrt(np.mean(size**2))) if len(size) else float("nan")
-    return Misfit(rms, float(np.mean(every**2)) if len(every) else float("nan"))
+    every = np.concatenate(left)
+    chi2 = float(np.mean(every**2)) if len(every) else float("nan")
+    return Misfit(rms(np.concatenate(sizes)), chi2)
 
 
 def held_out(
@@ -203,8 +203,7 @@ def held_out_shots(
             model = model.knowing([*problem.fixed, *stage.static])
         unknown = None
         if small is not None and i:
-            explained = found.before if i == since and i < len(stages) - 1 else found.fit
-            explained = explained if stage.causes or found.fit.causes == () else found.before
+            explained = found.fit if stage.causes or not found.fit.causes else found.before
             about = replace(judge, model=model)
             unknown = _unknown(small, explained, about, stage)
         scored.append(held_out_residuals(replace(judge, model=model, fixed=stage.causes), unknown))

@@ -8,7 +8,7 @@ fit it is an amount that is an outlier of its family.
 >>> [(one.element, one.amount) for one in outliers(ring, causes, errors, findings)]
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -62,18 +62,27 @@ class Suspect:
     device: str | None = field(default=None, metadata=OPTIONAL)
 
 
-Candidate = tuple[str | None, str, float]
-"""The effect, element and statistic of a candidate."""
-
-
 def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tuple[Suspect, ...]:
     """Return the first suspects of each kind, where the explanation does not explain the data: of
     the search, then of the scan."""
+    candidates: list[tuple[str | None, str | None, float]] = [
+        (cause.effect, cause.element, named.detection.statistic)
+        for cause, named in zip(explanation.fit.causes, explanation.named, strict=True)
+    ]
+    candidates += [(None, ring.magnets[k].name, d.statistic) for k, d in explanation.kicks.items()]
+    candidates += [
+        (None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()
+    ]
+    candidates.sort(key=lambda candidate: -candidate[2])
+    scan = explanation.scan
+    order = np.argsort(-scan.statistic)
+    seen = order[scan.statistic[order] >= chi2.isf(judgement.false_alarm, 1)]  # by a single test
+    candidates += [(*scan.hypotheses[i], float(scan.statistic[i])) for i in seen]
     found: dict[tuple[SuspectKind, object], Suspect] = {}
     places = {element.name: element for element in ring.elements}
-    threshold = explanation.scan.threshold(judgement.false_alarm)
-    for effect, name, statistic in _candidates(ring, explanation, judgement):
-        if name not in places:
+    threshold = scan.threshold(judgement.false_alarm)
+    for effect, name, statistic in candidates:
+        if name is None or name not in places:
             continue  # the beam, or a family: no place to inspect
         element = places[name]
         where, near = between(ring, [element.s])
@@ -131,35 +140,9 @@ def outliers(
 def numbers(amounts: Iterable[tuple[Cause, float]]) -> list[tuple[tuple[Cause, ...], float]]:
     """Amounts with their errors; those of several places with one number (a magnet's pieces)
     together."""
-    found: dict[tuple[float, float], list[Cause]] = {}
-    sigmas: list[float] = []
+    found: dict[tuple[float, float], tuple[list[Cause], float]] = {}
     for cause, sigma in amounts:
         one = bool(cause.amount) and sigma > 0
         own = (round(cause.amount / sigma, 9), sigma) if one else (float(len(found)), -1.0)
-        if own not in found:
-            found[own] = []
-            sigmas.append(sigma)
-        found[own].append(cause)
-    return [(tuple(own), sigma) for own, sigma in zip(found.values(), sigmas, strict=True)]
-
-
-def _candidates(ring: Ring, explanation: Explanation, judgement: Judgement) -> Iterator[Candidate]:
-    """Candidates by falling statistic: of the search, then of the scan of its residual, those that
-    a single test finds significant."""
-    candidates: list[Candidate] = [
-        (cause.effect, cause.element, named.detection.statistic)
-        for cause, named in zip(explanation.fit.causes, explanation.named, strict=True)
-        if cause.element is not None
-    ]
-    candidates += [(None, ring.magnets[k].name, d.statistic) for k, d in explanation.kicks.items()]
-    candidates += [
-        (None, ring.monitors[m].name, d.statistic) for m, d in explanation.monitors.items()
-    ]
-    yield from sorted(candidates, key=lambda candidate: -candidate[2])
-    scan, least = explanation.scan, chi2.isf(judgement.false_alarm, 1)
-    for i in np.argsort(-scan.statistic):
-        if scan.statistic[i] < least:
-            break
-        effect, name = scan.hypotheses[int(i)]
-        if name is not None:
-            yield effect, name, float(scan.statistic[i])
+        found.setdefault(own, ([], sigma))[0].append(cause)
+    return [(tuple(own), sigma) for own, sigma in found.values()]

@@ -21,7 +21,6 @@ SCORES = [
     "heldout_rms_coupling", "heldout_rms_roll", "heldout_chi2_per_dof", "dispersion_rms",
 ]  # fmt: skip
 """Columns of a `Step`."""
-_KINDS = {"bpms": ("monitor",), "correctors": ("hcorrector", "vcorrector")}
 
 
 class Tables(Mapping[str, Any]):
@@ -111,9 +110,9 @@ def _errors(diagnosis: Diagnosis) -> Any:
     ])  # fmt: skip
 
 
-def _of_kind(diagnosis: Diagnosis, which: str) -> Any:
-    """All elements of a kind with what was fitted to them."""
-    own = [e for e in diagnosis.ring.elements if e.kind in _KINDS[which]]
+def _of_kinds(diagnosis: Diagnosis, *kinds: str) -> Any:
+    """All elements of some kinds with what was fitted to them."""
+    own = [e for e in diagnosis.ring.elements if e.kind in kinds]
     rejected = {name: plane or "xy" for name, plane in diagnosis.rejected_channels}
     rejected |= dict.fromkeys(diagnosis.bad_monitors, "xy")
     rows = {
@@ -181,8 +180,8 @@ def _covariance(diagnosis: Diagnosis) -> Any:
 _TABLES = {
     "findings": _findings,
     "errors": _errors,
-    "bpms": lambda diagnosis: _of_kind(diagnosis, "bpms"),
-    "correctors": lambda diagnosis: _of_kind(diagnosis, "correctors"),
+    "bpms": lambda diagnosis: _of_kinds(diagnosis, "monitor"),
+    "correctors": lambda diagnosis: _of_kinds(diagnosis, "hcorrector", "vcorrector"),
     "optics": _optics,
     "steps": _steps,
     "families": _families,

@@ -10,12 +10,10 @@ from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Misfit
 from tmlattice.measurement import OrbitResponse
+from tmlattice.measurement.kinds import QUANTITIES
 from tmlattice.observe.data import Data
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.observe.tune_readings import TuneReadings
-
-QUANTITIES = ("tune_x", "tune_y", "chromaticity_x", "chromaticity_y")
-"""Quantities in the order of the columns of `TuneReadings`, named as in the files."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class NumberRead:
 
     Attributes:
         shot: its place among those of the fit.
-        quantity: one of `QUANTITIES`.
+        quantity: as in the files, one of `measurement.kinds.QUANTITIES`.
         read, error: the reading, and its standard error.
         before, after: of the design and of the result.
     """

@@ -204,11 +204,10 @@ class Effect(ABC):
 
     def _allowed(self, ring: Ring) -> frozenset[str | None]:
         """Its places in any case, cached with the ring: there are thousands of errors."""
-        key = ("places", self.name)
-        if key not in ring.memory:
-            ring.memory[key] = frozenset(p and p.casefold() for p in self._named(ring))
-        found: frozenset[str | None] = ring.memory[key]
-        return found
+        return ring.remembered(
+            ("places", self.name),
+            lambda: frozenset(p and p.casefold() for p in self._named(ring)),
+        )
 
 
 class RingEffect(Effect):

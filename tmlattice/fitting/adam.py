@@ -67,16 +67,20 @@ class FitResult(Speaks):
     def _told(self) -> tuple[str, dict[str, str]]:
         largest = sorted(self.changes.items(), key=lambda own: -abs(own[1][0]))[:3]
         changed = (f"{name} {100 * amount:+.3g} %" for name, (amount, _) in largest)
-        tunes = "" if self.tunes is None else " ".join(f"{q:.6f}" for q in self.tunes)
         return str(self.options.get("method", "adam")), {
             "layers": str(len(self.network.layers)),
             "steps": str(len(self.loss)),
             "loss": f"{self.loss[0]:.3g} to {min(self.loss):.3g} m²",
             "chi-square": "" if self.chi2 is None else f"{self.chi2:.3g} a reading",
-            "tunes": tunes,
+            "tunes": tunes_text(self.tunes),
             "changes": ", ".join(changed),
             "seconds": f"{self.seconds:.2f}",
         }
+
+
+def tunes_text(tunes: NDArray[np.float64] | None) -> str:
+    """Return tunes for a line; empty if there are none."""
+    return "" if tunes is None else " ".join(f"{q:.6f}" for q in tunes)
 
 
 def fit_adam(

@@ -144,17 +144,14 @@ def tune_fit(
     start = np.asarray(launch, dtype=float)
     if start.shape != (4,) or not np.isfinite(start).all():
         raise TmlatticeError("a launch has four finite numbers: x, px, y, py in m and rad")
-    recipe: dict[str, Any] = {
-        "epochs": epochs, "learning_rate": learning_rate, "regularization": regularization,
-        "regularization_rate": regularization_rate, "relative_to_design": relative_to_design,
-        "free": free, "clip": clip, "patience": patience,
-    }  # fmt: skip
     name = middle_of_first_arc(ring).name if magnet is None else ring[magnet].name
     machine, true_tunes, change = changed_ring(ring, name, change)
     measurement = first_turn_of(machine, start[None], noise, np.random.default_rng(seed))
     found = tune_fit_measurement(
         ring, measurement, turns, methods=methods, candidates=candidates, progress=progress,
-        **recipe,
+        epochs=epochs, learning_rate=learning_rate, regularization=regularization,
+        regularization_rate=regularization_rate, relative_to_design=relative_to_design,
+        free=free, clip=clip, patience=patience,
     )  # fmt: skip
     return replace(found, magnet=name, change=change, noise=noise, true_tunes=true_tunes, seed=seed)
 

@@ -18,13 +18,13 @@ from tmlattice.fitting.sparse import (
     LARGEST_NUMBER,
     REFINED,
     fit_sparse,
-    sparse_causes,
+    searched,
     warn_of_launches,
 )
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import SymplecticNetwork, TaylorNetwork
-from tmlattice.observe.data import NOISE_FLOOR, first_turn
+from tmlattice.observe.data import NOISE_FLOOR
 
 
 @by_name
@@ -121,13 +121,11 @@ def _options_of(fit: Callable[..., Any], given: dict[str, Any], method: str) -> 
 
 def _check_launches(network: Network, measurement: Measurement, sigma: ArrayLike | None) -> None:
     """Warn of launches that differ from those stated; silent without a ring or a noise."""
-    ring, n = network.ring, network.dimension
+    ring = network.ring
     if ring is None or measurement.noise is None:
         return
-    if not any(e.k1 or e.k2 for e in ring.elements if e.kind in EFFECTS):
-        return
-    data = first_turn(network.monitors, measurement, None, sigma, n)
-    warn_of_launches(sparse_causes(ring, data, dimension=n))
+    if any(e.k1 or e.k2 for e in ring.elements if e.kind in EFFECTS):
+        warn_of_launches(searched(network, measurement, ring, tuple(EFFECTS), None, sigma))
 
 
 def _with_chi2(result: FitResult, measurement: Measurement) -> FitResult:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.fitting.adam import FitResult
+from tmlattice.fitting.adam import FitResult, tunes_text
 from tmlattice.fitting.sparse import MAX_MISFIT
 from tmlattice.late import Method
 from tmlattice.lattice import Ring
@@ -53,9 +53,8 @@ class MethodFit(Speaks):
     problem: str | None = None
 
     def _told(self) -> tuple[str, dict[str, str]]:
-        tunes = "none" if self.tunes is None else " ".join(f"{q:.6f}" for q in self.tunes)
         return self.method, {
-            "tunes": tunes,
+            "tunes": tunes_text(self.tunes) or "none",
             "leaves": f"{1e6 * self.rms:.4g} µm",
             "noise": f"{1e6 * self.noise:.4g} µm",
             "named": ", ".join(self.named),
@@ -99,13 +98,6 @@ class MethodFit(Speaks):
         }
 
 
-def trusted(methods: Sequence[MethodFit]) -> MethodFit | None:
-    """Return the recommended method: one with a residual of noise alone and stated errors, the one
-    of fewest magnets first; None if there is none."""
-    good = [m for m in methods if m.method != "adam" and m.tunes is not None and m.explains]
-    return min(good, key=lambda m: m.method not in SPARSE_METHODS, default=None)
-
-
 def errors(tunes: Array | None, true: Array | None) -> tuple[Array | None, Array | None]:
     """Return errors, absolute (the short way round the circle) and relative, [2] each."""
     if tunes is None or true is None:
@@ -121,18 +113,6 @@ def pair(value: Array | None) -> list[float] | None:
 
 ALIKE = 3.0
 """Joint standard errors within which two methods' tunes are the same."""
-
-
-def advice(methods: Sequence[MethodFit]) -> str:
-    """Return a few sentences: the recommended method, and why the others differ."""
-    best = trusted(methods)
-    sentences = [_recommended(methods, best)]
-    for method in methods:
-        if method.method == "adam":
-            sentences.append(_recipe(method))
-        elif method is not best and best is not None:
-            sentences.append(_compared(method, best))
-    return " ".join(one for one in sentences if one)
 
 
 def _recommended(methods: Sequence[MethodFit], best: MethodFit | None) -> str:
@@ -246,11 +226,9 @@ class TuneFit(Speaks):
     )
 
     def _told(self) -> tuple[str, dict[str, str]]:
-        def both(tunes: Array | None) -> str:
-            return "" if tunes is None else " ".join(f"{q:.6f}" for q in tunes)
-
-        rows = {"design tunes": both(self.design_tunes), "true tunes": both(self.true_tunes)}
-        rows |= {f"tunes of {m.method}": both(m.tunes) or "none" for m in self.methods}
+        rows = {"design tunes": tunes_text(self.design_tunes),
+                "true tunes": tunes_text(self.true_tunes)}  # fmt: skip
+        rows |= {f"tunes of {m.method}": tunes_text(m.tunes) or "none" for m in self.methods}
         rows["trusted"] = "none" if self.trusted is None else self.trusted.method
         what = self.source if self.change is None else f"{self.magnet} {100 * self.change:+g} %"
         return f"of {last_part(self.ring.name)}, {what}", rows
@@ -282,8 +260,11 @@ class TuneFit(Speaks):
 
     @property
     def trusted(self) -> MethodFit | None:
-        """Recommended method; None if none explains the readings."""
-        return trusted(self.methods)
+        """Recommended method: one with a residual of noise alone and stated errors, the one of
+        fewest magnets first; None if none explains the readings."""
+        good = [m for m in self.methods
+                if m.method != "adam" and m.tunes is not None and m.explains]  # fmt: skip
+        return min(good, key=lambda m: m.method not in SPARSE_METHODS, default=None)
 
     @property
     def best(self) -> MethodFit:
@@ -294,8 +275,15 @@ class TuneFit(Speaks):
 
     @property
     def advice(self) -> str:
-        """Recommendation in a few sentences."""
-        return advice(self.methods)
+        """A few sentences: the recommended method, and why the others differ."""
+        best = self.trusted
+        sentences = [_recommended(self.methods, best)]
+        for method in self.methods:
+            if method.method == "adam":
+                sentences.append(_recipe(method))
+            elif method is not best and best is not None:
+                sentences.append(_compared(method, best))
+        return " ".join(one for one in sentences if one)
 
     def as_json(self) -> dict[str, Any]:
         """Return the result in the format `tmlattice-tune-fit`, version 1 (see `schemas/`)."""

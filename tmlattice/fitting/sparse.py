@@ -7,7 +7,7 @@ about as well increase the stated error of the tunes.
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +26,7 @@ from tmlattice.inference.priors import AmountPrior, Student
 from tmlattice.inference.search import Explanation, Search, explain
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
-from tmlattice.network import TaylorNetwork
+from tmlattice.network import SymplecticNetwork, TaylorNetwork
 from tmlattice.observe.data import Data, first_turn
 from tmlattice.observe.first_turns import FirstTurns
 from tmlattice.optics import RingTunes, short_way
@@ -82,10 +82,10 @@ def fit_sparse(
         well, weighted by their evidence; None without a cause.
     """
     begun = time.perf_counter()
-    found = searched(network, measurement, ring, kinds, noise, launch_sigma, {
-        "fault": fault, "largest_number": largest_number, "refined": refined,
-        "candidates": candidates,
-    })  # fmt: skip
+    found = searched(
+        network, measurement, ring, kinds, noise, launch_sigma, fault=fault,
+        largest_number=largest_number, refined=refined, candidates=candidates,
+    )  # fmt: skip
     warn_of_launches(found)
     best = _refined(found)
     turn = RingTunes(first_turns(found).model.assembly)
@@ -121,13 +121,13 @@ def first_turns(found: Explanation) -> FirstTurns:
 
 
 def searched(
-    network: TaylorNetwork,
+    network: TaylorNetwork | SymplecticNetwork,
     measurement: Measurement,
     ring: Ring | None,
     kinds: Sequence[str],
     noise: float | None,
     launch_sigma: ArrayLike | None,
-    options: Mapping[str, Any] = {},
+    **options: Any,
 ) -> Explanation:
     """Return the changed magnets by their evidence, see `fit_sparse` and `sparse_causes`;
     TmlatticeError: no ring to change."""

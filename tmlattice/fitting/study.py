@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from tmlattice.arrays import Array
-from tmlattice.batch import MADE_BY, fingerprint, run_batch
+from tmlattice.arrays import Array, pair, rms
+from tmlattice.batch import fingerprint, run_batch
+from tmlattice.diagnosis.records import decoded
 from tmlattice.errors import TmlatticeError, UnstableRingError
 from tmlattice.files import output_file, write_json
 from tmlattice.fitting.experiment import (
@@ -132,7 +133,7 @@ def run_case(
         true = matrix_tunes(ring_matrix(machine))
     except UnstableRingError:
         return dataclasses.replace(empty, problem=UNSTABLE)
-    design = _network_of(ring)
+    design = ring.remembered(NETWORK, lambda: TaylorNetwork.from_ring(ring))
     optics = one_turn_optics(design)
     start = np.asarray(launch, dtype=float)
     phases = np.pi * np.arange(shots)[:, None] / shots * np.ones(2)
@@ -140,7 +141,7 @@ def run_case(
     # independent noise for each magnet, so that the cases are independent
     generator = np.random.default_rng([seed, zlib.crc32(empty.magnet.encode())])
     measurement = first_turn_of(machine, launches, noise, generator)
-    known = dataclasses.replace(empty, true_tunes=_pair(true))
+    known = dataclasses.replace(empty, true_tunes=pair(true))
     kind, _, regularization = method.partition("-")
     options: dict[str, Any] = {"candidates": [magnet]} if kind == "known" else {}
     if kind == "adam":
@@ -159,32 +160,20 @@ def run_case(
         [seed, 1]).random((4, 2)))  # fmt: skip
     try:
         miss = TaylorNetwork.from_ring(machine).readings(new) - fit.network.readings(new)
-        prediction = float(np.sqrt(np.mean(miss**2)))
+        prediction = rms(miss)
     except TmlatticeError:
         prediction = None  # lost at five times the amplitude in one of them
-    left = measurement.readings[:, 0] - design.readings(launches)
-    before = float(np.sqrt(np.mean(left**2)))
+    before = rms(measurement.readings[:, 0] - design.readings(launches))
     return dataclasses.replace(
         known,
-        absolute_error=_pair(absolute),
-        relative_error=_pair(relative),
-        tune_sigma=None if fit.tune_sigma is None else _pair(fit.tune_sigma),
+        absolute_error=pair(absolute),
+        relative_error=pair(relative),
+        tune_sigma=None if fit.tune_sigma is None else pair(fit.tune_sigma),
         orbit_rms=(before, found.rms),
         prediction_rms=prediction,
         found=tuple(fit.changes) if method in ("sparse", "known") else None,
         seconds=fit.seconds,
     )
-
-
-def _pair(values: Array) -> Pair:
-    return float(values[0]), float(values[1])
-
-
-def _network_of(ring: Ring) -> TaylorNetwork:
-    if NETWORK not in ring.memory:
-        ring.memory[NETWORK] = TaylorNetwork.from_ring(ring)
-    network: TaylorNetwork = ring.memory[NETWORK]
-    return network
 
 
 @cache
@@ -233,10 +222,8 @@ def _open_folder(folder: Path, identity: dict[str, Any]) -> None:
 def _case(job: tuple[str, str], values: dict[str, Any]) -> Case:
     if "error" in values:  # the code, or the worker, failed
         return Case(job[0], float("nan"), job[1], 0, problem=values["error"])
-    plain: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != MADE_BY
-    }
-    return Case(**plain)
+    case: Case = decoded(Case, values)
+    return case
 
 
 def study_tune_fit(

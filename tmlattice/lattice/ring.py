@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -300,6 +300,13 @@ class Ring(Speaks):
     def memory(self) -> dict[Any, Any]:
         """What was worked out for this ring and is worth keeping as long as it lives: its maps."""
         return {}
+
+    def remembered(self, key: Hashable, make: Callable[[], Made]) -> Made:
+        """What `make` returns, worked out once for this ring."""
+        if key not in self.memory:
+            self.memory[key] = make()
+        found: Made = self.memory[key]
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Only the fields travel: what is worked out from them can be worked out again."""

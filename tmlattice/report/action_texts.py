@@ -110,10 +110,11 @@ def consequence_text(finding: Finding) -> str:
         return ""
     effect, consequences = find(finding.effect), finding.consequences
     if consequences is None:
-        if effect.natural or not isinstance(effect, RingEffect):
-            nothing = "no effect on the stored beam"
+        if effect.natural:
+            return ""
+        if not isinstance(effect, RingEffect):
             reads = "; its readings are wrong" if isinstance(effect, ReadingEffect) else ""
-            return "" if effect.natural else nothing + reads
+            return f"no effect on the stored beam{reads}"
         return "none while it is set to zero" if effect.acts_on_settings else ""
     found, corrected = _beam_text(consequences.found, consequences), _after_text(consequences)
     return f"estimated: {found}\nafter the correction: {corrected}"
@@ -157,40 +158,33 @@ def _pair(values: tuple[float, float], factor: float, digits: int) -> str:
 # --- the next measurement -------------------------------------------------------------------------
 def next_text(diagnosis: Diagnosis) -> str:
     """The recommended next measurement; empty where none was proposed."""
-    shot = diagnosis.next
-    if shot is None:
+    proposed = diagnosis.next
+    if proposed is None:
         return ""
-    changes = [
-        _setting_text(element, name, value)
-        for element, setting in shot.settings.items()
-        for name, value in setting.items()
-    ]
-    first, second = shot.parts
-    launch = shot.launch
+    launch, separation = proposed.launch, proposed.separation
     if launch is None:
-        return (
-            f"{KINDS[shot.kind].words} ({shot.minutes:.2g} minutes) would separate '{first}' from "
-            f"'{second}' by {shot.separation:.1f} standard deviations"
-            + _enough(shot.separation, "of them")
+        what = f"{KINDS[proposed.kind].words} ({proposed.minutes:.2g} minutes)"
+        again = "of them"
+    else:
+        changes = [
+            _setting_text(element, name, value)
+            for element, setting in proposed.settings.items()
+            for name, value in setting.items()
+        ]
+        how = f"with {' and '.join(changes)}, " if changes else ""
+        where = (
+            f"x = {1e3 * launch['x']:.2f} mm, px = {1e3 * launch['px']:.3f} mrad, "
+            f"y = {1e3 * launch['y']:.2f} mm, py = {1e3 * launch['py']:.3f} mrad"
         )
-    where = (
-        f"x = {1e3 * launch['x']:.2f} mm, px = {1e3 * launch['px']:.3f} mrad, "
-        f"y = {1e3 * launch['y']:.2f} mm, py = {1e3 * launch['py']:.3f} mrad"
-    )
-    if launch["delta"]:
-        where += f", energy {100 * launch['delta']:+.2f} %"
-    how = f"with {' and '.join(changes)}, " if changes else ""
+        if launch["delta"]:
+            where += f", energy {100 * launch['delta']:+.2f} %"
+        what, again = f"One more shot, {how}launched at {where},", "such shots"
+    first, second = proposed.parts
+    number = f"; {int(np.ceil((5 / separation) ** 2))} {again} reach 5" if separation < 5 else ""
     return (
-        f"One more shot, {how}launched at {where}, would separate '{first}' from '{second}' by "
-        f"{shot.separation:.1f} standard deviations" + _enough(shot.separation)
+        f"{what} would separate '{first}' from '{second}' by {separation:.1f} standard "
+        f"deviations{number}."
     )
-
-
-def _enough(separation: float, what: str = "such shots") -> str:
-    """The number of such measurements that reach 5 standard deviations."""
-    if separation >= 5:
-        return "."
-    return f"; {int(np.ceil((5 / separation) ** 2))} {what} reach 5."
 
 
 def _setting_text(element: str, name: str, value: float) -> str:

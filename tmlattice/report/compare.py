@@ -5,7 +5,7 @@
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.arrays import rms
 from tmlattice.beam.chain import Chain
 from tmlattice.diagnosis.load import DOCUMENT, FORMAT, load
 from tmlattice.diagnosis.result import Diagnosis
@@ -159,10 +160,10 @@ def compare(first: Any, second: Any) -> Differences:
     kinds = [_kind(name, own) for name, own in zip(names, (one, other), strict=True)]
     if kinds[0] != kinds[1]:
         raise MeasurementError(
-            f"'{names[0]}' is {_WORDS[kinds[0]]} and '{names[1]}' is {_WORDS[kinds[1]]}: compare "
-            "two of one kind"
+            f"'{names[0]}' is {_KINDS[kinds[0]][1]} and '{names[1]}' is {_KINDS[kinds[1]][1]}: "
+            "compare two of one kind"
         )
-    rows, notes = _COMPARED[kinds[0]](one, other)
+    rows, notes = _KINDS[kinds[0]][2](one, other)
     order = sorted(rows, key=lambda row: -abs(row.pull) if math.isfinite(row.pull) else 1.0)
     return Differences(kinds[0], (names[0], names[1]), tuple(order), tuple(notes))
 
@@ -189,15 +190,8 @@ def _name(given: Any, own: Any) -> str:
     return str(getattr(own, "name", type(own).__name__))
 
 
-_WORDS = {
-    "diagnoses": "a diagnosis",
-    "lattices": "a lattice",
-    "orbit responses": "an orbit response",
-}
-
-
 def _kind(name: str, own: Any) -> str:
-    for kind, cls in zip(_WORDS, (Diagnosis, Ring, OrbitResponse), strict=True):
+    for kind, (cls, _, _) in _KINDS.items():
         if isinstance(own, cls):
             return kind
     raise MeasurementError(
@@ -280,31 +274,21 @@ def _of_rings(one: Ring, other: Ring) -> Iterator[Difference]:
             yield _row(name, None, a, b, unit, math.nan)
     if len(betas) == 2 and betas[0].shape == betas[1].shape:
         beat = np.sqrt(np.mean((betas[1] / betas[0] - 1) ** 2, axis=0))
-        for plane, rms in zip("xy", beat.tolist(), strict=True):
-            if rms > ROUNDING:
-                yield Difference(f"beta beating {plane}, rms", None, 0.0, rms, rms, math.nan,
-                                 "relative")  # fmt: skip
+        for plane, size in zip("xy", beat.tolist(), strict=True):
+            if size > ROUNDING:
+                yield _row(f"beta beating {plane}, rms", None, 0.0, size, "relative", math.nan)
 
 
 # --- orbit responses ------------------------------------------------------------------------------
 def _responses(one: OrbitResponse, other: OrbitResponse) -> Found:
-    """Each corrector's orbits per kick, at the first one's kick."""
+    """Each corrector's orbits per kick, and the RF's per step, at the first one's."""
     monitors = [name for name in one.monitors if name in set(other.monitors)]
     if not monitors:
         raise MeasurementError("the two orbit responses have no BPM in common; check the names")
-    first, second = (own.select(monitors=monitors) for own in (one, other))
-    place = {name: i for i, name in enumerate(second.correctors)}
-    rows: list[Difference] = []
-    for i, name in enumerate(first.correctors):
-        if name in place:
-            j = place[name]
-            kicks = float(first.kicks[i]), float(second.kicks[j])
-            rows += _of_orbits(name, first, second, (first.response[i], second.response[j]), kicks)
-    if first.rf is not None and second.rf is not None:
-        orbits = (first.rf.orbit, second.rf.orbit)
-        if orbits[0] is not None and orbits[1] is not None:
-            steps = first.rf.step, second.rf.step
-            rows += _of_orbits("rf", first, second, (orbits[0], orbits[1]), steps)
+    here, there = (_columns(own.select(monitors=monitors)) for own in (one, other))
+    rows = [
+        row for name in here if name in there for row in _of_orbits(name, here[name], there[name])
+    ]
     notes = []
     for which, own, other_names in (
         ("first", one.correctors, set(other.correctors)),
@@ -316,25 +300,28 @@ def _responses(one: OrbitResponse, other: OrbitResponse) -> Found:
     return rows, notes
 
 
-def _of_orbits(
-    name: str,
-    first: OrbitResponse,
-    second: OrbitResponse,
-    orbits: tuple[np.ndarray, np.ndarray],
-    kicks: Sequence[float],
-) -> Iterator[Difference]:
-    a, b = orbits[0], orbits[1] * kicks[0] / kicks[1]
+Column = tuple[np.ndarray, np.ndarray, float]
+"""Orbit and variance of its readings, [monitor, 2], and kick, or step of the RF."""
+
+
+def _columns(own: OrbitResponse) -> dict[str, Column]:
+    """The columns of a response by the corrector; `rf`: that of the RF."""
+    variance = np.full(own.response.shape[1:], np.nan) if own.noise is None else own.noise**2
+    columns = zip(own.correctors, own.response, own.kicks.tolist(), strict=True)
+    found: dict[str, Column] = {name: (orbit, variance, kick) for name, orbit, kick in columns}
+    if own.rf is not None and own.rf.orbit is not None:
+        found["rf"] = (own.rf.orbit, variance, own.rf.step)
+    return found
+
+
+def _of_orbits(name: str, first: Column, second: Column) -> Iterator[Difference]:
+    (a, own, kick), (b, more, other_kick) = first, second
+    b = b * kick / other_kick
     read = np.isfinite(a) & np.isfinite(b)
     if not read.any():
         return
-    own = np.full(a.shape, np.nan) if first.noise is None else first.noise**2
-    more = np.full(a.shape, np.nan) if second.noise is None else second.noise**2
     a, b, own = a[read], b[read], own[read]
-    variance = own + more[read] * (kicks[0] / kicks[1]) ** 2
-
-    def rms(values: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(values**2)))
-
+    variance = own + more[read] * (kick / other_kick) ** 2
     expected = float(np.sqrt(np.mean(variance)))
     yield Difference(ORBIT, name, rms(a), rms(b), rms(b - a), expected, "m")
     square = float(a @ a) - float(np.nansum(own))  # without what the noise adds to it
@@ -344,8 +331,9 @@ def _of_orbits(
         yield _row("response per kick, relative", name, 1.0, scale, "relative", sigma)
 
 
-_COMPARED: dict[str, Callable[[Any, Any], Found]] = {
-    "diagnoses": _diagnoses,
-    "lattices": _lattices,
-    "orbit responses": _responses,
+_KINDS: dict[str, tuple[type, str, Callable[[Any, Any], Found]]] = {
+    "diagnoses": (Diagnosis, "a diagnosis", _diagnoses),
+    "lattices": (Ring, "a lattice", _lattices),
+    "orbit responses": (OrbitResponse, "an orbit response", _responses),
 }
+"""Class, words and comparison of what can be compared."""

@@ -25,7 +25,7 @@ from tmlattice.report.text import (
     small_rows,
     suspect_rows,
     title,
-    tune_texts,
+    tune_row,
     verdict_sentence,
     wrapped,
 )
@@ -116,9 +116,7 @@ def _parts(diagnosis: Diagnosis, width: int) -> Iterator[_Part]:
 
 
 def _gap_table(diagnosis: Diagnosis, width: int) -> list[str]:
-    before, after = tune_texts(diagnosis)
-    name = "tunes without orbit errors" if diagnosis.by_families else "fractional tunes Qx, Qy"
-    rows = [*gap_rows(diagnosis), (name, before, after)]
+    rows = [*gap_rows(diagnosis), tune_row(diagnosis)]
     noise = noise_text(diagnosis)
     lines = columns([*rows, ("noise of a reading", noise, "")] if noise else rows, width)
     numbers = number_rows(diagnosis)

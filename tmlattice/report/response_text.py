@@ -4,12 +4,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from tmlattice.arrays import rms
 from tmlattice.diagnosis.response.common_factors import Reason
 from tmlattice.diagnosis.response.validation import Step
 from tmlattice.diagnosis.result import Diagnosis
-from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import numbers
-from tmlattice.effects import Cause, with_labels
+from tmlattice.effects import with_labels
 from tmlattice.report.amounts import all_of, amount_text, degenerate_text, labelled, words
 from tmlattice.report.text import columns, wrapped
 from tmlattice.speaks import listed
@@ -89,61 +89,36 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
     return [HYPOTHESIS, *rows]
 
 
-def largest(result: Diagnosis, effect: str) -> list[str]:
-    """The largest errors of an effect that the data determine, with posterior rms and the share
-    that comes from the data."""
-    supports = _supports_of(result, effect)
-    rows = [row for row in _numbers_of(result, effect) if supports[row[0][0].element].determined]
-    rows = sorted(rows, key=lambda row: -abs(row[0][0].amount))
-    return [
-        f"{all_of([place.element for place in places], result.devices)} "
-        f"{amount_text(effect, places[0].amount, sigma)} "
-        f"({100 * supports[places[0].element].share_from_data:.0f} %)"
-        for places, sigma in rows[:SHOWN]
-    ]
-
-
-def undetermined(result: Diagnosis, effect: str) -> str:
-    """Amounts of an effect that the data do not determine, with what they are degenerate with;
-    empty if there are none."""
-    supports = _supports_of(result, effect)
-    by_reason: dict[str, list[str]] = {}
-    for places, _ in _numbers_of(result, effect):
-        if not (own := supports[places[0].element]).determined:
-            name = all_of([place.element for place in places], result.devices)
-            by_reason.setdefault(degenerate_text(effect, own), []).append(name)
-    said = [f"{listed(names, SHOWN)} ({reason})" for reason, names in by_reason.items()]
-    return f"{NOT_DETERMINED}: {listed(said, SHOWN, '; ')}" if said else ""
-
-
-NOT_DETERMINED = "not determined by the data"
-
-
-def _supports_of(result: Diagnosis, effect: str) -> dict[str | None, Support]:
-    """Support by element."""
-    return {c.element: support for c, _, support in result.supported if c.effect == effect}
-
-
-def _numbers_of(result: Diagnosis, effect: str) -> list[tuple[tuple[Cause, ...], float]]:
-    told = zip(result.causes, result.errors, strict=True)
-    return numbers((cause, sigma) for cause, sigma in told if cause.effect == effect)
-
-
 def error_rows(result: Diagnosis) -> list[tuple[str, str]]:
     """By effect: the number of amounts, the rms and the largest of those that the data determine,
-    and those that are not determined."""
+    with the share that comes from the data, and those that are not determined, with what they are
+    degenerate with."""
     rows = []
     for effect in dict.fromkeys(cause.effect for cause in result.causes):
-        supports = _supports_of(result, effect)
-        found = [places[0] for places, _ in _numbers_of(result, effect)]
-        amounts = [own.amount for own in found if supports[own.element].determined]
-        said = f"{words(effect)}: {len(found)}"
-        if amounts:
-            rms = amount_text(effect, float(np.sqrt(np.mean(np.square(amounts)))))
-            said += f", {len(amounts)} determined by the data, rms {rms}; "
+        own = [row for row in result.supported if row[0].effect == effect]
+        supports = {cause.element: support for cause, _, support in own}
+        known: list[tuple[float, str]] = []
+        unknown: dict[str, list[str]] = {}
+        found = numbers((cause, sigma) for cause, sigma, _ in own)
+        for places, sigma in found:
+            amount, support = places[0].amount, supports[places[0].element]
+            name = all_of([place.element for place in places], result.devices)
+            if support.determined:
+                share = f"{100 * support.share_from_data:.0f} %"
+                known.append((amount, f"{name} {amount_text(effect, amount, sigma)} ({share})"))
+            else:
+                unknown.setdefault(degenerate_text(effect, support), []).append(name)
+        said, parts = f"{words(effect)}: {len(found)}", []
+        if known:
+            typical = amount_text(effect, rms([amount for amount, _ in known]))
+            said += f", {len(known)} determined by the data, rms {typical}; "
             said += "largest (share from the data):"
-        parts = ["; ".join(largest(result, effect)), undetermined(result, effect)]
-        rows.append((said, ". ".join(part for part in parts if part)))
+            known.sort(key=lambda row: -abs(row[0]))
+            parts.append("; ".join(text for _, text in known[:SHOWN]))
+        if unknown:
+            texts = [f"{listed(names, SHOWN)} ({why})" for why, names in unknown.items()]
+            parts.append(f"not determined by the data: {listed(texts, SHOWN, '; ')}")
+        rows.append((said, ". ".join(parts)))
     return rows
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tmlattice.arrays import rms
 from tmlattice.diagnosis.consequences import Beam, beam_with
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.support import FREE, Support
@@ -62,8 +63,8 @@ def _table(diagnosis: Diagnosis, title: str, supported: Sequence[Supported]) -> 
     known = {(c.element or "", c.effect): (c.amount, sigma, own) for c, sigma, own in supported}
     units = {}
     for effect in effects:
-        rms = np.sqrt(np.mean([c.amount**2 for c, *_ in supported if c.effect == effect]))
-        units[effect] = scaled(effect, float(rms))
+        typical = rms([c.amount for c, *_ in supported if c.effect == effect])
+        units[effect] = scaled(effect, typical)
     names = list(dict.fromkeys(cause.element or "" for cause, *_ in supported))
 
     def clearest(name: str) -> float:

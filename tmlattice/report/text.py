@@ -1,7 +1,4 @@
-"""Sentences and rows of a report, for the terminal (`plain.report_text`) and the HTML page.
-
-The same sentences and rows are in the terminal (`plain.report_text`) and in the HTML page.
-"""
+"""Sentences and rows of a report, for the terminal (`plain.report_text`) and the HTML page."""
 
 import re
 import textwrap
@@ -320,13 +317,14 @@ def noise_text(diagnosis: Diagnosis) -> str:
     return f"{x} in x, {y} in y" + (" (estimated)" if diagnosis.noise_estimated else "")
 
 
-def tune_texts(diagnosis: Diagnosis) -> tuple[str, str]:
-    """Fractions of Qx, Qy before and after."""
+def tune_row(diagnosis: Diagnosis) -> tuple[str, str, str]:
+    """Row of the fractions of Qx, Qy: (name, before, after)."""
+    name = "tunes without orbit errors" if diagnosis.by_families else "fractional tunes Qx, Qy"
     before, after = (
         "unstable" if q is None else f"{q[0]:.4f}, {q[1]:.4f}"
         for q in (diagnosis.tunes["before"], diagnosis.tunes["after"])
     )
-    return before, after
+    return name, before, after
 
 
 def sensitivity_rows(

@@ -12,11 +12,11 @@ patterns: the combinations of usual errors of bends and quadrupoles that focus m
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import (
     dispersion_behind,
@@ -77,11 +77,9 @@ class _Kicks(Family):
         names = tuple(data.measured.correctors)
         planes = data.plane.tobytes()
         key = (self.name, data.at.tobytes(), float(data.kicks[-1]), read, names, planes)
-        memory = data.ring.memory
-        if key not in memory:
-            memory[key] = patterns_of_kicks(Predicted(data, Errors.none(data)), self.plane)
-        found: Patterns = memory[key]
-        return found
+        return data.ring.remembered(
+            key, lambda: patterns_of_kicks(Predicted(data, Errors.none(data)), self.plane)
+        )
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
@@ -119,14 +117,8 @@ class _Kicks(Family):
             at_correctors=errors.at_correctors + values @ patterns.at_correctors,
         )
 
-    def causes_of(
-        self, errors: Errors, values: Array, sigma: Array, data: ResponseData
-    ) -> list[StatedCause]:
-        """No causes: single kicks are degenerate."""
-        return []
-
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
-        """No effect of the catalogue."""
+        """No causes: single kicks are degenerate."""
         return [{} for _ in range(self.size(data))]
 
 
@@ -146,6 +138,17 @@ class VerticalKicks(_Kicks):
     title = "kicks in the vertical dispersion"
 
 
+AnyFamily = TypeVar("AnyFamily", bound=Family)
+
+
+def _fitted(values: Mapping[str, Array], *families: AnyFamily) -> Iterator[tuple[AnyFamily, Array]]:
+    """Yield the families with fitted numbers that are not all zero, and these."""
+    for family in families:
+        own = values.get(family.variable, np.zeros(0))
+        if own.any():
+            yield family, own
+
+
 def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iterator[str]:
     """Yield a message for each plane in which kicks contribute to the RF's orbit.
 
@@ -153,24 +156,17 @@ def dispersion_by_kicks(values: Mapping[str, Array], data: ResponseData) -> Iter
         values: fitted, by variable.
         data: the response.
     """
-    for family in (HorizontalKicks(), VerticalKicks()):
-        own = values.get(family.variable, np.zeros(0))
-        if own.any():
-            size = _rms(own, family.patterns(data).rf)
-            yield (
-                f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from a "
-                f"{FIELDS[family.plane]} but from kicks of the closed orbit (errors of bends, "
-                "quadrupole offsets, correctors), which the data do not separate"
-            )
+    for family, own in _fitted(values, HorizontalKicks(), VerticalKicks()):
+        size = rms(own @ family.patterns(data).rf)
+        yield (
+            f"{1e6 * size:.2g} µm rms of the RF's orbit in {'xy'[family.plane]} are not from a "
+            f"{FIELDS[family.plane]} but from kicks of the closed orbit (errors of bends, "
+            "quadrupole offsets, correctors), which the data do not separate"
+        )
 
 
 FIELDS = ("gradient", "skew gradient")
 """Field by which a closed orbit acts, by plane."""
-
-
-def _rms(values: Array, patterns: Array) -> float:
-    """Rms of a sum of patterns."""
-    return float(np.sqrt(np.mean((values @ patterns) ** 2)))
 
 
 def fitted_orbit_kicks(at: Predicted) -> Array | None:
@@ -197,11 +193,7 @@ def dispersion_beside(
         values: fitted, by variable.
         data: the response.
     """
-    found = [
-        (family, values[family.variable])
-        for family in (HorizontalKicks(), VerticalKicks())
-        if values.get(family.variable, np.zeros(0)).any()
-    ]
+    found = [*_fitted(values, HorizontalKicks(), VerticalKicks())]
     if not found:
         return {}
     model = data.design
@@ -265,11 +257,9 @@ class OrbitFamily(RingFamily):
 
     def patterns(self, data: ResponseData) -> OrbitPatterns:
         """The patterns in the design."""
-        memory = data.ring.memory
-        if self.name not in memory:
-            memory[self.name] = orbit_patterns(data.design, self.plane, self.effects)
-        found: OrbitPatterns = memory[self.name]
-        return found
+        return data.ring.remembered(
+            self.name, lambda: orbit_patterns(data.design, self.plane, self.effects)
+        )
 
     def size(self, data: ResponseData) -> int:
         """Number of patterns."""
@@ -323,9 +313,8 @@ def orbits_in_sextupoles(values: Mapping[str, Array], data: ResponseData) -> Ite
         data: the response.
     """
     sizes = [
-        f"{1e3 * _rms(own, family.patterns(data).orbits):.2g} mm in {'xy'[family.plane]}"
-        for family in (HorizontalOrbit(), VerticalOrbit())
-        if (own := values.get(family.variable, np.zeros(0))).any()
+        f"{1e3 * rms(own @ family.patterns(data).orbits):.2g} mm in {'xy'[family.plane]}"
+        for family, own in _fitted(values, HorizontalOrbit(), VerticalOrbit())
     ]
     if sizes:
         yield (

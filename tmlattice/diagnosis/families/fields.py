@@ -4,8 +4,9 @@ All pieces of a magnet share one number.
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,8 +30,6 @@ FURTHEST = 0.05
 
 
 class _Magnets(RingFamily):
-    effect: ClassVar[str]
-
     @abstractmethod
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The pieces of each magnet, and the share of each piece in the magnet's number."""
@@ -41,21 +40,27 @@ class _Magnets(RingFamily):
 
     def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
         """The cause of every piece; the same in each round."""
-        memory, key = data.ring.memory, ("moves", type(self), data.measured.correctors)
-        if key not in memory:
-            memory[key] = [
-                {(self.effect, place): share for place, share in pieces.items()}
+        return data.ring.remembered(
+            ("moves", type(self), data.measured.correctors),
+            lambda: [
+                {(self.effects[0], place): share for place, share in pieces.items()}
                 for pieces in self.shares(data)
-            ]
-        known: list[dict[Hypothesis, float]] = memory[key]
-        return known
+            ],
+        )
+
+
+def _by_type(each: Iterable[dict[str, float]]) -> list[dict[str, float]]:
+    """The pieces of each type of magnet, from those of each magnet."""
+    types: dict[str, dict[str, float]] = {}
+    for pieces in each:
+        types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
+    return list(types.values())
 
 
 class QuadrupoleGradient(_Magnets):
     """Gradients of single quadrupoles, relative to the design's."""
 
-    name = effect = "quadrupole_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("quadrupole_gradient",)
+    name, effects = "quadrupole_gradient", ("quadrupole_gradient",)
     block, variable, trust = 0, "gradient", 0.01
     rms, tails, most = 3e-3, TAILS, LARGEST_GRADIENT
 
@@ -71,8 +76,11 @@ class QuadrupoleGradient(_Magnets):
 class FamilyGradient(QuadrupoleGradient):
     """The common error of a family's quadrupoles, by their supply."""
 
-    name = "family_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("family_gradient",)
+    name, effects = "family_gradient", ("family_gradient",)
+
+    def moves(self, data: ResponseData) -> list[dict[Hypothesis, float]]:
+        """The gradients of single quadrupoles, whose numbers it shares."""
+        return QuadrupoleGradient().moves(data)
 
     def count(self, data: ResponseData) -> int:
         """Number of families."""
@@ -86,8 +94,10 @@ class FamilyGradient(QuadrupoleGradient):
 class _Thin(_Magnets):
     """Integrated fields; each piece has its share of the magnet's length."""
 
+    kinds: ClassVar[tuple[str, ...]]
+
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("quadrupole",))
+        return magnets(ring, self.kinds)
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         out = []
@@ -100,28 +110,22 @@ class _Thin(_Magnets):
 class BendGradient(_Magnets):
     """Gradients of combined-function bends, relative to the design's: one number per type."""
 
-    name = effect = "bend_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("bend_gradient",)
+    name, effects = "bend_gradient", ("bend_gradient",)
     block, variable, trust = 0, "bend_gradient", 0.01
     rms = 3e-3
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The bends of each type: single ones are degenerate with neighbouring quadrupoles."""
-        types: dict[str, dict[str, float]] = {}
-        for own in magnets(data.ring, ("bend",), powered=True):
-            types.setdefault(stem(own[0].name), {}).update({e.name: e.k1 for e in own})
-        return list(types.values())
+        bends = magnets(data.ring, ("bend",), powered=True)
+        return _by_type({e.name: e.k1 for e in own} for own in bends)
 
 
 class SkewGradient(_Thin):
     """Skew gradients of rolled quadrupoles, and of sextupoles: by windings, or a vertical orbit."""
 
-    name = effect = "skew_gradient"
-    effects: ClassVar[tuple[str, ...]] = ("skew_gradient",)
+    name, effects = "skew_gradient", ("skew_gradient",)
     block, variable, trust = 1, "skew", 1e-3  # 1/m: larger steps move the tunes
-
-    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("quadrupole", "sextupole"))
+    kinds = ("quadrupole", "sextupole")
 
     def groups(self, data: ResponseData) -> list[Group]:
         """The priors of quadrupoles and sextupoles, each with its scale."""
@@ -136,27 +140,23 @@ class SkewGradient(_Thin):
 class OtherGradient(_Thin):
     """Gradients outside quadrupoles: by the orbit in sextupoles, and of wigglers."""
 
-    name = effect = "gradient_absolute"
-    effects: ClassVar[tuple[str, ...]] = ("gradient_absolute",)
+    name, effects = "gradient_absolute", ("gradient_absolute",)
     block, variable, trust = 0, "other", 3e-3
     rms, tails = 1e-4, TAILS
-
-    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("sextupole", "wiggler"))
+    kinds = ("sextupole", "wiggler")
 
 
 class VerticalFocusing(_Thin):
     """Gradients of insertion devices, in wigglers and in straights."""
 
-    name = effect = "vertical_focusing"
-    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    name, effects = "vertical_focusing", ("vertical_focusing",)
     block, variable, trust = 0, "device", 3e-3
     rms, tails = 1e-4, 1.0
 
     @property
     def title(self) -> str:
         """The name of its effect, and where: `EdgeFocusing` has the same effect."""
-        return f"{self.effect} in straights"
+        return f"{self.name} in straights"
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
         return self._devices(ring, straights(ring))
@@ -176,7 +176,7 @@ class FocusingChange(VerticalFocusing):
     include straights next to wigglers of bends, whose focusing has no other number."""
 
     def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return self._devices(ring, straights(ring, beside=True))
+        return self._devices(ring, straights(ring, next_to_wigglers=True))
 
     def lowest(self, data: ResponseData) -> Array | float:
         """No bounds."""
@@ -190,19 +190,13 @@ class EdgeFocusing(_Thin):
     not at all. Errors are hardly larger than that, and negligible for small angles.
     """
 
-    name, effect = "edge_focusing", "vertical_focusing"
-    effects: ClassVar[tuple[str, ...]] = ("vertical_focusing",)
+    name, effects = "edge_focusing", ("vertical_focusing",)
     block, variable, trust, single = 0, "edge", 3e-3, False
-
-    def _places(self, ring: Ring) -> list[tuple[Element, ...]]:
-        return magnets(ring, ("bend",))
+    kinds = ("bend",)
 
     def shares(self, data: ResponseData) -> list[dict[str, float]]:
         """The bends of each type: single ones have no edge errors of their own."""
-        types: dict[str, dict[str, float]] = {}
-        for pieces in super().shares(data):
-            types.setdefault(stem(next(iter(pieces))), {}).update(pieces)
-        return list(types.values())
+        return _by_type(super().shares(data))
 
     def groups(self, data: ResponseData) -> list[Group]:
         """The prior of types, relative to a rectangular magnet's edges."""
@@ -224,8 +218,7 @@ class CorrectorPosition(_Magnets):
     A single corrector there has no number, because no other one could confirm it.
     """
 
-    name = effect = "corrector_position"
-    effects: ClassVar[tuple[str, ...]] = ("corrector_position",)
+    name, effects = "corrector_position", ("corrector_position",)
     block, variable, trust = 0, "position", 0.02
     rms, most = 5e-3, FURTHEST
 
@@ -264,7 +257,7 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
         correctors: names.
         planes: "x" or "y", of each.
     """
-    others = [e for e in ring.magnets if e.kind not in ("hcorrector", "vcorrector")]
+    others = [e for e in ring.elements if _parts(e)]
     places = np.array([e.s for e in others])
     behind = np.searchsorted(places, [ring[name].s for name in correctors]) % len(others)
     return [
@@ -273,7 +266,7 @@ def between(ring: Ring, correctors: Sequence[str], planes: Sequence[str]) -> lis
     ]
 
 
-def straights(ring: Ring, beside: bool = False) -> list[Element]:
+def straights(ring: Ring, next_to_wigglers: bool = False) -> list[Element]:
     """Return the marker nearest to the middle of each long straight, else its longest drift.
 
     A straight next to a wiggler of alternating bends has none, because its focusing is degenerate
@@ -281,30 +274,30 @@ def straights(ring: Ring, beside: bool = False) -> list[Element]:
 
     Args:
         ring: the ring.
-        `beside`: whether straights next to such a wiggler are included.
+        next_to_wigglers: whether straights next to such a wiggler are included.
     """
-    found, ways = list[Element](), list[Element]()
-    within, bends = list[_Placed](), list[float]()
-    begin = np.inf  # the first straight ends at the first magnet of the turn
-    for element, s in _around(ring):
-        if not _parts(element):
-            within.append(_Placed(element, s))
+    own = ring.elements
+    parting = [i for i, e in enumerate(own) if _parts(e)]
+    if not parting:
+        return []
+    # one turn from a magnet to itself: from no bend if possible, so that no wiggler is split
+    first = min(parting, key=lambda i: own[i].kind == "bend")
+    turn = [(e, e.s) for e in own[first:]] + [(e, e.s + ring.length) for e in own[: first + 1]]
+    found, ways, bends = list[Element](), list[Element](), list[float]()
+    at = [i for i, (element, _) in enumerate(turn) if _parts(element)]
+    for i, j in pairwise(at):
+        (before, start), (behind, end) = turn[i], turn[j]
+        start, end = start + before.length / 2, end - behind.length / 2
+        if end - start > STRAIGHT:
+            ways += _middle(turn[i + 1 : j], (start + end) / 2)
+        if before.kind == "bend":
+            bends.append(before.angle)
+        if behind.kind == "bend" and j != at[-1]:
             continue
-        end = s - element.length / 2
-        if end - begin > STRAIGHT:
-            ways += _middle(within, (begin + end) / 2)
-        within, begin = [], s + element.length / 2
-        if element.kind == "bend":
-            bends.append(element.angle)
-            continue
-        found += ways if beside else _outside(ways, bends)
+        if next_to_wigglers or not (bends and min(bends) < 0 < max(bends)):
+            found += ways
         ways, bends = [], []
-    return found + (ways if beside else _outside(ways, bends))
-
-
-class _Placed(NamedTuple):
-    element: Element
-    s: float  # m, one turn further behind the lattice's first element
+    return found
 
 
 def _parts(element: Element) -> bool:
@@ -312,34 +305,10 @@ def _parts(element: Element) -> bool:
     return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
 
 
-def _around(ring: Ring) -> list[_Placed]:
-    """One turn from a magnet to itself, both included; it starts at no bend if possible, so that a
-    wiggler of alternating bends is not split."""
-    own = ring.elements
-    magnets = sorted(
-        (i for i, e in enumerate(own) if _parts(e)), key=lambda i: (own[i].kind == "bend", i)
-    )
-    if not magnets:
-        return []
-    first = magnets[0]
-    return [
-        *(_Placed(e, e.s) for e in own[first:]),
-        *(_Placed(e, e.s + ring.length) for e in own[: first + 1]),
-    ]
-
-
-def _outside(ways: Sequence[Element], bends: Sequence[float]) -> list[Element]:
-    """Straights among these bends, without other magnets, except those of a wiggler."""
-    return [] if bends and min(bends) < 0 < max(bends) else list(ways)
-
-
-def _middle(within: Sequence[_Placed], middle: float) -> list[Element]:
-    markers = [own for own in within if own.element.kind == "marker"]
-    drifts = [
-        own.element
-        for own in within
-        if own.element.kind == "drift" and own.element.length >= STRAIGHT / 2
-    ]
+def _middle(within: Sequence[tuple[Element, float]], middle: float) -> list[Element]:
+    """The place in a straight, of its elements and their s, m."""
+    markers = [own for own in within if own[0].kind == "marker"]
     if markers:
-        return [min(markers, key=lambda own: abs(own.s - middle)).element]
+        return [min(markers, key=lambda own: abs(own[1] - middle))[0]]
+    drifts = [e for e, _ in within if e.kind == "drift" and e.length >= STRAIGHT / 2]
     return [max(drifts, key=lambda e: e.length)] if drifts else []
