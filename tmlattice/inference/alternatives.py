@@ -157,7 +157,7 @@ def best_start(problem: Problem, others: Fit, hypothesis: Hypothesis) -> Cause:
             continue
         point = problem.at(there, others.nuisances, others.kicks)
         clean = np.full(1, np.inf) if point.lost else others.projection.out(point.residual)
-        left.append(float(clean @ clean))
+        left.append(float(np.nan_to_num(clean @ clean, nan=np.inf)))
     return causes[int(np.argmin(left))]
 
 
