@@ -19,7 +19,7 @@ from tmlattice.diagnosis.response.missing_effects import weigh
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause, apply, with_labels
 from tmlattice.errors import MeasurementError
-from tmlattice.lattice import load_ring
+from tmlattice.lattice import Element, load_ring
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.response import simulate_response as simulated
 from tmlattice.measurement import OrbitResponse, read_measurement, write_measurement
@@ -102,14 +102,12 @@ def test_noise_that_nobody_states_is_learnt_from_neighbours(small_ring, rng, noi
     measured = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), monitors, read)
     found = estimated_noise(small_ring, measured)[0, 1]
     assert 0.6 < found / noise < 1.5  # of 16 columns
+    elements: list[Element] = []
+    for element in small_ring.elements:
+        again = replace(element, name=f"{element.name} again")
+        elements += [element, again] if element.kind == "monitor" else [element]
+    ring = replace(small_ring, elements=tuple(elements))
     both = [name + own for name in monitors for own in ("", " again")]
-
-    class Twice(dict):
-        """A ring in which every monitor has two names."""
-
-        length = small_ring.length
-
-    ring = Twice({name: small_ring[name.removesuffix(" again")] for name in (*both, *names)})
     twice = OrbitResponse(names, ["y"] * 16, np.full(16, 1e-5), both, np.repeat(read, 2, axis=1))
     assert estimated_noise(ring, twice)[0, 1] == found
 

@@ -99,6 +99,21 @@ def test_a_corrector_that_is_rolled_kicks_by_its_turned_kick_too(petra3, model):
     assert_allclose(mine, theirs, atol=1e-9 * np.abs(theirs).max())
 
 
+def test_a_step_of_a_corrector_with_errors_vs_the_maps_of_the_stepped_ring(petra3, model):
+    names = [model.correctors[i] for i in SOME]
+    assert {petra3[name].kind for name in names} == {"hcorrector", "vcorrector"}
+    errors = [
+        Cause(effect, name, amount) for name in names
+        for effect, amount in (("corrector_roll", 0.1), ("corrector_position", 0.02))
+    ]  # fmt: skip
+    machine = apply(petra3, errors)
+    mine = ResponseModel(machine).closed_orbits(names, [1e-6] * len(names))
+    for name, orbit in zip(names, mine, strict=True):
+        stepped = ResponseModel(apply(machine, (), {name: {"kick": 1e-6}}))
+        # the third order of sextupoles is far smaller
+        assert_allclose(orbit, stepped.readings, atol=1e-6 * np.abs(orbit).max())
+
+
 def test_without_energy_a_horizontal_kick_moves_less(petra3, model):
     """Without energy shift lacks -eta_m eta_c / (alpha C): what the longer path takes."""
     flat = ResponseModel(petra3, dimension=4)

@@ -107,7 +107,6 @@ class ResponseModel:
         self.maps = self._dispersed(ring_maps(ring, dimension, self.layers), magnets)
         self.free = np.arange(4) if dimension == 4 else np.array([0, 1, 2, 3, 5])
         self._chain = Chain(self.maps)
-        self._columns: dict[tuple[tuple[str, ...], bool], Columns] = {}
         self._close(frequency)
 
     def at_frequency(self, frequency: float) -> "ResponseModel":
@@ -119,7 +118,6 @@ class ResponseModel:
         other = copy(self)
         # the new orbit to first order: fewer iterations
         near = self.state + (frequency - self.frequency) * self.rf_start
-        other._forget()
         other._close(frequency, near)
         return other
 
@@ -142,9 +140,8 @@ class ResponseModel:
         other = copy(self)
         other.ring = ring
         other.layers, touched = self.layers.changed_to(ring)
-        other._columns = {}
+        other._forget()
         if touched:  # else the kicks differ, and the orbit is the same
-            other._forget()
             other.maps = other._dispersed(changed_maps(self.maps, other.layers, touched), touched)
             other._chain = Chain(other.maps)
             other._close(self.frequency)
@@ -173,7 +170,7 @@ class ResponseModel:
 
     def _forget(self) -> None:
         """Drop what was cached for the previous orbit."""
-        self._columns = {}
+        self._columns: dict[tuple[tuple[str, ...], bool], Columns] = {}
         for name in ("closing", "inverse", "rf_start"):
             self.__dict__.pop(name, None)
 
@@ -181,6 +178,7 @@ class ResponseModel:
         dimension = self.dimension
         if frequency and dimension != 6:
             raise ValueError("the RF moves the energy, which four coordinates do not have")
+        self._forget()
         self.frequency = frequency
         self._turn = np.zeros(len(self.free))
         if dimension == 6:

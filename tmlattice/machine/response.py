@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from tqdm.auto import tqdm
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.rf import rf_of
 from tmlattice.by_name import by_name
@@ -140,9 +140,9 @@ class StoredMachine:
         self, readings: Array, noise: float | Sequence[float], purpose: str
     ) -> tuple[Array, Array | None]:
         """Return readings [shot, ..., monitor, 2] with noise, and the noise of the record."""
-        rms = rms_of(noise)
-        add_noise(readings, rms, self.seed, purpose)
-        return readings, stated_noise(rms, len(self.ring.monitors))
+        size = rms_of(noise)
+        add_noise(readings, size, self.seed, purpose)
+        return readings, stated_noise(size, len(self.ring.monitors))
 
     def changes(
         self, orbits: Iterable[Array], noise: float | Sequence[float], purpose: str
@@ -165,7 +165,7 @@ def rf_step_of(ring: Ring, design: ResponseModel | None = None) -> float:
     """Return the RF step, Hz, that raises the energy so that the design's orbit changes by 1.3 mm
     rms, to two digits; 0 without dispersion."""
     model = ResponseModel(ring) if design is None else design
-    size = float(np.sqrt(np.mean(model.rf_response()[:, 0] ** 2)))
+    size = rms(model.rf_response()[:, 0])
     step = np.sign(model.rf_start[5]) * RF_ORBIT * rf_of(ring).frequency(ring)
     return float(f"{step / size:.1e}") if size else 0.0
 

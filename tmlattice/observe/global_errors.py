@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices
+from tmlattice.arrays import INVISIBLE, TINY, Array, Flags, Indices, rms
 from tmlattice.effects import Cause, Settings
 from tmlattice.errors import MeasurementError
 from tmlattice.inference import chi2
@@ -643,5 +643,4 @@ def _part(data: Measurement) -> Measurement:
 
 
 def _size(data: Measurement) -> float:
-    there = data.readings[np.isfinite(data.readings)]
-    return float(np.sqrt(np.mean(there**2)))
+    return rms(data.readings[np.isfinite(data.readings)])

@@ -16,7 +16,6 @@ to the response of the model with the errors of the first.
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -349,6 +348,14 @@ class Predicted:
         return Predicted(self.data, self.errors.with_causes(self.data, causes), self.bent)
 
 
+def bent(at: Predicted) -> Predicted:
+    """The prediction with the third order of the steps, if the ring stores a beam with each."""
+    try:
+        return at.bend()
+    except UnstableRingError:
+        return at
+
+
 def alike(
     ring: Ring, before: OrbitResponse, after: OrbitResponse
 ) -> tuple[OrbitResponse, OrbitResponse]:
@@ -417,10 +424,7 @@ def response_change(
         energy=errors.energy,
         orbit_kicks=orbit_kicks,
     )
-    stepped = Predicted(there, Errors.none(there))
-    with suppress(UnstableRingError):  # no beam is stored with a step: it stays linear
-        stepped = stepped.bend()
-    orbits = stepped.straight + change
+    orbits = bent(Predicted(there, Errors.none(there))).straight + change
     rf = before.measured.rf
     if rf is not None and rf.orbit is not None:
         rf = replace(rf, orbit=orbits[-1])

@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tmlattice.arrays import INVISIBLE, Array, Flags, Indices
+from tmlattice.arrays import INVISIBLE, Array, Flags, Indices, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.judgement import ENOUGH
@@ -166,7 +166,7 @@ def _computed(data: ResponseData) -> bool:
         return False
     apart = (data.orbits[-1] - design)[:, 0] / data.noise[:, 0]
     apart = apart[np.isfinite(apart)]
-    return len(apart) >= ENOUGH and bool(np.sqrt(np.mean(apart**2)) < MAX_MISFIT)
+    return len(apart) >= ENOUGH and rms(apart) < MAX_MISFIT
 
 
 def _differ(read: Array) -> float:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tmlattice.arrays import TINY, Array, Flags, Indices
+from tmlattice.arrays import TINY, Array, Flags, Indices, rms
 from tmlattice.diagnosis.families.fields import (
     REPRODUCED,
     USUAL,
@@ -179,7 +179,7 @@ def explain_gradients(state: State) -> CommonFactors | None:
         common_factors,
         instead,
         1 - float(np.sum(left**2)) / size if size else 0.0,
-        float(np.sqrt(np.mean(left**2))),
+        rms(left),
         between,
     )
 

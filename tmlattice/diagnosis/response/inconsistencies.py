@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tmlattice.arrays import REDUNDANT, Array
+from tmlattice.arrays import REDUNDANT, Array, rms
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import linear, rf_fitted
@@ -99,7 +99,7 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
             (mean @ found.values[at], np.sum(spread @ found.covariance * spread, axis=1))
         )
     return Inconsistency(
-        float(np.sqrt(np.mean(missed**2))),
+        rms(missed),
         float(np.sqrt(np.mean(np.diag(covariance)))),
         total,
         len(read),

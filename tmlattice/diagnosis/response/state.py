@@ -10,15 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tmlattice.arrays import Array, Flags
+from tmlattice.arrays import Array, Flags, rms
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.effects import find
-from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW
 from tmlattice.inference.priors import SCALE_SPREAD, Group
 from tmlattice.inference.problem import Hypothesis
-from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.orbit_response import Errors, Predicted, bent
 from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
@@ -160,14 +159,6 @@ def bend(state: State) -> State:
     return replace(state, at=bent(state.at))
 
 
-def bent(at: Predicted) -> Predicted:
-    """The prediction with the third order of the steps, if the ring stores a beam with each."""
-    try:
-        return at.bend()
-    except UnstableRingError:
-        return at
-
-
 def allow(state: State, families: Sequence[Family]) -> State:
     """The state with more families, at zero or at given values; present ones are unchanged."""
     values = {f.variable: np.zeros(f.size(state.data)) for f in families}
@@ -275,8 +266,7 @@ def jump(state: State, beyond: float | None = None) -> State:
 
 def rms_of(values: Array) -> float:
     """Return the rms of all finite values; NaN without any."""
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+    return rms(values[np.isfinite(values)])
 
 
 def amplitudes(

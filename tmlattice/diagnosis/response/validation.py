@@ -224,11 +224,9 @@ def inner(state: State, by_others: Array | None = None) -> Validated:
     ]
     left = np.stack([[one.inside, one.outside] for one in missed])
     columns = np.stack([np.nansum(left**2, axis=(0, 3)), np.isfinite(left).sum(axis=(0, 3))]).T
-    of_rf = (
-        missed[0].rf
-        if by_others is None
-        else np.where(np.isfinite(missed[0].rf), missed[0].rf, by_others)
-    )
+    of_rf = missed[0].rf
+    if by_others is not None:
+        of_rf = np.where(np.isfinite(of_rf), of_rf, by_others)
     rf = np.stack([np.nan_to_num(of_rf) ** 2, np.isfinite(of_rf)], axis=1)
     floor = (FLOOR * float(np.median(state.data.noise))) ** 2
     columns[..., 0] += floor[:2] * columns[..., 1]
