@@ -1,7 +1,7 @@
 """Diagnosis of an orbit response of a ring with distributed errors.
 
 The order of the procedure: a sparse fit is tried (`sparse`). A fit of all errors begins
-(`first_guess`, `state`), families are added one by one in damped rounds (`hierarchical`, `rounds`,
+(`first_guess`, `state`), families are added and fitted by damped steps (`hierarchical`, `rounds`,
 `weights`, `jitter`), outliers and wrong labels are rejected (`outlier_readings`,
 `labels`), each family is validated by evidence and held-out readings (`linear`, `validation`), and
 single faults are sought given distributed errors (`detected_faults`). The result has its errors

@@ -631,7 +631,7 @@ def _settled(state: State) -> State | None:
     beam is stored, or where an amount is implausible."""
     for first in (_stepped, replace):
         try:
-            rough = settle(first(state), gain=ROUGH, possible=_possible)
+            rough = settle(first(state), gain=ROUGH)
             return settle(bend(rough)) if _possible(rough) else None
         except (TmlatticeError, np.linalg.LinAlgError):
             continue

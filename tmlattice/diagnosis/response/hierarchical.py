@@ -3,8 +3,8 @@
 >>> fit = fit_families(data, split)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in fit.steps]
 
-Families are added one by one, then all are fitted together, and each is tested by the loss without
-it, with the fit linearised.
+Families are added, all are fitted together, and each is tested by the loss without it, with the fit
+linearised.
 """
 
 import logging
@@ -32,7 +32,7 @@ from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.rounds import (
     evidence_of,
     linear_evidence,
-    one_round,
+    one_step,
     settle,
 )
 from tmlattice.diagnosis.response.state import (
@@ -68,10 +68,12 @@ ASTRAY, NEAR = 1.2, 1e-3
 """Largest unexplained share of the typical column's mean square: as a ratio to the design's, or
 itself if that is more. Above it the fit has diverged."""
 FIRST, ROUGH = 4, 0.03
-"""Rounds of each block after a family is added or removed, and the relative fall of the cost
-required for another one."""
+"""Largest number of steps of each block after families are added or removed, and the relative fall
+of the cost by which a step is progress."""
+OPTICS = 3
+"""Number of first trials that are added one by one: of all, calibrations, gains, gradients."""
 DIVERGED = 2.0
-"""Ratio of the held-out rms to the design's above which one round has diverged."""
+"""Ratio of the held-out rms to the design's above which one step has diverged."""
 
 
 def fit_chi2(state: State) -> tuple[Block, ...]:
@@ -142,7 +144,7 @@ def fit_families(
     """
     design = begin(data, split)
     trials = readable(design, trials)
-    state = in_turn(begun(design, trials), trials, progress)
+    state = rough(begun(design, trials), trials, progress)
     single, labels = _outliers(state)
     progress("all families without outliers")
     state, notes = _together(without_readings(state, single | rejected(state, labels)), trials)
@@ -251,19 +253,21 @@ def steps_of(before: Step, state: State, trials: Sequence[Trial]) -> tuple[Step,
     """Return the scores before and with the fitted trials; those before alone without any."""
     if not trials:
         return (before,)
-    title = _title(trials[0]) if len(trials) == 1 else f"{len(trials)} families of errors"
     count = sum(family.count(state.data) for trial in trials for family in trial)
-    return before, score(state, title, count)
+    return before, score(state, _titles(trials), count)
 
 
-def in_turn(
+def rough(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
 ) -> State:
-    """Return the rough fit of all families, added one by one: all at once they converge slowly from
-    a design that is far from the ring, as PETRA III's is."""
-    for trial in readable(state, trials):
-        progress(with_labels(_title(trial)))
-        state = settle(jump(allow(state, trial)), _blocks(trial), FIRST, ROUGH)
+    """Return a rough fit of all families. Calibrations, gains and gradients are added one by one: a
+    fit of all at once converges slowly from a design that is far from the ring (PETRA III). The
+    others are added together."""
+    trials = readable(state, trials)
+    for some in filter(None, [*([own] for own in trials[:OPTICS]), trials[OPTICS:]]):
+        progress(with_labels(_titles(some)))
+        families = [family for trial in some for family in trial]
+        state = settle(jump(allow(state, families)), FIRST, ROUGH)
     return state
 
 
@@ -287,7 +291,7 @@ def reversed_decisions(
     fit: HierarchicalFit, progress: Callable[[str], Any] = lambda stage: None
 ) -> HierarchicalFit:
     """Return the fit with the scores that each decision would have if it were reversed, after one
-    round in which the other families are fitted again; none if that round diverges."""
+    step in which the other families are fitted again; none if that step diverges."""
     rejected = [trial for trial, step in fit.decisions.items() if not step.kept]
     state = allow(fit.state, [family for trial in rejected for family in trial])
     there = {block: linear(state, block) for block in (0, 1) if state.of_block(block)}
@@ -372,6 +376,10 @@ def _title(trial: Trial) -> str:
     return ", ".join(family.title for family in trial)
 
 
+def _titles(trials: Sequence[Trial]) -> str:
+    return _title(trials[0]) if len(trials) == 1 else f"{len(trials)} families of errors"
+
+
 def _blocks(trial: Trial) -> list[int]:
     """Blocks that are fitted: skew gradients move the tunes to second order."""
     return [1, 0] if any(own.name == COUPLING for own in trial) else [trial[0].block]
@@ -440,14 +448,14 @@ def _asked(trial: Trial) -> bool:
 
 
 def _moved_without(state: State, block: int, there: Linear, names: Collection[str]) -> State | None:
-    """The state after one round of a block in which some priors are narrow, so that their numbers
+    """The state after one step of a block in which some priors are narrow, so that their numbers
     are zero; None if it has no closed orbit, or the others are not determined."""
     groups = tuple(
         replace(group, basis=0 * group.basis) if group.name in names else group
         for group in there.groups
     )
     try:
-        moved, _, after = one_round(state, block, there._replace(groups=groups))
+        moved, _, after = one_step(state, block, there._replace(groups=groups))
     except np.linalg.LinAlgError:
         return None
     return moved if np.isfinite(after) else None
@@ -455,8 +463,8 @@ def _moved_without(state: State, block: int, there: Linear, names: Collection[st
 
 def _without(state: State, trial: Trial) -> State:
     """The state without a trial's families and the others fitted again, first with the derivatives
-    here; the other block is unchanged to first order."""
+    here."""
     block = trial[0].block
     there = linear(state, block)
     moved = _moved_without(state, block, there, _priors(trial, state))
-    return settle(forbid(moved or state, trial), _blocks(trial), FIRST, ROUGH)
+    return settle(forbid(moved or state, trial), FIRST, ROUGH)

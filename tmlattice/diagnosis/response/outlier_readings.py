@@ -124,7 +124,7 @@ def shares(state: State, block: int, left: Array) -> Array:
     times = np.where(np.isfinite(left), times, 1.0)
     if state.robust:
         out[block, :-1] = times[:-1] ** 2
-    if state.allows(DISPERSION) and np.isfinite(left[-1]).sum() >= FEW:
+    if state.has_fitted(DISPERSION) and np.isfinite(left[-1]).sum() >= FEW:
         out[block, -1] = times[-1] ** 4
     return out
 

@@ -1,10 +1,10 @@
-"""Damped Gauss-Newton rounds of a hierarchical fit, and the log evidence of its result.
+"""Damped Gauss-Newton steps of a hierarchical fit, and the log evidence of its result.
 
 >>> state = settle(bend(jump(allow(state, families))))
 """
 
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,24 +19,25 @@ from tmlattice.inference.priors import Group
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 12
-"""Most rounds of a fit: it has converged, as far as the changing weights allow."""
+MOST_STEPS = 12
+"""Largest number of steps of each block. Fits have converged by then, as far as the changing
+weights allow."""
 GAIN = 3e-3
-"""Relative fall of the cost required for another round."""
+"""Relative fall of the cost by which a step is progress."""
 EACH = 4
-"""Iterations of EM for the prior scales in a round."""
+"""Iterations of EM for the prior scales in a step."""
 LEARN = 10
 """Iterations of EM for prior scales alone: those of absent errors fall slowly."""
 RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
-"""Repetitions of a diverged round, and of a step that crosses lower bounds; divisor of the step
-bounds of a diverged round; their growth, and its limit."""
+"""Repetitions of a diverged step, and of one that crosses lower bounds; divisor of the bounds of a
+diverged step; their growth, and its limit."""
 CORRECTED, CORRECTS = 6, 1e-3
 """Corrections of a step by the residuals at its end, with the derivatives at its start; and the
 relative fall of the cost required for another one. Correlated numbers follow a curved valley of the
 cost, which its tangent leaves."""
 
 
-def one_round(
+def one_step(
     state: State, block: int, there: Linear, bold: float = 1.0
 ) -> tuple[State, float, float]:
     """Solve the readings of one block, and move. Return the state, and the cost before and after.
@@ -45,7 +46,7 @@ def one_round(
         state: the start.
         block: 0 in-plane, 1 coupling.
         there: `linear` of that block at the start.
-        bold: factor on the step bounds; small after diverged rounds.
+        bold: factor on the step bounds; small after diverged steps.
     """
     found = bounded_step(there, bold)
     groups = {group.name: group for group in found.groups}
@@ -131,60 +132,66 @@ def _penalty(groups: Sequence[Group], rows: slice, values: Array) -> float:
 
 
 def settle(
-    state: State,
-    blocks: Sequence[int] = (0, 1),
-    most: int = ROUNDS,
-    gain: float = GAIN,
-    possible: Callable[[State], bool] = lambda state: True,
-    look_at_monitors: bool = True,
+    state: State, most: int = MOST_STEPS, gain: float = GAIN, look_at_monitors: bool = True
 ) -> State:
-    """Return the state after damped rounds, which end when none reduces the cost any further.
+    """Return the state of the lowest cost after damped Gauss-Newton steps.
 
-    This is the method of Levenberg and Marquardt with a step bound for each number. A step of one
-    block that increases its cost is repeated with smaller bounds. What it costs the other block is
-    subtracted from its gain: otherwise what that one regains in turn would be taken for progress.
+    The blocks are stepped in turn, by the method of Levenberg and Marquardt with a step bound for
+    each number. A step that increases the cost of its own block is repeated with smaller bounds. It
+    may increase the cost of the other block, which its derivatives omit, because the next step may
+    compensate. Weights and bad BPMs are updated at a new lowest cost only, so that costs in between
+    are comparable. The fit ends when a step of each block was no progress.
 
     Args:
         state: the start.
-        blocks: that are fitted, in this order.
-        most: most rounds of each block.
-        gain: relative fall of the cost required for another round.
-        possible: whether a state is plausible; rounds end at one that is not.
-        look_at_monitors: whether bad BPMs are rejected after each round.
+        most: largest number of steps of each block.
+        gain: relative fall of the cost by which a step is progress.
+        look_at_monitors: whether the bad BPMs are updated.
     """
     good = state.good
-    bold = dict.fromkeys(blocks, 1.0)
-    for turn in range(most):
-        gained = total = 0.0
-        for block in [own for own in blocks if state.of_block(own)]:
-            there = linear(state, block)
-            state = replace(state, kept={**state.kept, **there.kept})
-            for _ in range(RETRIES):
-                moved, before, after = one_round(state, block, there, bold[block])
-                if after <= before:
-                    break
-                bold[block] /= ASTRAY
-            if after > before:
-                continue
-            bold[block] = min(BOLDER * bold[block], BOLDEST)
-            others = [own for own in blocks if own != block and state.of_block(own)]
-            gained += before - after
-            gained += sum(_misfit(state, state, own) - _misfit(state, moved, own) for own in others)
-            total += after
-            state = moved
-        for seen in (0, 1):
-            if state.of_block(seen):
-                state = look(state, seen)
+
+    def looked(state: State) -> State:
+        for block in (0, 1):
+            if state.of_block(block):
+                state = look(state, block)
                 state = state if look_at_monitors else replace(state, good=good)
-        log.info(
-            "round %d: cost %.3g less, model discrepancy %s m",
-            turn,
-            gained / max(total, TINY),
-            np.median(state.lacking, axis=1),
-        )
-        if gained <= gain * total or not possible(state):
+        return state
+
+    best, start = state, state
+    blocks = [block for block in (0, 1) if state.of_block(block)]
+    bold = dict.fromkeys(blocks, 1.0)
+    gained, idle = 0.0, 0  # since the lowest cost
+    for turn, block in enumerate(blocks * most):
+        there = linear(state, block)
+        state = replace(state, kept={**state.kept, **there.kept})
+        for _ in range(RETRIES):
+            moved, before, after = one_step(state, block, there, bold[block])
+            if after <= before:
+                break
+            bold[block] /= ASTRAY
+        idle += 1
+        if after <= before:
+            bold[block] = min(BOLDER * bold[block], BOLDEST)
+            then, now = (
+                sum(_misfit(state, at, own) for own in blocks if own != block)
+                for at in (state, moved)
+            )
+            leaves = gained == 0
+            gained += before + then - after - now
+            state = moved
+            log.info("step %d, block %d: cost %.3g less, model discrepancy %s m", turn, block,
+                     gained / max(after + now, TINY), np.median(state.lacking, axis=1))  # fmt: skip
+            if gained > gain * (after + now):
+                idle = 0
+            elif leaves and gained < 0:
+                idle = 1  # the other block may compensate
+            if gained >= 0:
+                best, gained = looked(state), 0.0
+                state = best
+        if idle == len(blocks):
             break
-    return state
+    best = looked(start) if best is start else best
+    return replace(best, kept=state.kept)
 
 
 def linear_evidence(

@@ -129,6 +129,10 @@ class State:
         """Whether a family is in the fit."""
         return any(family.name == name for family in self.families)
 
+    def has_fitted(self, name: str) -> bool:
+        """Whether a family is in the fit and has numbers that are not all zero."""
+        return any(own.name == name and self.values[own.variable].any() for own in self.families)
+
     @property
     def fitted(self) -> Flags:
         """Fitted correctors, [column]; of the RF's column the BPMs are split instead."""

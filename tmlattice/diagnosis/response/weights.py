@@ -101,7 +101,7 @@ def look(state: State, block: int) -> State:
     noise = float(np.median(data.noise))
     shared = TYPICAL * typical**2 + np.nansum(share[block] * left**2, axis=1)
     squares = shared / (TYPICAL + use.sum(axis=1))
-    if state.allows(DISPERSION):
+    if state.has_fitted(DISPERSION):
         squares[-1] = typical**2  # the RF counts like a typical column
     lacking = state.lacking.copy()
     lacking[block] = np.sqrt(np.maximum(squares - noise**2, (LEAST * noise) ** 2))
@@ -114,7 +114,7 @@ def look(state: State, block: int) -> State:
 def _independent(state: State, block: int, left: Array, noise: Array) -> State:
     """The state with its effective sample size, once gradients are fitted: residuals by gradients
     are betatron oscillations, too."""
-    if state.independent is None or not state.allows(DISPERSION):
+    if state.independent is None or not state.has_fitted(DISPERSION):
         return state
     own = state.independent.copy()
     read = left[:-1] * np.sqrt(state.share[block, :-1])
@@ -168,7 +168,7 @@ def good_monitors(state: State, block: int = 0, bad: float = SIGNIFICANT) -> Fla
     data = state.data
     ratio = np.zeros(data.shape[1])
     read, orbits = data.pick(state.at.read, block), data.pick(data.orbits, block)
-    for p in (0, 1) if block == 0 or state.allows(COUPLING) else ():
+    for p in (0, 1) if block == 0 or state.has_fitted(COUPLING) else ():
         rows = state.fitted & (data.plane == p)
         if rows.sum() < FEW:
             continue
