@@ -10,7 +10,7 @@ from tmlattice import diagnose
 from tmlattice.diagnosis.families.steps import CHANGES, STEPS
 from tmlattice.diagnosis.response.before_after import ANY, drifts
 from tmlattice.diagnosis.response.changed_supplies import changed_supplies
-from tmlattice.diagnosis.response.hierarchical import rough
+from tmlattice.diagnosis.response.hierarchical import rough_fit
 from tmlattice.diagnosis.response.linear import linear, with_numbers
 from tmlattice.diagnosis.response.rounds import evidence_of, settle
 from tmlattice.diagnosis.response.state import begin
@@ -45,7 +45,7 @@ def fitted(small_ring, before):
     """The machine as the first measurement shows it."""
     data, split = parted(small_ring, before)
     design = begin(data, split)
-    return rough(design, STEPS)
+    return rough_fit(design, STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def crowded_change(small_ring, before, fitted):
     split = split_columns(data, 0.2, np.random.default_rng(0))
     state = begin(data, split)
     state = replace(state, exploring=False, guessed=ANY)
-    return settle(rough(state, CHANGES))
+    return settle(rough_fit(state, CHANGES))
 
 
 def test_a_blur_is_the_difference_that_an_open_error_makes(fitted, problem):

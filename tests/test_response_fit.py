@@ -9,7 +9,7 @@ from shared import gradients, parted, small_steps
 from tmlattice.diagnosis.families.fields import FocusingChange, VerticalFocusing
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response import hierarchical, rounds
-from tmlattice.diagnosis.response.hierarchical import rough
+from tmlattice.diagnosis.response.hierarchical import rough_fit
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.effects import Cause
@@ -191,7 +191,7 @@ def test_a_reversed_decision_is_felt_in_its_own_plane(small_ring, rng):
 
 
 def test_a_step_in_one_plane_that_spoils_the_other_does_not_end_the_fit(small_ring):
-    """Skew gradients of 0.015 1/m rms: twice the noise was left in plane, five times across."""
+    """Skew gradients of 0.015 1/m rms change in-plane readings, too: both reach their noise."""
     rng = np.random.default_rng(2)
     causes = gradients(small_ring, 5e-3, rng)
     causes += [
@@ -239,6 +239,6 @@ def test_a_device_focuses_and_a_change_of_one_may_do_less(small_ring):
         ).measured  # fmt: skip
         data, split = parted(small_ring, measured, 1)
         design = begin(data, split)
-        state = rough(design, [STEPS[0], (family,)])
+        state = rough_fit(design, [STEPS[0], (family,)])
         amounts.append(state.values["device"][family.places(data).index("d::95")])
     assert amounts == pytest.approx([0.0, -0.01, 0.01], rel=0.02, abs=0.0)

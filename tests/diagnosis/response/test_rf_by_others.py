@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from shared import gradients, parted, small_steps
 
 from tmlattice.diagnosis.families.steps import STEPS
-from tmlattice.diagnosis.response.hierarchical import rough
+from tmlattice.diagnosis.response.hierarchical import rough_fit
 from tmlattice.diagnosis.response.linear import linear, rf_by_others
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.response.weights import taken, weight
@@ -23,7 +23,7 @@ def settled(small_ring):
     measured = small_steps(small_ring, causes, seed=1)
     data, split = parted(small_ring, measured, 1)
     design = begin(data, split)
-    return rough(design, STEPS[:3])
+    return rough_fit(design, STEPS[:3])
 
 
 def told(state):

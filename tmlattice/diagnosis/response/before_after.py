@@ -45,7 +45,7 @@ from tmlattice.diagnosis.response.hierarchical import (
     fit_families,
     readable,
     reversed_decisions,
-    rough,
+    rough_fit,
     steps_of,
 )
 from tmlattice.diagnosis.response.labels import label_messages, since, without_swaps
@@ -280,7 +280,7 @@ def _fit_change(
     """The fit of all possible changes, with the estimated noise of the difference."""
     design = replace(begin(data, split), exploring=False, guessed=ANY)
     trials = readable(design, trials)
-    state = settle(bend(jump(rough(design, trials, progress))))
+    state = settle(bend(jump(rough_fit(design, trials, progress))))
     state = settle(_learnt_noise(state))
     design = _with_noise(design, state.data.noise)
     steps = steps_of(score(design, "reference"), state, trials)

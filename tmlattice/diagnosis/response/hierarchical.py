@@ -144,7 +144,7 @@ def fit_families(
     """
     design = begin(data, split)
     trials = readable(design, trials)
-    state = rough(begun(design, trials), trials, progress)
+    state = rough_fit(begun(design, trials), trials, progress)
     single, labels = _outliers(state)
     progress("all families without outliers")
     state, notes = _together(without_readings(state, single | rejected(state, labels)), trials)
@@ -257,7 +257,7 @@ def steps_of(before: Step, state: State, trials: Sequence[Trial]) -> tuple[Step,
     return before, score(state, _titles(trials), count)
 
 
-def rough(
+def rough_fit(
     state: State, trials: Iterable[Trial], progress: Callable[[str], Any] = lambda stage: None
 ) -> State:
     """Return a rough fit of all families. Calibrations, gains and gradients are added one by one: a

@@ -28,7 +28,7 @@ EACH = 4
 """Iterations of EM for the prior scales in a step."""
 LEARN = 10
 """Iterations of EM for prior scales alone: those of absent errors fall slowly."""
-RETRIES, ASTRAY, BOLDER, BOLDEST = 4, 4.0, 2.0, 8.0
+RETRIES, NARROWER, WIDER, WIDEST = 4, 4.0, 2.0, 8.0
 """Repetitions of a diverged step, and of one that crosses lower bounds; divisor of the bounds of a
 diverged step; their growth, and its limit."""
 CORRECTED, CORRECTS = 6, 1e-3
@@ -38,7 +38,7 @@ cost, which its tangent leaves."""
 
 
 def one_step(
-    state: State, block: int, there: Linear, bold: float = 1.0
+    state: State, block: int, there: Linear, width: float = 1.0
 ) -> tuple[State, float, float]:
     """Solve the readings of one block, and move. Return the state, and the cost before and after.
 
@@ -46,9 +46,9 @@ def one_step(
         state: the start.
         block: 0 in-plane, 1 coupling.
         there: `linear` of that block at the start.
-        bold: factor on the step bounds; small after diverged steps.
+        width: factor on the step bounds; small after diverged steps.
     """
-    found = bounded_step(there, bold)
+    found = bounded_step(there, width)
     groups = {group.name: group for group in found.groups}
     learnt = replace(state, groups={**state.groups, **groups})
 
@@ -79,7 +79,7 @@ def one_step(
         left = state.data.pick(then.at.left, block)
         score = gathered(there, state.data.plane_of(block), weighed(state, block, left))
         score += there.normal.matrix @ moved
-        score += there.normal.matrix @ there.start + there.start / (bold * there.trust) ** 2
+        score += there.normal.matrix @ there.start + there.start / (width * there.trust) ** 2
         aim, before = found.solved(score), aim
         further = aim - before
         if further @ there.normal.matrix @ further < CORRECTS * after:
@@ -93,9 +93,9 @@ def _misfit(state: State, at: State, block: int) -> float:
     return float(np.sum(left * weighed(state, block, left)))
 
 
-def bounded_step(there: Linear, bold: float) -> Posterior:
+def bounded_step(there: Linear, width: float) -> Posterior:
     """The bounded step, with numbers fixed at their lower bounds where it would cross them."""
-    groups, trust = there.groups, bold * there.trust
+    groups, trust = there.groups, width * there.trust
     for _ in range(RETRIES):
         found = solve(there.normal, groups, there.start, trust, rounds=EACH)
         low = found.values < there.lowest
@@ -159,19 +159,19 @@ def settle(
 
     best, start = state, state
     blocks = [block for block in (0, 1) if state.of_block(block)]
-    bold = dict.fromkeys(blocks, 1.0)
+    width = dict.fromkeys(blocks, 1.0)
     gained, idle = 0.0, 0  # since the lowest cost
     for turn, block in enumerate(blocks * most):
         there = linear(state, block)
         state = replace(state, kept={**state.kept, **there.kept})
         for _ in range(RETRIES):
-            moved, before, after = one_step(state, block, there, bold[block])
+            moved, before, after = one_step(state, block, there, width[block])
             if after <= before:
                 break
-            bold[block] /= ASTRAY
+            width[block] /= NARROWER
         idle += 1
         if after <= before:
-            bold[block] = min(BOLDER * bold[block], BOLDEST)
+            width[block] = min(WIDER * width[block], WIDEST)
             then, now = (
                 sum(_misfit(state, at, own) for own in blocks if own != block)
                 for at in (state, moved)
