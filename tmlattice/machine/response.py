@@ -9,7 +9,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.arrays import Array, rms
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.rf import rf_of
+from tmlattice.beam.rf import frequency_of, rf_of
 from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings, apply, monitors_with
 from tmlattice.lattice import Ring
@@ -200,12 +200,7 @@ def _with_frequency(settings: Settings, relative: float) -> Settings:
     if relative == 0:
         return settings
     changed = {name: own for name, own in settings.items() if name.casefold() != "rf"}
-    before = sum(
-        own.get("frequency_relative", 0.0)
-        for name, own in settings.items()
-        if name.casefold() == "rf"
-    )
-    return changed | dict(rf_setting(before + relative))
+    return changed | dict(rf_setting(frequency_of(settings) + relative))
 
 
 def spread_of(causes: Sequence[Cause]) -> float:
