@@ -365,11 +365,9 @@ def _through(ring: Ring, start: Array) -> tuple[Array, Array]:
     layers = LayerMaps(ring, 6)
     path, total = [start], [np.eye(6)]
     for element in ring.elements:
-        own = layers.map(element)
-        x = path[-1]
-        bent = np.zeros((6, 6)) if own.T is None else own.T @ x
-        path.append(own.B + (own.R + bent) @ x)
-        total.append((own.R + 2 * bent) @ total[-1])
+        image, slopes = layers.map(element)(path[-1])
+        path.append(image)
+        total.append(slopes @ total[-1])
     return np.array(path), np.array(total)
 
 

@@ -29,6 +29,9 @@ Group = Literal[
 """Effects that a figure draws in one colour."""
 
 
+Hypothesis = tuple[str, str | None]
+"""An effect and its place."""
+
 MIN_STRENGTH = 0.01
 """Smallest remaining share of a strength."""
 
