@@ -270,8 +270,7 @@ class Chain(LayerChain):
         sweeps.run(sweeps.track, len(history), size, *turn.W, turn.curved, history)
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state /
-        d launch there, [layer + 2, n, n]."""
+        """Return what `LayerChain.tangents` states."""
         turn, n = self.turn(), self.dimension
         states = np.empty((1, turn.steps + 1, n))
         tangents = np.empty((*states.shape, n))

@@ -74,11 +74,11 @@ def _flow(generator: Array) -> tuple[Array, Array, Array, Flags, Flags]:
     """The fields of generators: c, A, Q; whether each moves anything; and whether, in four
     coordinates, it is of pure second degree and keeps the mid-plane."""
     c, A, Q = field(generator)
-    linear: Flags = c.any(axis=1) | A.any(axis=(1, 2))
+    linear: Flags = np.asarray(c.any(axis=1) | A.any(axis=(1, 2)))
     flat = np.zeros(len(c), dtype=bool)
     if c.shape[1] == 4:
-        flat = ~(linear | Q[:, _SKEW].any(axis=1))
-    return c, A, Q, linear | Q.any(axis=(1, 2)), flat
+        flat = ~(linear | np.asarray(Q[:, _SKEW].any(axis=1)))
+    return c, A, Q, linear | np.asarray(Q.any(axis=(1, 2))), flat
 
 
 class SymplecticNetwork(NetworkChain):
@@ -187,23 +187,17 @@ class SymplecticNetwork(NetworkChain):
         sweeps.run(flows.track, len(history), size, W0[ends], merged(W1, ends), *rest, history)
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state / d
-        launch there, [layer + 2, n, n]."""
+        """Return what `LayerChain.tangents` states."""
         path, steps = self.jacobians(x)
         return path, products(steps)
 
     def jacobians(self, x: Array) -> tuple[Array, Array]:
         """Return the same states, and the Jacobian of every layer and of the closing drift."""
-        path, _, slopes, W1 = self._slopes(x)
-        half, one = 0.5 * slopes, np.eye(self.dimension)
-        return path, np.asarray(np.linalg.solve(one - half, (one + half) @ W1), dtype=float)
-
-    def _slopes(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """States [layer + 2, n], middles, the fields' slopes there and W1, [layer + 1, ...]."""
         W0, W1, c, A, Q, moves, flat = self._one_turn_fields()
         size, states = sweeps.begun(np.asarray(x)[None], len(W0) + 1)
         middles = np.empty_like(states[:, 1:])
         sweeps.run(flows.forward, 1, size, W0, W1, c, A, Q, moves, flat, states, middles)
-        path, middle = states[0, :, :, 0], middles[0, :, :, 0]
-        slopes = A + np.einsum("kaij,kj->kai", second_derivatives(Q), middle)
-        return path, middle, slopes, W1
+        slopes = A + np.einsum("kaij,kj->kai", second_derivatives(Q), middles[0, :, :, 0])
+        half, one = 0.5 * slopes, np.eye(self.dimension)
+        steps = np.linalg.solve(one - half, (one + half) @ W1)
+        return states[0, :, :, 0], np.asarray(steps, dtype=float)
