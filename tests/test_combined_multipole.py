@@ -17,8 +17,7 @@ from tmlattice.lattice.at_file import ring_from_at
 from tmlattice.machine.at_engine import AtEngine
 from tmlattice.machine.ocelot_engine import OcelotEngine
 from tmlattice.maps import ring_matrix
-from tmlattice.maps.magnets import way_map
-from tmlattice.maps.quadratic import composed, of_ocelot, parts_of
+from tmlattice.maps.quadratic import composed, of_ocelot, parts_of, quadratic_map
 from tmlattice.optics import off_momentum, one_turn_optics
 
 ENERGY = 1.9
@@ -92,7 +91,8 @@ def test_a_bend_with_other_fields_keeps_them_in_its_middle():
         element = at.Dipole("B", 0.3, 0.1, 0.0, **form, **fields)
         lattice = at.Lattice([element], energy=ENERGY * 1e9, periodicity=1)
         found = ring_from_at(lattice, "x")
-        moved.append([way_map(found.elements, ENERGY)(start) for start in starts])
+        way = composed(quadratic_map(element, ENERGY, 4) for element in found.elements)
+        moved.append(way(starts)[0])
         six = np.zeros((6, 3), order="F")
         six[:4] = starts.T
         tracked.append(lattice.track(six)[0][:4, :, 0, 0].T)

@@ -10,7 +10,7 @@ from shared import measured_data
 
 from tmlattice import Cause, TaylorNetwork, load_ring, off_momentum, read_measurement
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.response_derivatives import derivatives
+from tmlattice.beam.response_derivatives import ResponseSlopes
 from tmlattice.effects import CATALOGUE, RingEffect, apply
 from tmlattice.errors import EffectError, MeasurementError, UnknownNameError
 from tmlattice.machine import at_orbit
@@ -29,6 +29,11 @@ def engine(petra3):
 
 
 SOME = [0, 5, 100, 300, 498]
+
+
+def derivatives(model, hypotheses):
+    slopes = ResponseSlopes(model)
+    return slopes.whole(slopes.factors(hypotheses))
 
 
 def test_response_of_correctors_vs_at(model, engine):

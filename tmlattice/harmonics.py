@@ -22,7 +22,7 @@ import numpy as np
 
 from tmlattice.arrays import Array, ComplexArray
 from tmlattice.errors import TooFewTurnsError
-from tmlattice.optics import Optics
+from tmlattice.optics import Optics, short_way
 
 MIN_TURNS = 16
 
@@ -88,7 +88,7 @@ def tunes(states: Array, optics: Optics | None = None, method: Method | str = "n
     half = turns // 2
     fraction, amplitude = frequency(signals, method)
     first, second = (frequency(s, method)[0] for s in (signals[..., :half], signals[..., -half:]))
-    error = np.abs((first - second + 0.5) % 1.0 - 0.5) / 2
+    error = np.abs(short_way(first - second)) / 2
     if not np.isfinite(fraction).all():
         raise TooFewTurnsError(
             f"no steady line in {turns} turns; track more turns, or closer to the closed orbit"

@@ -125,6 +125,12 @@ def text_of(path: Path, error: type[TmlatticeError]) -> str:
         raise error(f"{path}, line {line}: not UTF-8; save the file as UTF-8") from problem
 
 
+def _short_text(path: Path, error: type[TmlatticeError]) -> str:
+    if check_regular(path, error) > MOST_YAML:
+        raise error(f"'{path}' is larger than {MOST_YAML >> 20} MB; write less of it")
+    return text_of(path, error)
+
+
 def json_of(path: Path, error: type[TmlatticeError], finite: bool = True) -> Any:
     """The value of a JSON file.
 
@@ -195,9 +201,7 @@ def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:
     """
     import yaml
 
-    if check_regular(path, error) > MOST_YAML:
-        raise error(f"'{path}' is larger than {MOST_YAML >> 20} MB; write less of it")
-    text = text_of(path, error)
+    text = _short_text(path, error)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     count = 0
 
@@ -236,9 +240,7 @@ def yaml_of(path: Path, error: type[TmlatticeError]) -> Any:
 def toml_of(path: Path, error: type[TmlatticeError]) -> dict[str, Any]:
     """The value of a TOML file, of the size and depth that a YAML file may have; error: as of
     `text_of`, or no TOML, with the line; a number that is not finite; or too much of it."""
-    if check_regular(path, error) > MOST_YAML:
-        raise error(f"'{path}' is larger than {MOST_YAML >> 20} MB; write less of it")
-    text = text_of(path, error)
+    text = _short_text(path, error)
     for number, line in enumerate(text.splitlines(), 1):
         # a key of many parts: its reader takes a time that grows with their square
         keys = [line] if line.lstrip().startswith("[") else line.split("=")[:-1]

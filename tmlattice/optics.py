@@ -216,10 +216,8 @@ def ring_tunes(ring: Ring, energy: float = 0.0) -> list[float] | None:
         energy: relative deviation of the beam's.
     """
     try:
-        if energy:
-            turn = ResponseModel(ring).at_energy(energy).tangents[-1]
-            return [float(q) for q in matrix_tunes(turn[:4, :4])]
-        return [float(q) for q in matrix_tunes(ring_matrix(ring))]
+        turn = ResponseModel(ring).at_energy(energy).tangents[-1] if energy else ring_matrix(ring)
+        return [float(q) for q in matrix_tunes(turn[:4, :4])]
     except (UnstableRingError, np.linalg.LinAlgError):
         return None
 
@@ -265,28 +263,25 @@ def _fractions(values: ComplexArray) -> Array:
     return np.asarray(np.angle(values) / (2 * np.pi) % 1.0)
 
 
-def closed_orbit(network: LayerChain, delta: float = 0.0, tolerance: float = 1e-14) -> Array:
+def closed_orbit(network: LayerChain, delta: float = 0.0) -> Array:
     """The state [n] that repeats after a turn, in x, px, y, py, by Newton's method.
 
     Args:
         network: four or six coordinates; in six, tau stays 0 and p stays `delta`.
         delta: relative energy deviation p, six coordinates only.
-        tolerance: m and rad.
 
     Raises:
         UnstableRingError: there is none within reach.
     """
-    return np.asarray(_on_closed_orbit(network, delta, tolerance)[0][0])
+    return np.asarray(_on_closed_orbit(network, delta)[0][0])
 
 
-def _on_closed_orbit(
-    network: LayerChain, delta: float = 0.0, tolerance: float = 1e-14
-) -> tuple[Array, Array]:
+def _on_closed_orbit(network: LayerChain, delta: float = 0.0) -> tuple[Array, Array]:
     """`LayerChain.tangents` about the closed orbit of an energy."""
     start = np.zeros(network.dimension)
     if network.dimension == 6:
         start[5] = delta
-    return network.closed_orbit(start, tolerance=tolerance)
+    return network.closed_orbit(start)
 
 
 def one_turn_optics(network: LayerChain) -> Optics:
@@ -329,8 +324,7 @@ def twiss(ring: Ring | LayerChain | Any) -> Twiss:
     if isinstance(ring, LayerChain):
         names, s = ring.layers, ring.maps.s
         path, total = _on_closed_orbit(ring)
-        end = total[-1]
-        path, total = path[:-1], total[:-1]
+        end, path, total = total[-1], path[:-1], total[:-1]
     else:
         ring = load_ring(ring)
         names = tuple(element.name for element in ring.elements)
@@ -365,11 +359,9 @@ def _through(ring: Ring, start: Array) -> tuple[Array, Array]:
     layers = LayerMaps(ring, 6)
     path, total = [start], [np.eye(6)]
     for element in ring.elements:
-        own = layers.map(element)
-        x = path[-1]
-        bent = np.zeros((6, 6)) if own.T is None else own.T @ x
-        path.append(own.B + (own.R + bent) @ x)
-        total.append((own.R + 2 * bent) @ total[-1])
+        image, slopes = layers.map(element)(path[-1])
+        path.append(image)
+        total.append(slopes @ total[-1])
     return np.array(path), np.array(total)
 
 

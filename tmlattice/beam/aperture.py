@@ -3,7 +3,6 @@
 import numpy as np
 
 from tmlattice.arrays import Array, Flags
-from tmlattice.beam import sweeps
 from tmlattice.errors import BeamLostError
 from tmlattice.maps import RingMaps
 
@@ -23,7 +22,7 @@ def lost(states: Array) -> Flags:
     return np.asarray(~np.all(inside, axis=-1))
 
 
-def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) -> None:
+def check_alive(states: Array, maps: RingMaps) -> None:
     """Raise where a trajectory of states [block, layer + 1, n, lane] has left the aperture;
     BeamLostError: names the trajectory and the layer where it was lost."""
     last = states[:, -1]
@@ -33,7 +32,7 @@ def check_alive(states: Array, maps: RingMaps, size: sweeps.Size, batch: int) ->
     if not anywhere.any():
         return
     block, lane = np.unravel_index(int(anywhere.argmax()), anywhere.shape)
-    trajectory = int(block) * len(size[1]) + int(lane)
+    trajectory = int(block) * states.shape[-1] + int(lane)
     raise lost_beam(states[block, :, :, lane], trajectory, maps)
 
 

@@ -18,6 +18,7 @@ from tmlattice.beam.rf import Cavities, Rf, cavities, frequency_of, rf_of
 from tmlattice.effects import (
     Cause,
     Directions,
+    Hypothesis,
     RingEffect,
     Settings,
     apply,
@@ -27,9 +28,6 @@ from tmlattice.effects import (
 from tmlattice.effects.directions import directions, kept_directions, ring_effect, sitting_on
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import LayerMaps, RingMaps, ring_maps
-
-Hypothesis = tuple[str, str | None]
-"""An effect and its place."""
 
 MADE = 10_000
 """Changed layers in memory: some 20 MB."""
@@ -75,16 +73,11 @@ class Assembly:
         """Relative energy that the design orbit loses in a turn by the known causes."""
         return sum(element.errors.loss for element in self.ring.elements)
 
-    def set(self, settings: Settings) -> dict[int, Element]:
-        """Return the elements that settings change, with the known causes."""
+    def changed(self, settings: Settings, causes: Sequence[Cause] = ()) -> dict[int, Element]:
+        """Return the elements that settings and further causes change, with the known causes."""
         changed = set_elements(self.design, settings)
         for place in changed:
             changed[place] = self._with(changed[place], self._known_at.get(place, ()))
-        return changed
-
-    def changed(self, settings: Settings, causes: Sequence[Cause]) -> dict[int, Element]:
-        """Return the elements that settings and further causes change."""
-        changed = self.set(settings)
         for cause in on_ring(causes):
             for place in _members(self.design, cause):
                 element = changed.get(place, self.ring.elements[place])
@@ -190,7 +183,7 @@ class Group:
         self.active = active
         self.there = there
         self.layers = Layers.of(there.maps, there.third)
-        self.replaced = there.set(settings)
+        self.replaced = there.changed(settings)
         own = there.layers_with(self.replaced)
         self.touched = frozenset(own)
         self.layers.put(own)

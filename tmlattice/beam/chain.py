@@ -67,15 +67,9 @@ def first_pass(weights: Sequence[Array], maps: RingMaps, start: Array) -> tuple[
     """Return states [block, layer + 1, n, lane] and readings [block, monitor, 2, lane], from
     launches [batch, n]."""
     W0, W1, W2 = weights
-    size = sweeps.size_of(start.shape[1], len(start))
-    packed = sweeps.pack(start, len(size[1]))
-    states = np.empty((len(packed), len(W0) + 1, *packed.shape[1:]))
-    states[:, 0] = packed
-    sweeps.run(sweeps.forward, len(packed), size, W0, W1, W2, curved(W2), states)
-    readings = np.empty((len(packed), len(maps.at), 2, len(size[1])))
-    out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
-    sweeps.run(sweeps.read, len(packed), size, *out, states, readings)
-    return states, readings
+    size, states = sweeps.begun(start, len(W0) + 1)
+    sweeps.run(sweeps.forward, len(states), size, W0, W1, W2, curved(W2), states)
+    return states, sweeps.read_out(maps, size, states)
 
 
 class LayerChain:
@@ -129,10 +123,7 @@ class LayerChain:
         Lost trajectories are not reported: their states grow or become infinite.
         """
         start = self._start(launch)
-        size = sweeps.size_of(self.dimension, len(start))
-        packed = sweeps.pack(start, len(size[1]))
-        states = np.empty((len(packed), len(self.layers) + 1, *packed.shape[1:]))
-        states[:, 0] = packed
+        size, states = sweeps.begun(start, len(self.layers) + 1)
         self._forward(size, states)
         return sweeps.unpack(states, len(start))
 
@@ -162,10 +153,7 @@ class LayerChain:
 
     def _turns(self, start: Array, turns: int) -> Array:
         """States [batch, turns + 1, n] at the start of every turn, from `start` [batch, n]."""
-        size = sweeps.size_of(self.dimension, len(start))
-        packed = sweeps.pack(start, len(size[1]))
-        history = np.empty((len(packed), turns + 1, *packed.shape[1:]))
-        history[:, 0] = packed
+        size, history = sweeps.begun(start, turns + 1)
         self._track(size, history)
         return sweeps.unpack(history, len(start))
 
@@ -266,7 +254,7 @@ class Chain(LayerChain):
         """Return (x, y) at every monitor on one pass, [batch, monitor, 2], m."""
         start = self._start(launch)
         states, readings = first_pass(self.weights(), self.maps, start)
-        check_alive(states, self.maps, sweeps.size_of(self.dimension, len(start)), len(start))
+        check_alive(states, self.maps)
         return sweeps.unpack(readings, len(start))
 
     def turn(self) -> Layers:
@@ -282,8 +270,7 @@ class Chain(LayerChain):
         sweeps.run(sweeps.track, len(history), size, *turn.W, turn.curved, history)
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state /
-        d launch there, [layer + 2, n, n]."""
+        """Return what `LayerChain.tangents` states."""
         turn, n = self.turn(), self.dimension
         states = np.empty((1, turn.steps + 1, n))
         tangents = np.empty((*states.shape, n))

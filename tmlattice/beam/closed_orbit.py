@@ -260,7 +260,8 @@ class ResponseModel:
                 )
             planes.append(CORRECTORS[element.kind])
         layer = self.layers.layer_of[place] if len(place) else np.empty(0, dtype=np.int64)
-        kick, slope = self._kicks(place, layer)
+        # at their layers' exits; the slopes by the state at the entrances
+        kick, slope = self._per_kick(place, layer)(self.path[layer])
         if turned:
             kick, slope = _turned(kick), _turned(slope)
         launch_kick = np.einsum("cij,cj->ci", self.inverse[layer + 1], kick)
@@ -278,13 +279,7 @@ class ResponseModel:
     def response(self, correctors: Sequence[str] | None = None, turned: bool = False) -> Array:
         """d (closed orbit) / d kick at fixed RF frequency, m/rad, [corrector, monitor, 2].
 
-        Args:
-            correctors: names; None: all of the ring, in beam order.
-            turned: with their kicks turned by a right angle, from x towards y.
-
-        Raises:
-            UnknownNameError: no such element.
-            MeasurementError: an element that is not a corrector.
+        Arguments and errors are those of `columns`.
         """
         columns = self.columns(correctors, turned)
         slopes = self.reading_slopes
@@ -355,17 +350,6 @@ class ResponseModel:
         """
         up, down = (self.at_frequency(self.frequency + side * step / 2) for side in (1, -1))
         return up.readings - down.readings
-
-    def _kicks(self, place: Indices, layer: Indices) -> tuple[Array, Array]:
-        """Correctors' kicks at their layers' exits, [column, n], and their slopes by the state at
-        the entrances, [column, n, n]."""
-        per_kick = self._per_kick(place, layer)
-        x = self.path[layer]
-        bent = np.zeros_like(per_kick.R)
-        if per_kick.T is not None:
-            bent = (per_kick.T @ x[:, None, :, None])[..., 0]
-        kick = per_kick.B + ((per_kick.R + bent) @ x[:, :, None])[..., 0]
-        return kick, per_kick.R + 2 * bent
 
     def _per_kick(self, place: Indices, layer: Indices) -> Quadratic:
         """Derivatives of layers' maps by their correctors' kicks, [column, ...]."""

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from tmlattice.arrays import Array, Indices
 from tmlattice.beam import tangents as kernels
-from tmlattice.beam.assembly import Group, Hypothesis
+from tmlattice.beam.assembly import Group
 from tmlattice.beam.threads import share
 from tmlattice.beam.tracked import LAUNCH, Kicks, Paths, TrackedShots
 from tmlattice.effects import (
     CATALOGUE,
     Cause,
+    Hypothesis,
     LaunchEffect,
     Monitors,
     ReadingEffect,

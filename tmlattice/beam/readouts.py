@@ -53,12 +53,9 @@ def positions(launches: Array, turns: int, layers: Layers, cavities: Cavities = 
         turns: at least 1.
         cavities: in six coordinates; none on a single turn.
     """
-    n, at = launches.shape[1], layers.at
-    size = sweeps.size_of(n, len(launches))
-    lanes = len(size[1])
-    states = np.empty((-(-len(launches) // lanes), layers.steps + 1, n, lanes))
-    states[:, 0] = sweeps.pack(launches, lanes)
-    readings = np.empty((len(states), len(at), 2, lanes))
+    at = layers.at
+    size, states = sweeps.begun(launches, layers.steps + 1)
+    readings = np.empty((len(states), len(at), 2, len(size[1])))
     beam = np.empty((len(launches), turns, len(at), 2))
     bends, bent = layers.curved, curved(layers.R[2])
     alive = np.ones(len(launches), dtype=bool)

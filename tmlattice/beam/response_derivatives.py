@@ -13,7 +13,7 @@ C^-1 (...) C over the layers before j, an error's change of the whole response i
 each monitor (its reading of a launch changes) and for each column (its launch changes): `Factors`.
 """
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -23,35 +23,14 @@ from scipy.sparse import csr_array
 from tmlattice.arrays import AT_ONCE, Array, Indices
 from tmlattice.beam.closed_orbit import KICK, ResponseModel, feed_down
 from tmlattice.compiled import jit_sums
-from tmlattice.effects import RingEffect, directions, find
+from tmlattice.effects import Hypothesis, RingEffect, directions, find
 from tmlattice.effects.directions import STEP, Directions, ring_effect
 from tmlattice.errors import EffectError
 from tmlattice.maps.quadratic import Quadratic, slopes, stacked
 from tmlattice.maps.taylor import second_derivatives
 
-Hypothesis = tuple[str, str | None]
-
 STILL = 1e-12
 """m and rad per unit: smaller kicks of an error are taken as no change of the closed orbit."""
-
-
-def derivatives(
-    model: ResponseModel,
-    hypotheses: Sequence[Hypothesis],
-    correctors: Sequence[str] | None = None,
-) -> Iterator[Array]:
-    """Yield d (orbit response) / d amount of effects.
-
-    Args:
-        correctors: names; None: all of the ring, in beam order.
-
-    Yields:
-        For each hypothesis [corrector + 1, monitor, 2]: m/rad per unit for the correctors; and in
-        the last row the RF's, m per relative step per unit, 0 in four coordinates.
-    """
-    slopes = ResponseSlopes(model, correctors)
-    _check(hypotheses)
-    return (slopes.whole(slopes.factors([hypothesis]))[0] for hypothesis in hypotheses)
 
 
 def kicks_on_orbit(model: ResponseModel, d: Directions) -> tuple[Array, Array]:
@@ -61,12 +40,6 @@ def kicks_on_orbit(model: ResponseModel, d: Directions) -> tuple[Array, Array]:
     bent = (second_derivatives(d.D2) @ x[:, None])[..., 0]
     kick = d.D0[..., None] + (d.D1 + bent / 2) @ x
     return (model.inverse[d.layer + 1] @ kick)[..., 0], d.D1 + bent
-
-
-def _check(hypotheses: Sequence[Hypothesis]) -> None:
-    for name, _ in hypotheses:
-        if not isinstance(find(name), RingEffect):
-            raise EffectError(f"'{name}' does not act on the ring; it has no such derivative")
 
 
 class Factors(NamedTuple):
@@ -101,7 +74,7 @@ class ResponseSlopes:
     """Derivatives of one response.
 
     Args:
-        model, correctors: see `derivatives`.
+        correctors: names; None: all of the ring, in beam order.
 
     Attributes:
         start, launch_kick: each column's change of the launch per unit, and its kick as a further
@@ -128,7 +101,9 @@ class ResponseSlopes:
         self._mixes: dict[Hashable, Quadratic] = {}
 
     def whole(self, change: Factors) -> Array:
-        """Derivatives of the whole response, [error, column, monitor, 2]: see `derivatives`."""
+        """Derivatives of the whole response, [error, column, monitor, 2]: m/rad per unit of the
+        error for the correctors; in the last column the RF's, m per relative step per unit, 0 in
+        four coordinates."""
         at = np.arange(len(self.readings))
         return np.stack(
             [self.picked(change, at, np.full(len(self.start), p)) for p in (0, 1)], axis=3
@@ -171,7 +146,9 @@ class ResponseSlopes:
         Raises:
             EffectError: an effect that does not act on the ring.
         """
-        _check(hypotheses)
+        for name, _ in hypotheses:
+            if not isinstance(find(name), RingEffect):
+                raise EffectError(f"'{name}' does not act on the ring; it has no such derivative")
         n, errors = self.model.dimension, len(hypotheses)
         out = Factors(
             np.empty((errors, *self.readings.shape)), *np.empty((2, errors, len(self.start), n))
@@ -253,9 +230,7 @@ class ResponseSlopes:
         for i in effect.members(model.ring, place):
             for c in self._at.get(i, ()):
                 k = int(columns.layer[c])
-                w0, w1, w2 = self._mix(effect, i).after(model.layers.way(k)).reduced()
-                x = model.path[k]
-                image = w0 + (w1 + second_derivatives(w2[None])[0] @ x / 2) @ x
+                image, _ = self._mix(effect, i).after(model.layers.way(k))(model.path[k])
                 mixed[c] = model.inverse[k + 1] @ image
         return mixed
 

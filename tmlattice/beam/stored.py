@@ -29,11 +29,10 @@ from tmlattice.arrays import Array, ComplexArray, Indices
 from tmlattice.beam.closed_orbit import ResponseModel, feed_down
 from tmlattice.beam.response_derivatives import STILL, kicks_on_orbit
 from tmlattice.beam.rf import NO_RF, Cavities
+from tmlattice.effects import Hypothesis
 from tmlattice.effects.directions import directions_nearby
 from tmlattice.errors import UnstableRingError
 from tmlattice.maps.taylor import second_derivatives
-
-Hypothesis = tuple[str, str | None]
 
 TRANSVERSE = 4
 """Coordinates of the betatron motion; energy and path length are those of the closed orbit."""
@@ -166,12 +165,12 @@ class StoredBeam:
         whole = S - first + ((z + w) @ bends[-1].reshape(-1, n).T).reshape(rows, n, n)
         late = G @ ((S - first) @ U).transpose(1, 2, 0).reshape(n, -1)  # [monitor 2, mode row]
         seen = late.reshape(len(at), 2, 2, rows).transpose(3, 0, 1, 2)
-        if np.abs(w).max(initial=0.0) > STILL:
-            moves = self._seen_bends
-            seen = seen + (w @ moves).view(complex).reshape(*shape, 2)
-            seen = behind[..., None, None] * seen + (z @ moves).view(complex).reshape(*shape, 2)
-        else:
-            seen = behind[..., None, None] * seen
+        moving = np.abs(w).max(initial=0.0) > STILL
+        if moving:
+            seen = seen + (w @ self._seen_bends).view(complex).reshape(*shape, 2)
+        seen = behind[..., None, None] * seen
+        if moving:
+            seen += (z @ self._seen_bends).view(complex).reshape(*shape, 2)
         return whole, seen
 
     @cached_property

@@ -22,6 +22,7 @@ from tmlattice.arrays import Array, Flags
 from tmlattice.beam.nonlinear import bend_state
 from tmlattice.beam.threads import share
 from tmlattice.compiled import jit, jit_sums
+from tmlattice.maps import RingMaps
 
 Size = tuple[tuple[None, ...], tuple[None, ...]]
 
@@ -222,6 +223,24 @@ def pack(rows: Array, lanes: int) -> Array:
     padded[: len(rows)] = rows
     folded = padded.reshape(blocks, lanes, *rows.shape[1:])
     return np.ascontiguousarray(np.moveaxis(folded, 1, -1))
+
+
+def begun(start: Array, exits: int) -> tuple[Size, Array]:
+    """Return the size for launches [batch, n], and states [block, exit, n, lane] of which the first
+    exit holds the launches; the others are empty."""
+    size = size_of(start.shape[1], len(start))
+    packed = pack(start, len(size[1]))
+    states = np.empty((len(packed), exits, *packed.shape[1:]))
+    states[:, 0] = packed
+    return size, states
+
+
+def read_out(maps: RingMaps, size: Size, states: Array) -> Array:
+    """Return the readings [block, monitor, 2, lane] of states [block, layer + 1, n, lane]."""
+    readings = np.empty((len(states), len(maps.at), 2, len(size[1])))
+    out = maps.R0, maps.R1, maps.R2, curved(maps.R2), maps.at
+    run(read, len(states), size, *out, states, readings)
+    return readings
 
 
 def unpack(blocks: Array, batch: int) -> Array:

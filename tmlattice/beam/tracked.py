@@ -182,13 +182,11 @@ class TrackedShots:
     def beam(self, launches: Array, causes: Sequence[Cause] = (), kicks: Kicks = NO_KICKS) -> Array:
         """Return the beam's position, [shot, reading, 2], m; NaN where it is lost."""
         states = self._states(launches)
-        weights, nodes = (np.ones(1), states[None])
-        if self.dimension == 6:
-            weights, nodes = beams(states, causes)
+        still = beams(states, ())
+        moved = beams(states, causes) if self.dimension == 6 else still
         total = np.zeros((self.shots, self.turns * len(self.at), 2))
         for group, shots, rf in self._runs(causes, kicks):
-            beam = (weights, nodes) if group.active else (np.ones(1), states[None])
-            for weight, node in zip(*beam, strict=True):
+            for weight, node in zip(*(moved if group.active else still), strict=True):
                 found = positions(node[shots], self.turns, group.layers, rf)
                 total[shots] += weight * found.reshape(len(found), -1, 2)
         return total

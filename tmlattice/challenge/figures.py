@@ -159,8 +159,8 @@ def calibration(rows: Sequence[Row]) -> list[dict[str, Any]]:
     out = []
     for low, high in pairwise(PROBABILITIES):
         some = [pair for pair in both if low <= pair[0] < (high if high < 1 else 2)]
-        mean = float(np.mean([p for p, _ in some])) if some else None
-        out.append({"from": low, "to": high, "stated": mean, "true": rate([t for _, t in some])})
+        mean, true = _mean([p for p, _ in some]), rate([t for _, t in some])
+        out.append({"from": low, "to": high, "stated": mean, "true": true})
     return out
 
 
@@ -175,9 +175,9 @@ def coverage(rows: Sequence[Row]) -> dict[str, Any]:
     ]
     return {
         "holds_truth": rate([a["in_set"] for a in named]),
-        "mean_stated_mass": float(np.mean([a["mass"] for a in named])) if named else None,
-        "median_elements": float(np.median([a["elements"] for a in strong])) if strong else None,
-        "median_members": float(np.median([a["members"] for a in strong])) if strong else None,
+        "mean_stated_mass": _mean([a["mass"] for a in named]),
+        "median_elements": _quantiles([a["elements"] for a in strong])["median"],
+        "median_members": _quantiles([a["members"] for a in strong])["median"],
         "no_larger_than_oracle": rate([tool <= own for tool, own in oracle]),
     }
 

@@ -6,6 +6,7 @@ out. With distributed errors the noise is that of both (Mahalanobis).
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from tmlattice.inference.newton import fit
 from tmlattice.inference.problem import Problem
 from tmlattice.lattice import Ring
 from tmlattice.machine import simulate, stored_beam
+from tmlattice.machine.machine import StoredSimulation
 from tmlattice.machine.response import NOISE, simulate_response
 from tmlattice.machine.shots import stream
 from tmlattice.measurement import AnyMeasurement
@@ -84,28 +86,20 @@ def measure(
     kind: str, ring: Ring, causes: Sequence[Cause], noise: float, shots: int, **own: Any
 ) -> AnyMeasurement:
     """Return one measurement of a machine by AT."""
-    fine = tuple(noise * rms for rms in NOISE)
-    made: Mapping[str, Callable[[], Any]] = {
-        "trajectory": lambda: simulate(
-            ring, causes, shots=shots, noise=noise * READING_NOISE, **own
-        ).measurement(),
-        "turn_by_turn": lambda: stored_beam.simulate_turns(
-            ring, causes, shots=shots, turns=TURNS, noise=noise * stored_beam.TURN_NOISE, **own
-        ).measured,
-        "closed_orbit": lambda: stored_beam.simulate_orbits(
-            ring, causes, noise=fine, **own
-        ).measured,
-        "dispersion": lambda: stored_beam.simulate_dispersion(
-            ring, causes, noise=fine, **own
-        ).measured,
-        "tunes": lambda: stored_beam.simulate_tunes(
-            ring, causes, noise=[noise * rms for rms in stored_beam.TUNE_NOISE], **own
-        ).measured,
-        "orbit_response": lambda: simulate_response(
-            ring, causes, noise=fine, progress=False, **own
-        ).measured,
-    }  # fmt: skip
-    measured: AnyMeasurement = made[kind]()
+    if kind == "trajectory":
+        own |= {"shots": shots, "noise": noise * READING_NOISE}
+        return simulate(ring, causes, **own).measurement()
+    usual: Mapping[str, tuple[Callable[..., StoredSimulation], Any]] = {
+        "turn_by_turn": (stored_beam.simulate_turns, stored_beam.TURN_NOISE),
+        "closed_orbit": (stored_beam.simulate_orbits, NOISE),
+        "dispersion": (stored_beam.simulate_dispersion, NOISE),
+        "tunes": (stored_beam.simulate_tunes, stored_beam.TUNE_NOISE),
+        "orbit_response": (partial(simulate_response, progress=False), NOISE),
+    }
+    simulated, rms = usual[kind]
+    if kind == "turn_by_turn":
+        own |= {"shots": shots, "turns": TURNS}
+    measured: AnyMeasurement = simulated(ring, causes, noise=noise * np.array(rms), **own).measured
     return measured
 
 
@@ -245,9 +239,9 @@ def kinds_case(asked: CaseSettings, number: int, name: str) -> tuple[Case, Truth
     parts = {**measured, **({BEFORE + kind: healthy[kind] for kind in kinds} if pair else {})}
     options = {"background": background} if background and asked.known_rms else {}
     case = Case(name, asked.lattice, parts, options, kinds)
-    sizes = (total,) if len(causes) == 1 else ()
     truth = Truth(
-        name, asked.tier, causes, None, sizes, total, background, 0.0, noise, seed, {}, {}, alone,
+        name, asked.tier, causes, None, (total,) * len(causes), total, background, 0.0, noise, seed,
+        {}, {}, alone,
     )  # fmt: skip
     return case, truth, draw
 

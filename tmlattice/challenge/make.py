@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from tqdm.auto import tqdm
 
-from tmlattice.arrays import Array
+from tmlattice.arrays import Array, Flags
 from tmlattice.batch import fingerprint
 from tmlattice.challenge.case import (
     CONTENTS,
@@ -35,13 +35,14 @@ from tmlattice.challenge.kinds import (
 )
 from tmlattice.challenge.unknown import DISCRETE, LARGEST, Unknown, clean_readings
 from tmlattice.effects import Cause, Settings, background_rms, find, modelled, monitors_with, names
-from tmlattice.errors import TmlatticeError, UnstableRingError
+from tmlattice.errors import TmlatticeError, UnstableRingError, unknown_choice
 from tmlattice.files import output_file, write_json
 from tmlattice.input_files import json_of
 from tmlattice.lattice import Ring
 from tmlattice.lattice.load import contents
 from tmlattice.machine import Machine, Shots, draw_background, draw_shots
 from tmlattice.machine.shots import stream
+from tmlattice.machine.simulate import measured
 from tmlattice.measurement import AnyMeasurement, Measurement
 
 SIGNAL = (5.0, 100.0)
@@ -104,7 +105,7 @@ def make(
         TmlatticeError: another tier, or a folder of another challenge.
     """
     if tier not in TIERS:
-        raise TmlatticeError(f"no tier '{tier}'; there are {', '.join(TIERS)}")
+        raise unknown_choice("tier", tier, TIERS)
     kinds = _kinds(tier, kinds)
     _check(tier, kinds, reference, learnt, known_rms, bool(background))
     if correctors is not None and not learnt:
@@ -224,7 +225,7 @@ def _kinds(tier: str, asked: Sequence[str]) -> tuple[str, ...]:
         raise TmlatticeError("kinds are chosen for tiers E, M and P; leave --kind out")
     for kind in asked:
         if kind not in RECORDS:
-            raise TmlatticeError(f"no kind '{kind}'; there are {', '.join(RECORDS)}")
+            raise unknown_choice("kind", kind, RECORDS)
     if tier == "M" and len(set(asked)) < 2:
         raise TmlatticeError("tier M is of kinds together; name at least two of them")
     return tuple(dict.fromkeys(asked))
@@ -295,7 +296,7 @@ class CaseDraw:
             options["background"] = self.background
         causes: list[Cause] = []
         unknown: dict[str, Any] | None = None
-        clean, sizes = healthy, []
+        clean, sizes, total = healthy, [], 0.0
         if self.asked.tier != "E":
             ruler = Ruler(
                 quiet_problem(self.ring, launches, settings, self.noise, self.background, before)
@@ -316,10 +317,9 @@ class CaseDraw:
                 sizes = [self._size(ruler, self._readings([c]) - healthy, [c]) for c in causes]
             total = self._size(ruler, clean - healthy, causes)
             sizes = sizes or [total]
-        else:
-            total = 0.0
-        case = self._case(name, clean, causes, options)
-        clean = self._frozen(clean, case, causes)
+        frozen = monitors_with(self.ring, causes).frozen
+        case = self._case(name, clean, frozen, options)
+        clean = np.where(frozen[:, None], case.fit.readings[0, 0], clean)
         parts = {"fit": clean[fit], "heldout": clean[self.asked.shots :], "before": healthy[fit]}
         true = {"fit": _five(self.shots)[fit], "heldout": _five(self.shots)[self.asked.shots :]}
         if self.before is not None:
@@ -376,49 +376,24 @@ class CaseDraw:
         return ruler.size(change[: self.asked.shots])
 
     # --- what is written ------------------------------------------------------------------------
-    def _case(
-        self, name: str, clean: Array, causes: Sequence[Cause], options: dict[str, Any]
-    ) -> Case:
+    def _case(self, name: str, clean: Array, frozen: Flags, options: dict[str, Any]) -> Case:
         noise = stream(self.seed, "reading noise").standard_normal(clean.shape)
         readings = clean + self.noise * noise
-        for at in self._frozen_monitors(causes):
-            readings[:, at] = readings[0, at]
+        readings[:, frozen] = readings[0, frozen]
         first = self._measurement(self.shots, readings)
         shots = list(range(len(self.shots)))
-        reference = None
-        if self.before is not None:
-            quiet = clean_readings(Machine(self.ring, self.small), self.before)
-            noise = stream(self.seed, "reference noise").standard_normal(quiet.shape)
-            reference = self._measurement(self.before, quiet + self.noise * noise)
         parts: dict[str, AnyMeasurement] = {
             "fit": first.select(shots[: self.asked.shots]),
             "heldout": first.select(shots[self.asked.shots :]),
         }
-        if reference is not None:
-            parts["reference"] = reference
+        if self.before is not None:
+            quiet = clean_readings(Machine(self.ring, self.small), self.before)
+            noise = stream(self.seed, "reference noise").standard_normal(quiet.shape)
+            parts["reference"] = self._measurement(self.before, quiet + self.noise * noise)
         return Case(name, self.asked.lattice, parts, options)
 
     def _measurement(self, shots: Shots, readings: Array) -> Measurement:
-        monitors = tuple(monitor.name for monitor in self.ring.monitors)
-        return Measurement(
-            launches=shots.nominal,
-            readings=readings[:, None],
-            monitors=monitors,
-            noise=np.full((len(monitors), 2), self.noise),
-            launch_sigma=np.tile(shots.sigma, (len(shots), 1)),
-            settings=shots.settings,
-            lattice=self.ring.name,
-            energy=self.ring.energy,
-        )
-
-    def _frozen_monitors(self, causes: Sequence[Cause]) -> list[int]:
-        return [int(at) for at in np.flatnonzero(monitors_with(self.ring, causes).frozen)]
-
-    def _frozen(self, clean: Array, case: Case, causes: Sequence[Cause]) -> Array:
-        clean = clean.copy()
-        for at in self._frozen_monitors(causes):
-            clean[:, at] = case.fit.readings[0, 0, at]
-        return clean
+        return measured(self.ring, shots, readings[:, None], np.full(2, self.noise))
 
 
 def _five(shots: Shots) -> Array:

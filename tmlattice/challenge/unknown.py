@@ -1,13 +1,12 @@
 """Faults outside the catalogue, tracked by AT."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.effects import Cause, Settings
-from tmlattice.lattice import Ring
+from tmlattice.lattice import Element, Ring
 from tmlattice.machine import Machine, Shots
 from tmlattice.machine.at_engine import AtEngine
 
@@ -55,17 +54,15 @@ class Unknown:
     def __init__(
         self, ring: Ring, kind: str, shots: Shots, clean: Array, random: np.random.Generator
     ) -> None:
-        kinds: dict[str, Callable[[Any], bool]] = {
-            "hysteresis": lambda e: e.kind == "quadrupole" and e.k1 != 0,
-            "octupole": lambda e: e.kind == "quadrupole" and e.k1 != 0,
-            "kick_jitter": lambda e: e.kind in ("hcorrector", "vcorrector"),
-        }
         self.ring, self.kind, self.shots, self.clean = ring, kind, shots, clean
-        monitors = ring.monitors[:-1] if kind == "exchanged_cables" else ring.monitors
-        sits_on = kinds.get(kind)
-        places = monitors if sits_on is None else [e for e in ring.elements if sits_on(e)]
+        places: Sequence[Element]
+        if kind in ("hysteresis", "octupole"):
+            places = [e for e in ring.elements if e.kind == "quadrupole" and e.k1 != 0]
+        elif kind == "kick_jitter":
+            places = [e for e in ring.elements if e.kind in ("hcorrector", "vcorrector")]
+        else:
+            places = ring.monitors[:-1] if kind == "exchanged_cables" else ring.monitors
         self.element = places[int(random.integers(len(places)))]
-        self.at = [m.name for m in ring.monitors].index(self.element.name) if not sits_on else -1
         self.sign = np.where(random.permutation(len(shots)) % 2, 1.0, -1.0)
         self.draw = random.standard_normal(len(shots))
 
@@ -101,13 +98,14 @@ class Unknown:
 
     def _misread(self, amount: float) -> Array:
         out = self.clean.copy()
-        x, y = self.clean[:, self.at].T
+        at = [monitor.name for monitor in self.ring.monitors].index(self.element.name)
+        x, y = self.clean[:, at].T
         if self.kind == "monitor_cubic":
-            out[:, self.at] += amount * self.clean[:, self.at] ** 3
+            out[:, at] += amount * self.clean[:, at] ** 3
         elif self.kind == "monitor_quadratic":
-            out[:, self.at] += amount * np.stack([x**2 - y**2, -2 * x * y], axis=1)
+            out[:, at] += amount * np.stack([x**2 - y**2, -2 * x * y], axis=1)
         else:
-            out[:, [self.at, self.at + 1]] = self.clean[:, [self.at + 1, self.at]]
+            out[:, [at, at + 1]] = self.clean[:, [at + 1, at]]
         return out
 
 

@@ -22,8 +22,6 @@ from tmlattice.cli.options import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-FAILED = 1
-
 METHODS = {
     "tool": "diagnose",
     "oracle": "oracle",
@@ -121,7 +119,7 @@ def run(context: click.Context, folder: Path, workers: dict[str, Any], lattice: 
     for name, error in failed.items():
         screen.print(f"case {name}: {error}")
     if failed:
-        context.exit(FAILED)
+        context.exit(1)
 
 
 @challenge.command("score", cls=Careful)
@@ -193,12 +191,9 @@ def print_score(screen: "Console", result: dict[str, Any]) -> None:
     if "exact" in result:
         exact, above = result["exact"], result["exact_above_10"]
         rows = ((METHODS[n], _share(exact[n]), _share(above.get(n))) for n in METHODS if n in exact)
-        head: tuple[str, ...] = (
-            "all causes found, up to equivalence",
-            "all cases",
-            "each above 10",
+        screen.print(
+            table("all causes found, up to equivalence", "all cases", "each above 10", rows=rows)
         )
-        screen.print(table(*head, rows=rows))
     if "methods" in result:
         _print_methods(screen, "signal to noise >= 10", result["methods"])
         for name, methods in result["bands"].items():

@@ -22,8 +22,6 @@ from tmlattice.cli.options import (
 if TYPE_CHECKING:
     from tmlattice.diagnosis.signals import Checkup
 
-WRONG = 1
-
 
 @click.command("check", cls=OfMachine)
 @lattice_argument
@@ -58,7 +56,7 @@ def check(
         write(document)
     _print(found, json_file)
     if found.status == "wrong":
-        context.exit(WRONG)
+        context.exit(1)
 
 
 def _print(found: "Checkup", json_file: Path | None) -> None:

@@ -164,8 +164,8 @@ def simulate(
     if options["noise"] is None and machine is not None and kind in ("trajectory", "turn-by-turn"):
         options["noise"] = machine.stated.noise
     _warn_of_large(effects)
-    causes = [Cause(find(name).name, element, amount) for name, element, amount in effects]
-    causes = [_named(ring, cause) for cause in causes]
+    causes = [Cause(find(name).name, _place(ring, name, element), amount)
+              for name, element, amount in effects]  # fmt: skip
     options["background"] = dict(options["background"])
     options["correctors"] = options["correctors"] or None
     options["settings"] = _settings(options["settings"])
@@ -257,16 +257,8 @@ def _print_causes(ring: Any, causes: list[Any]) -> None:
     from tmlattice.effects import find
 
     places = {element.name: f"{element.s:.2f}" for element in ring.elements}
-    rows = [
-        (
-            c.effect,
-            c.element or "-",
-            places.get(c.element, "-"),
-            f"{c.amount:g}",
-            find(c.effect).unit,
-        )
-        for c in causes
-    ]
+    rows = [(c.effect, c.element or "-", places.get(c.element, "-"), f"{c.amount:g}",
+             find(c.effect).unit) for c in causes]  # fmt: skip
     if rows:
         console().print(table("effect", "element", "s [m]", "amount", "unit", rows=rows))
 
@@ -300,18 +292,14 @@ def _warn_of_large(effects: tuple[tuple[str, str | None, float], ...]) -> None:
             )
 
 
-def _named(ring: Any, cause: Any) -> Any:
-    """The cause with its element's name as the ring spells it."""
-    from dataclasses import replace
-
+def _place(ring: Any, effect: str, element: str | None) -> str | None:
+    """The place of an effect as the ring spells it; one that there is not, as it is given."""
     from tmlattice.effects import find
 
-    if cause.element is None:
-        return cause
-    for place in find(cause.effect).places(ring):
-        if place is not None and place.casefold() == cause.element.casefold():
-            return replace(cause, element=place)
-    return cause
+    if element is None:
+        return None
+    spelt = {place.casefold(): place for place in find(effect).places(ring) if place is not None}
+    return spelt.get(element.casefold(), element)
 
 
 def _settings(path: Path | None) -> list[dict[str, dict[str, float]]]:

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tmlattice.arrays import Array, pair
-from tmlattice.beam.assembly import Assembly, Hypothesis, assembly
+from tmlattice.beam.assembly import Assembly, assembly
 from tmlattice.beam.chain import Chain
 from tmlattice.beam.layers import Layers
 from tmlattice.diagnosis.recommended_actions import compensated
 from tmlattice.diagnosis.records import named
-from tmlattice.effects import Cause, RingEffect, changed_elements, find
+from tmlattice.effects import Cause, Hypothesis, RingEffect, changed_elements, find
 from tmlattice.errors import TmlatticeError
 from tmlattice.lattice import Element, Ring
 from tmlattice.maps import TaylorMap

@@ -113,13 +113,11 @@ def groups(
     known: list[Settings] = []
     members: list[list[int]] = []
     for shot, setting in enumerate(settings):
-        for i, other in enumerate(known):
-            if other == setting:
-                members[i].append(shot)
-                break
-        else:
+        i = next((i for i, other in enumerate(known) if other == setting), len(known))
+        if i == len(known):
             known.append(setting)
-            members.append([shot])
+            members.append([])
+        members[i].append(shot)
     for setting, indices in zip(known, members, strict=True):
         yield np.array(indices), setting
 

@@ -48,10 +48,6 @@ class Build:
         """A thin kick of (d px / dx, d px / dy, d py / dx, d py / dy)."""
         self.slopes[where] = _sum(self.slopes[where], slopes)
 
-    def thin(self, where: Where) -> bool:
-        """Whether there is a thin kick."""
-        return where in self.gradients or where in self.slopes
-
 
 def _sum(old: Sequence[float], new: Sequence[float]) -> tuple[float, ...]:
     return tuple(a + b for a, b in zip(old or (0.0,) * len(new), new, strict=True))

@@ -18,7 +18,7 @@ import numpy as np
 
 from tmlattice import cache
 from tmlattice.arrays import Array, Indices
-from tmlattice.effects.effect import FamilyEffect, RingEffect, find
+from tmlattice.effects.effect import FamilyEffect, Hypothesis, RingEffect, find
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.ring import KEPT
 from tmlattice.maps import LayerMaps
@@ -40,7 +40,7 @@ class Directions:
         E0, E1, E2: d read-out / d amount, [read, 2], [read, 2, n], [read, 2, n (n + 1) / 2].
     """
 
-    hypotheses: tuple[tuple[str, str | None], ...]
+    hypotheses: tuple[Hypothesis, ...]
     owner: Indices
     layer: Indices
     D0: Array
@@ -77,13 +77,9 @@ MANY = 100
 """Number of hypotheses from which directions are stored in the cache folder."""
 
 
-def kept_directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) -> Directions:
-    """Return `directions`, from the user's cache folder if they were computed before.
-
-    Args:
-        layers: of a ring as in its file.
-        hypotheses: (effect, place).
-    """
+def kept_directions(layers: LayerMaps, hypotheses: Sequence[Hypothesis]) -> Directions:
+    """Return `directions` in a ring as in its file, from the user's cache folder if they were
+    computed before."""
     file = layers.ring.memory.get(KEPT)
     if file is None or len(hypotheses) < MANY:
         return directions(layers, hypotheses)
@@ -98,9 +94,7 @@ def kept_directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | Non
     return found
 
 
-def _read(
-    layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]], content: bytes
-) -> Directions:
+def _read(layers: LayerMaps, hypotheses: Sequence[Hypothesis], content: bytes) -> Directions:
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         kept = Directions(tuple(hypotheses), **arrays)
     n, magnets, monitors = layers.dimension, len(layers.ring.magnets), len(layers.ring.monitors)
@@ -117,9 +111,7 @@ def _read(
     return kept
 
 
-def directions_nearby(
-    layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]
-) -> Directions:
+def directions_nearby(layers: LayerMaps, hypotheses: Sequence[Hypothesis]) -> Directions:
     """Return `directions`, cached with the maps; of changed maps only those of changed elements are
     computed anew."""
     key = ("directions", tuple(hypotheses))
@@ -138,7 +130,7 @@ def directions_nearby(
 
 
 def sitting_on(
-    before: Ring, after: Ring, hypotheses: Sequence[tuple[str, str | None]], places: Collection[int]
+    before: Ring, after: Ring, hypotheses: Sequence[Hypothesis], places: Collection[int]
 ) -> list[int]:
     """Indices of hypotheses on elements that differ, in one of two rings.
 
@@ -179,7 +171,7 @@ def ring_effect(name: str) -> RingEffect:
     return effect
 
 
-def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) -> Directions:
+def directions(layers: LayerMaps, hypotheses: Sequence[Hypothesis]) -> Directions:
     """Return the directions of effects in the weights of a ring's layers.
 
     Args:
@@ -194,7 +186,8 @@ def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) 
     ways: list[Quadratic] = []
     magnets: list[tuple[int, int, int]] = []  # owner, layer, pair
     others: list[tuple[int, int, int, float, list[Element]]] = []
-    rows, reads = _Rows(n, n), _Rows(2, n)
+    rows: list[_Row] = []
+    reads: list[_Row] = []
     first_monitor = np.concatenate([[0], np.cumsum([e.kind == "monitor" for e in ring.elements])])
     for owner, (name, place) in enumerate(hypotheses):
         effect = ring_effect(name)
@@ -224,19 +217,19 @@ def directions(layers: LayerMaps, hypotheses: Sequence[tuple[str, str | None]]) 
     layers.maps([element for *_, up_down in others for element in up_down])  # together
     for owner, k, member, h, up_down in others:
         (up, up_read), (down, down_read) = (layers.layer(k, {member: own}) for own in up_down)
-        rows.add(owner, k, _slope(up, down, h))
+        rows.append((owner, k, _slope(up, down, h)))
         start = first_monitor[layers.first_element(k)]
         for i, (a, b) in enumerate(zip(up_read, down_read, strict=True)):
             slope = _slope(a, b, h)
             if any(m.any() for m in slope):
-                reads.add(owner, int(start + i), slope)
+                reads.append((owner, int(start + i), slope))
     if magnets:
         maps = quadratic_maps(ends, ring.map_energy, n)
         each = slopes(maps, np.array(steps))[[own for own, _ in pairs]]
         D0, D1, D2 = each.after(stacked(ways, n)).reduced()
         for owner, k, pair in magnets:
-            rows.add(owner, k, (D0[pair], D1[pair], D2[pair]))
-    return Directions(tuple(hypotheses), *rows.stacked(), *reads.stacked())
+            rows.append((owner, k, (D0[pair], D1[pair], D2[pair])))
+    return Directions(tuple(hypotheses), *_stacked(rows, n, n), *_stacked(reads, 2, n))
 
 
 ARRAYS = ("owner", "layer", "D0", "D1", "D2", "read_owner", "monitor", "E0", "E1", "E2")
@@ -247,21 +240,17 @@ def _slope(up: Weights, down: Weights, h: float) -> Weights:
     return a, b, c
 
 
-class _Rows:
-    def __init__(self, height: int, n: int) -> None:
-        self._empty = tuple(
-            np.empty(shape)
-            for shape in ((0, height), (0, height, n), (0, height, n * (n + 1) // 2))
-        )
-        self._rows: list[tuple[int, int, Weights]] = []
+_Row = tuple[int, int, Weights]
+"""Owner, layer or monitor, and weights."""
 
-    def add(self, owner: int, at: int, weights: Weights) -> None:
-        self._rows.append((owner, at, weights))
 
-    def stacked(self) -> tuple[Indices, Indices, Array, Array, Array]:
-        owner = np.array([row[0] for row in self._rows], dtype=np.int64)
-        at = np.array([row[1] for row in self._rows], dtype=np.int64)
-        d0, d1, d2 = self._empty
-        if self._rows:
-            d0, d1, d2 = (np.stack([row[2][i] for row in self._rows]) for i in range(3))
-        return owner, at, d0, d1, d2
+def _stacked(
+    rows: Sequence[_Row], height: int, n: int
+) -> tuple[Indices, Indices, Array, Array, Array]:
+    owner = np.array([owner for owner, _, _ in rows], dtype=np.int64)
+    at = np.array([at for _, at, _ in rows], dtype=np.int64)
+    d0, d1, d2 = (
+        np.array([weights[i] for _, _, weights in rows]).reshape(-1, height, *order)
+        for i, order in enumerate(((), (n,), (n * (n + 1) // 2,)))
+    )
+    return owner, at, d0, d1, d2

@@ -29,6 +29,9 @@ Group = Literal[
 """Effects that a figure draws in one colour."""
 
 
+Hypothesis = tuple[str, str | None]
+"""An effect and its place."""
+
 MIN_STRENGTH = 0.01
 """Smallest remaining share of a strength."""
 
@@ -394,12 +397,14 @@ class ReadingEffect(Effect):
         return [monitor.name for monitor in ring.monitors]
 
     @abstractmethod
-    def change(self, beam: Array, amount: float) -> Array:
-        """Reading of the beam [..., 2] (x, y), m, with this amount alone, less beam."""
-
-    @abstractmethod
-    def set(self, monitors: "Monitors", at: int | slice, amount: float) -> None:
+    def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add this amount to one or some of `monitors`, in place."""
+
+    def change(self, beam: Array, amount: float) -> Array:
+        """Reading of the beam [..., 2] (x, y), m, with this amount alone, less beam; 0 if dead."""
+        alone = Monitors.perfect(1)
+        self.set(alone, 0, amount)
+        return np.asarray(beam @ (alone.matrix()[0] - np.eye(2)).T + alone.constant()[0])
 
 
 class LaunchEffect(Effect):

@@ -2,9 +2,6 @@
 
 from typing import ClassVar
 
-import numpy as np
-
-from tmlattice.arrays import Array
 from tmlattice.effects.effect import ReadingEffect, register
 from tmlattice.effects.reading import Monitors
 
@@ -21,12 +18,6 @@ class _Offset(ReadingEffect):
     background = 2e-4
     largest = 2e-3
     plane: int
-
-    def change(self, beam: Array, amount: float) -> Array:
-        """Return the offset."""
-        change = np.zeros_like(beam)
-        change[..., self.plane] = amount
-        return change
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the offset."""
@@ -67,12 +58,6 @@ class _Gain(ReadingEffect):
     background = 0.025
     largest = 2.0
     plane: int
-
-    def change(self, beam: Array, amount: float) -> Array:
-        """Return the change by the gain error."""
-        change = np.zeros_like(beam)
-        change[..., self.plane] = amount * beam[..., self.plane]
-        return change
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Multiply the gain."""
@@ -117,11 +102,6 @@ class MonitorRoll(ReadingEffect):
     background = 5e-3
     largest = 0.3
 
-    def change(self, beam: Array, amount: float) -> Array:
-        """Return the coordinates in rotated axes, less those in the ring's."""
-        cos, sin = np.cos(amount), np.sin(amount)
-        return np.asarray(beam @ np.array([[cos - 1, -sin], [sin, cos - 1]]))
-
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the angle."""
         monitors.roll[at] += amount
@@ -143,10 +123,6 @@ class MonitorCoupling(ReadingEffect):
     background = 5e-3
     largest = 0.3
 
-    def change(self, beam: Array, amount: float) -> Array:
-        """Return the share of the other plane."""
-        return np.asarray(amount * beam[..., ::-1])
-
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the coupling."""
         monitors.coupling[at] += amount
@@ -167,10 +143,6 @@ class MonitorSwap(ReadingEffect):
     sign = "1: x and y are swapped"
     largest = 1.0
     discrete = True
-
-    def change(self, beam: Array, amount: float) -> Array:
-        """Return the other plane less its own."""
-        return np.asarray(amount * (beam[..., ::-1] - beam))
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Swap the planes (0 does not)."""
@@ -194,10 +166,6 @@ class MonitorTurnOffset(ReadingEffect):
     of_turns = True
     whole = True
 
-    def change(self, beam: Array, amount: float) -> Array:
-        """Return nothing for a single turn."""
-        return np.zeros_like(beam)
-
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Add to the turn offset."""
         monitors.late[at] += amount
@@ -219,13 +187,6 @@ class MonitorDead(ReadingEffect):
     sign = "1: no signal; 2: frozen at its first reading of the measurement"
     largest = 2.0
     discrete = True
-
-    def change(self, beam: Array, amount: float) -> Array:
-        """Return no reading, or the first one of all, [shot, turn, ..., 2]."""
-        if amount == 1:
-            return np.full_like(beam, np.nan)
-        first = beam[(0,) * (beam.ndim - 1)] if amount == 2 else beam
-        return np.asarray(first - beam)
 
     def set(self, monitors: Monitors, at: int | slice, amount: float) -> None:
         """Silence or freeze the monitor."""

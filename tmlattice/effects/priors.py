@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tmlattice.effects.effect import CATALOGUE, RingEffect, find
+from tmlattice.effects.effect import CATALOGUE, Hypothesis, RingEffect, find
 from tmlattice.errors import EffectError
 from tmlattice.lattice import Ring
 
@@ -46,7 +46,7 @@ def background_rms(wanted: str | Mapping[str, float | None]) -> dict[str, float]
     return {name: rms for name, rms in chosen.items() if rms}
 
 
-def rare(ring: Ring, effects: Sequence[str]) -> dict[tuple[str, str | None], float]:
+def rare(ring: Ring, effects: Sequence[str]) -> dict[Hypothesis, float]:
     """Return the odds of each (effect, place) that is less probable than an ordinary fault.
 
     Args:

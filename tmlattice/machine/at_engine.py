@@ -50,9 +50,8 @@ Settings = Mapping[str, Mapping[str, float]]
 TURNS_AT_ONCE = 2**22
 """States of one block of AT's results, so that many turns fit into memory."""
 
-_CORRECTOR = frozenset({"hcorrector", "vcorrector"})
 SET_ON: Mapping[str, frozenset[str]] = {
-    "kick": _CORRECTOR,
+    "kick": frozenset({"hcorrector", "vcorrector"}),
     "k1_relative": frozenset({"quadrupole", "bend"}),
     "k2_relative": frozenset({"sextupole"}),
 }

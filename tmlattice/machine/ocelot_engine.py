@@ -1,14 +1,13 @@
 """The machine as the chain of OCELOT's maps, with the third order of sextupoles."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.beam.assembly import Group, assembly
 from tmlattice.beam.readouts import positions
-from tmlattice.beam.rf import NO_RF, rf_of
+from tmlattice.beam.rf import NO_RF
 from tmlattice.effects import Cause, Settings
 from tmlattice.effects.apply import groups
 from tmlattice.lattice import Ring
@@ -30,13 +29,10 @@ class OcelotEngine:
         scales = {"bends": radiation_bends, "wigglers": radiation_wigglers}
         lost = [Cause(f"radiation_loss_{what}", None, scale) for what, scale in scales.items()]
         known = [*causes, *(cause for cause in lost if cause.amount)]
-        self._there = replace(assembly(ring, known), rf=rf_of(ring))
+        self._there = assembly(ring, known)
 
     def track(
-        self,
-        launches: Array,
-        turns: int = 1,
-        settings: Sequence[Settings] | None = None,
+        self, launches: Array, turns: int = 1, settings: Sequence[Settings] | None = None
     ) -> Array:
         """Return the beam at every monitor, see `AtEngine.track`."""
         launches, there = np.asarray(launches, dtype=float), self._there

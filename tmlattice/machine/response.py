@@ -9,7 +9,7 @@ from tqdm.auto import tqdm
 
 from tmlattice.arrays import Array, rms
 from tmlattice.beam.closed_orbit import ResponseModel
-from tmlattice.beam.rf import rf_of
+from tmlattice.beam.rf import frequency_of, rf_of
 from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings, apply, monitors_with
 from tmlattice.lattice import Ring
@@ -127,8 +127,15 @@ class StoredMachine:
 
     @cached_property
     def energies(self) -> tuple[Array, Array]:
-        """Weights, and equivalent RF frequencies, of the beam's energies."""
-        return energies(self.ring, self.every)
+        """Weights of the Gauss-Hermite nodes of the beam's energy (three with an energy spread,
+        else one), and the RF frequency (relative) that is equivalent to each."""
+        spread, offset = spread_of(self.every), offset_of(self.every)
+        if spread == offset == 0:
+            return np.ones(1), np.zeros(1)
+        nodes = np.array([-1, 0, 1]) if spread else np.zeros(1)
+        weights = np.array([1, 4, 1]) / 6 if spread else np.ones(1)
+        per_energy = 1 / ResponseModel(apply(self.ring, self.every)).rf_start[5]
+        return weights, per_energy * (offset + np.sqrt(3) * spread * nodes)
 
     def at(self, settings: Sequence[Settings], frequency: float | None = None) -> list[Settings]:
         """Return the settings of each shot with a change of the RF frequency (relative); None: that
@@ -200,29 +207,12 @@ def _with_frequency(settings: Settings, relative: float) -> Settings:
     if relative == 0:
         return settings
     changed = {name: own for name, own in settings.items() if name.casefold() != "rf"}
-    before = sum(
-        own.get("frequency_relative", 0.0)
-        for name, own in settings.items()
-        if name.casefold() == "rf"
-    )
-    return changed | dict(rf_setting(before + relative))
+    return changed | dict(rf_setting(frequency_of(settings) + relative))
 
 
 def spread_of(causes: Sequence[Cause]) -> float:
     """Relative energy spread of the beam."""
     return float(np.sqrt(sum(c.amount**2 for c in causes if c.effect == "energy_spread")))
-
-
-def energies(ring: Ring, causes: Sequence[Cause]) -> tuple[Array, Array]:
-    """Weights of the Gauss-Hermite nodes of the beam's energy (three with an energy spread, else
-    one), and the RF frequency (relative) that is equivalent to each."""
-    spread, offset = spread_of(causes), offset_of(causes)
-    if spread == offset == 0:
-        return np.ones(1), np.zeros(1)
-    nodes = np.array([-1, 0, 1]) if spread else np.zeros(1)
-    weights = np.array([1, 4, 1]) / 6 if spread else np.ones(1)
-    per_energy = 1 / ResponseModel(apply(ring, causes)).rf_start[5]
-    return weights, per_energy * (offset + np.sqrt(3) * spread * nodes)
 
 
 def _map_orbits(

@@ -8,12 +8,28 @@ from typing import Any
 import numpy as np
 from tqdm.auto import tqdm
 
+from tmlattice.arrays import Array
 from tmlattice.by_name import by_name
 from tmlattice.effects import Cause, Settings
 from tmlattice.lattice import Ring
 from tmlattice.machine.machine import Errors, Machine, errors, stated_noise
 from tmlattice.machine.shots import LAUNCH_SIGMA, Shots, draw_shots
 from tmlattice.measurement import Measurement, measurement_writer
+
+
+def measured(ring: Ring, shots: Shots, readings: Array, noise: Array) -> Measurement:
+    """Return the record of readings [shot, turn, monitor, 2], m (noise: of x and y, m, [2])."""
+    names = tuple(monitor.name for monitor in ring.monitors)
+    return Measurement(
+        launches=shots.nominal,
+        readings=readings,
+        monitors=names,
+        noise=stated_noise(noise, len(names)),
+        launch_sigma=np.tile(shots.sigma, (len(shots), 1)),
+        settings=shots.settings,
+        lattice=ring.name,
+        energy=ring.energy,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,20 +48,9 @@ class Simulation(Errors):
 
     def measurement(self) -> Measurement:
         """Return all shots."""
-        readings = [
-            reading for _, reading in self.machine.measure(self.shots, self.turns, self.seed)
-        ]
-        names = tuple(monitor.name for monitor in self.ring.monitors)
-        return Measurement(
-            launches=self.shots.nominal,
-            readings=np.stack(readings),
-            monitors=names,
-            noise=stated_noise(self.machine.noise, len(names)),
-            launch_sigma=np.tile(self.shots.sigma, (len(self.shots), 1)),
-            settings=self.shots.settings,
-            lattice=self.ring.name,
-            energy=self.ring.energy,
-        )
+        shots = self.machine.measure(self.shots, self.turns, self.seed)
+        readings = np.stack([reading for _, reading in shots])
+        return measured(self.ring, self.shots, readings, self.machine.noise)
 
     def write(
         self, folder: Path, jobs: int = 1, progress: bool = True, force: bool = False

@@ -14,6 +14,7 @@ import numpy as np
 
 from tmlattice.beam.rf import rf_of
 from tmlattice.effects import Cause, Settings
+from tmlattice.effects.apply import groups
 from tmlattice.errors import EffectError, TmlatticeError
 from tmlattice.lattice import Ring
 from tmlattice.machine.at_stored import Beam, tunes_of, turns_of
@@ -204,10 +205,9 @@ def simulate_tunes(
     """
     machine = StoredMachine(ring, causes, background, seed, machine_seed)
     each = each_setting(settings, shots)
-    unlike = {repr(s): s for s in each}
-    moved = machine.at(list(unlike.values()))  # by an energy offset
-    found = {key: tunes_of(machine.engine, s) for key, s in zip(unlike, moved, strict=True)}
-    values = np.array([found[repr(s)] for s in each])  # [shot, tune or chromaticity, mode]
+    values = np.empty((shots, 2, 2))  # [shot, tune or chromaticity, mode]
+    for alike, moved in groups(machine.at(each), shots):  # by an energy offset
+        values[alike] = tunes_of(machine.engine, moved)
     add_noise(values, np.reshape(noise, (2, 1)), seed, "tunes")
     sigma = [np.full((shots, 2), rms) if rms > 0 else None for rms in noise]
     measured = TuneReading(

@@ -51,15 +51,6 @@ def part_maps(element: Element, energy: float) -> list[TaylorMap]:
     return [TaylorMap(of_ocelot(part, 4).reduced()) for part in parts_of(element, energy, False)]
 
 
-def way_map(elements: Sequence[Element], energy: float, dimension: int = 4) -> TaylorMap:
-    """Return the second-order map of elements in beam order: a layer, with the drifts before it
-    (dimension: 4 or 6)."""
-    way = identity(dimension)
-    for element in elements:
-        way = quadratic_map(element, energy, dimension).after(way)
-    return TaylorMap(way.reduced())
-
-
 @dataclass(frozen=True)
 class RingMaps:
     """The weights of a ring's chain of layers, stacked.

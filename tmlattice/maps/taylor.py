@@ -235,9 +235,6 @@ class TaylorMap:
         """Return d image / d x at the states x [..., n], [..., n (image), n (x)]."""
         x = np.asarray(x, dtype=float)
         columns = [self._derivative(i) for i in range(self.n)]
-        if self.order == 1:
-            constant = np.stack([column[:, 0] for column in columns], axis=-1)
-            return np.broadcast_to(constant, (*x.shape[:-1], self.n, self.n)).copy()
         maps = [self._of_rows(column, self.order - 1) for column in columns]
         return np.stack([m(x) for m in maps], axis=-1)
 

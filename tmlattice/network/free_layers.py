@@ -81,8 +81,7 @@ class FreeLayers(torch.nn.Module):
         return readings
 
     def _weights(self) -> dict[str, Tensor]:
-        weights = dict(self.network.named_parameters())
-        whole: dict[str, Tensor] = {**weights}
+        whole: dict[str, Tensor] = dict(self.network.named_parameters())
         for name, group in self.groups.items():
             place = torch.tensor(self.layers[name], device=self.network.W0.device)
             for weight, moved in group.named_parameters():

@@ -227,9 +227,8 @@ def plain_readings(network: TaylorNetwork, launch: Tensor) -> Tensor:
     The same mathematics as `network(launch)`, differentiated by torch alone: any order, any
     `torch.func` transform.
     """
-    sweep = network.sweep()
     weights = network.W0, network.W1, network.W2
-    return plain_pass(launch, weights, sweep.r, sweep.start)[0]
+    return plain_pass(launch, weights, network._read_outs, network._first_monitor)[0]
 
 
 def save_network(network: torch.nn.Module, path: Path) -> None:

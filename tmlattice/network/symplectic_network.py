@@ -32,37 +32,26 @@ class _FlowSweep(torch.autograd.Function):
         ctx: Any, launch: Tensor, W0: Tensor, generator: Tensor, W1: Array, maps: RingMaps
     ) -> Tensor:
         """Readings of one pass through all layers."""
-        batch, n = launch.shape
-        size = sweeps.size_of(n, batch)
-        start = sweeps.pack(launch.detach().numpy(), len(size[1]))
-        c, A, Q = field(generator.detach().numpy())
-        moves = _moves(c, A, Q)
-        states = np.empty((len(start), len(W1) + 1, n, len(size[1])))
-        states[:, 0] = start
-        middles = np.empty((len(start), len(W1), n, len(size[1])))
+        size, states = sweeps.begun(launch.detach().numpy(), len(W1) + 1)
+        middles = np.empty_like(states[:, 1:])
+        fields = _flow(generator.detach().numpy())
         w0 = W0.detach().numpy()
-        fields = c, A, Q, moves, _flat(c, A, Q)
-        sweeps.run(flows.forward, len(start), size, w0, W1, *fields, states, middles)
-        check_alive(states, maps, size, batch)
-        readings = np.empty((len(start), len(maps.at), 2, len(size[1])))
-        bent = curved(maps.R2)
-        sweeps.run(
-            sweeps.read, len(start), size, maps.R0, maps.R1, maps.R2, bent, maps.at, states,
-            readings,
-        )  # fmt: skip
-        ctx.kept = (maps, size, states, middles, W1, A, Q, moves, bent, batch)
-        return torch.from_numpy(sweeps.unpack(readings, batch))
+        sweeps.run(flows.forward, len(states), size, w0, W1, *fields, states, middles)
+        check_alive(states, maps)
+        _, A, Q, moves, _ = fields
+        ctx.kept = (maps, size, states, middles, W1, A, Q, moves, len(launch))
+        return torch.from_numpy(sweeps.unpack(sweeps.read_out(maps, size, states), len(launch)))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, pulls: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         """Gradients with respect to the launch, the kicks W0 and all generators."""
-        maps, size, states, middles, W1, A, Q, moves, bent, batch = ctx.kept
+        maps, size, states, middles, W1, A, Q, moves, batch = ctx.kept
         packed = sweeps.pack(np.ascontiguousarray(pulls.numpy()), len(size[1]))
         adjoint, inner = np.empty_like(states), np.empty_like(states)
         sweeps.run(
             flows.reverse, len(states), size, W1, A, Q, moves, np.zeros_like(moves), maps.R1,
-            maps.R2, bent, maps.start, states, middles, packed, adjoint, inner,
+            maps.R2, curved(maps.R2), maps.start, states, middles, packed, adjoint, inner,
         )  # fmt: skip
         kicks = generators = None
         if ctx.needs_input_grad[1]:
@@ -75,21 +64,21 @@ class _FlowSweep(torch.autograd.Function):
         return launch, kicks, generators, None, None
 
 
-def _moves(c: Array, A: Array, Q: Array) -> Flags:
-    return np.asarray(c.any(axis=1) | A.any(axis=(1, 2)) | Q.any(axis=(1, 2)))
-
-
 _SKEW = np.ones((4, 10), dtype=bool)
 """Zeros of Q for a generator that is even in (y, py)."""
 _SKEW[:2, [0, 1, 4, 7, 8, 9]] = False
 _SKEW[2:, [2, 3, 5, 6]] = False
 
 
-def _flat(c: Array, A: Array, Q: Array) -> Flags:
-    """Whether the field is of pure second degree and keeps the mid-plane; four coordinates."""
-    if c.shape[1] != 4:
-        return np.zeros(len(c), dtype=bool)
-    return np.asarray(~(c.any(axis=1) | A.any(axis=(1, 2)) | Q[:, _SKEW].any(axis=1)))
+def _flow(generator: Array) -> tuple[Array, Array, Array, Flags, Flags]:
+    """The fields of generators: c, A, Q; whether each moves anything; and whether, in four
+    coordinates, it is of pure second degree and keeps the mid-plane."""
+    c, A, Q = field(generator)
+    linear: Flags = np.asarray(c.any(axis=1) | A.any(axis=(1, 2)))
+    flat = np.zeros(len(c), dtype=bool)
+    if c.shape[1] == 4:
+        flat = ~(linear | np.asarray(Q[:, _SKEW].any(axis=1)))
+    return c, A, Q, linear | np.asarray(Q.any(axis=(1, 2))), flat
 
 
 class SymplecticNetwork(NetworkChain):
@@ -174,19 +163,17 @@ class SymplecticNetwork(NetworkChain):
         return readings
 
     def _fields(self) -> tuple[Array, Array, Array, Array, Array, Flags, Flags]:
-        c, A, Q = field(self.generator.detach().numpy())
-        return self.W0.detach().numpy(), self.W1.numpy(), c, A, Q, _moves(c, A, Q), _flat(c, A, Q)
+        return self.W0.detach().numpy(), self.W1.numpy(), *_flow(self.generator.detach().numpy())
 
     def _forward(self, size: sweeps.Size, states: Array) -> None:
-        middles = np.empty((len(states), states.shape[1] - 1, *states.shape[2:]))
+        middles = np.empty_like(states[:, 1:])
         sweeps.run(flows.forward, len(states), size, *self._fields(), states, middles)
 
     def _one_turn_fields(self) -> tuple[Array, Array, Array, Array, Array, Flags, Flags]:
         """The fields of all layers, and of the drift to the ring's end as a last one."""
         closing = [w[None] for w in self.maps.closing.coefficients]
         W1 = nearest_symplectic(closing[1])
-        c, A, Q = field(cubic_generator(W1, closing[2]))
-        end = closing[0], W1, c, A, Q, _moves(c, A, Q), _flat(c, A, Q)
+        end = closing[0], W1, *_flow(cubic_generator(W1, closing[2]))
         both = zip(self._fields(), end, strict=True)
         W0, W1, c, A, Q, moves, flat = (np.concatenate(pair) for pair in both)
         return W0, W1, c, A, Q, moves, flat
@@ -200,25 +187,17 @@ class SymplecticNetwork(NetworkChain):
         sweeps.run(flows.track, len(history), size, W0[ends], merged(W1, ends), *rest, history)
 
     def tangents(self, x: Array) -> tuple[Array, Array]:
-        """States [layer + 2, n] at the launch x [n], all exits and the ring's end, and d state / d
-        launch there, [layer + 2, n, n]."""
+        """Return what `LayerChain.tangents` states."""
         path, steps = self.jacobians(x)
         return path, products(steps)
 
     def jacobians(self, x: Array) -> tuple[Array, Array]:
         """Return the same states, and the Jacobian of every layer and of the closing drift."""
-        path, _, slopes, W1 = self._slopes(x)
-        half, one = 0.5 * slopes, np.eye(self.dimension)
-        return path, np.asarray(np.linalg.solve(one - half, (one + half) @ W1), dtype=float)
-
-    def _slopes(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """States [layer + 2, n], middles, the fields' slopes there and W1, [layer + 1, ...]."""
         W0, W1, c, A, Q, moves, flat = self._one_turn_fields()
-        size = sweeps.size_of(self.dimension, 1)
-        states = np.empty((1, len(W0) + 1, self.dimension, 1))
-        states[0, 0, :, 0] = x
-        middles = np.empty((1, len(W0), self.dimension, 1))
+        size, states = sweeps.begun(np.asarray(x)[None], len(W0) + 1)
+        middles = np.empty_like(states[:, 1:])
         sweeps.run(flows.forward, 1, size, W0, W1, c, A, Q, moves, flat, states, middles)
-        path, middle = states[0, :, :, 0], middles[0, :, :, 0]
-        slopes = A + np.einsum("kaij,kj->kai", second_derivatives(Q), middle)
-        return path, middle, slopes, W1
+        slopes = A + np.einsum("kaij,kj->kai", second_derivatives(Q), middles[0, :, :, 0])
+        half, one = 0.5 * slopes, np.eye(self.dimension)
+        steps = np.linalg.solve(one - half, (one + half) @ W1)
+        return states[0, :, :, 0], np.asarray(steps, dtype=float)

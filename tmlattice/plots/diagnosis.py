@@ -44,19 +44,14 @@ WIDE = 300.0
 
 def figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]:
     """Every figure that a diagnosis has: (name, caption, figure); close each after use."""
-    _, ax = plt.subplots(figsize=(6.5, 6.5), layout="constrained")
-    plot_plan(diagnosis, ax)
-    yield "plan", "The ring from above, with the findings.", _figure(ax)
+    yield "plan", "The ring from above, with the findings.", _figure(plot_plan(diagnosis))
     yield from (response_figures if diagnosis.by_families else _searched_figures)(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         if len(finding.recommended_actions) > 1:
-            height = 1.4 + 0.32 * min(len(finding.credible_set), MOST)
-            _, ax = plt.subplots(figsize=(9, height), layout="constrained")
-            plot_credible_set(finding, ax)
             yield (
                 f"credible-set-{number}",
                 f"Explanations of finding {number} that the data do not exclude.",
-                _figure(ax),
+                _figure(plot_credible_set(finding)),
             )
 
 
@@ -64,11 +59,10 @@ def _searched_figures(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Figure]]
     if not diagnosis.stored:
         yield from _of_readings(diagnosis)
     if diagnosis.heldout is not None:
-        ax = plot_gap(diagnosis, gap_axes(diagnosis))
         yield (
             "gap",
             "Readings of shots that the fit never saw less the model, as findings are added.",
-            _figure(ax),
+            _figure(plot_gap(diagnosis)),
         )
 
 
@@ -232,12 +226,8 @@ def free_kicks(diagnosis: Diagnosis) -> tuple[Array, Array]:
 def middles(diagnosis: Diagnosis) -> Array:
     """The place of each hypothesis of the first scan, m; NaN without one."""
     middles = {element.name: element.s for element in diagnosis.ring.elements}
-    return np.array(
-        [
-            np.nan if place is None else middles.get(place, np.nan)
-            for _, place in diagnosis.explanation.first.hypotheses
-        ]
-    )
+    places = [place for _, place in diagnosis.explanation.first.hypotheses]
+    return np.array([middles.get(place or "", np.nan) for place in places])
 
 
 def _whole_ring(side: Axes, diagnosis: Diagnosis) -> None:
@@ -359,9 +349,10 @@ MOST = 15
 
 def plot_credible_set(finding: Finding, ax: Axes | None = None) -> Axes:
     """Draw the probabilities of the explanations of one finding."""
-    if ax is None:
-        _, ax = plt.subplots()
     members = finding.credible_set[:MOST]
+    if ax is None:
+        size = 9, 1.4 + 0.32 * len(members)
+        _, ax = plt.subplots(figsize=size, layout="constrained")
     rows = np.arange(len(members))
     colours = [STYLES[find(member.effect).group][0] for member in members]
     ax.barh(rows, [100 * member.probability for member in members], color=colours, height=0.6)

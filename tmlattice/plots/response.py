@@ -83,9 +83,8 @@ def plot_maps(result: Diagnosis, figure: Figure | None = None) -> Figure:
     for ax, (title, values) in zip(axes, rows, strict=True):
         image = 1e6 * np.take_along_axis(values[:-1], plane[:, None, None], 2)[order, :, 0]
         image[:, ~view.good] = np.nan
-        image[view.held[:-1][order]] = np.nan if title.endswith("result") else image[
-            view.held[:-1][order]
-        ]  # fmt: skip
+        if title.endswith("result"):
+            image[view.held[:-1][order]] = np.nan
         limit = 4.0 * float(np.nanmedian(abs(image)))  # a plane of a single corrector sets no scale
         colours = plt.get_cmap("RdBu_r").with_extremes(bad="0.8")
         shown = ax.imshow(

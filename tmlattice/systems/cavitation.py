@@ -76,12 +76,16 @@ class Bubble:
         """4 nu in the scaled units."""
         return 4 * self.viscosity * self.time / self.radius**2
 
+    @property
+    def _scaled(self) -> tuple[float, float, float]:
+        """Pressures of the surface and of the vapour, and the wave's frequency, scaled."""
+        surface = 2 * self.tension / (self.radius * self.pressure)
+        return surface, self.vapour / self.pressure, 2 * np.pi / self.period
+
     @cached_property
     def terms(self) -> dict[tuple[int, ...], Array]:
         """The scaled equation for the distance from `REST`."""
-        surface = 2 * self.tension / (self.radius * self.pressure)
-        vapour = self.vapour / self.pressure
-        omega = 2 * np.pi / self.period
+        surface, vapour, omega = self._scaled
         rows = {
             (0, 1, 0, 0, 0): (0, 1.0),
             (0, 2, 1, 0, 0): (1, -1.5),
@@ -101,9 +105,7 @@ class Bubble:
 
     def solution(self, times: ArrayLike) -> Array:
         """Return true distances from `REST` at scaled times, [time, 5], by the equation in R."""
-        surface = 2 * self.tension / (self.radius * self.pressure)
-        vapour = self.vapour / self.pressure
-        omega = 2 * np.pi / self.period
+        surface, vapour, omega = self._scaled
 
         def slope(t: float, x: Array) -> list[float]:
             R, u = x

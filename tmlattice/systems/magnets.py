@@ -131,9 +131,7 @@ def agreements(ring: "Ring") -> list[Agreement]:
         differences = []
         for element in ring.elements:
             key = (element.length, element.angle, element.k1, element.k2)
-            if element.kind != kind or key in seen or element.length <= 0:
-                continue
-            if _tilted(element):
+            if element.kind != kind or key in seen or element.length <= 0 or _tilted(element):
                 continue
             seen.add(key)
             ours = magnet_map(element, 3).coefficients
