@@ -25,6 +25,11 @@ FORMATS = {
 the package's object of a ring of plain elements, its `write` a file; both state what they leave
 out."""
 
+SUFFIXES = (
+    ".json (the package's own), .at.json (AT), .xsuite.json (Xsuite), .madx or .seq (MAD-X), .py "
+    "(OCELOT)"
+)
+
 
 def save_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
     """Write a ring in the format that the suffix names, whole or not at all.
@@ -51,10 +56,7 @@ def save_ring(ring: Ring, path: str | Path) -> tuple[str, ...]:
         return ()
     module = _module(name)
     if module is None:
-        raise LatticeError(
-            f"'{path}' names no format; end it in .json (the package's own), .at.json (AT), "
-            ".xsuite.json (Xsuite), .madx or .seq (MAD-X), .py (OCELOT)"
-        )
+        raise LatticeError(f"'{path}' names no format; end it in {SUFFIXES}")
     bare, lacks = plain(ring, module.holds)
     with output_file(path) as temporary:
         return (*lacks, *module.write(bare, temporary))
