@@ -13,10 +13,9 @@ import numpy as np
 from tmlattice.errors import LatticeError
 from tmlattice.importers.imported import is_number
 from tmlattice.lattice.at_child import shipped_methods
+from tmlattice.lattice.checks import LONGEST
 from tmlattice.lattice.expressions import check_order, of_fields
 
-LONGEST = 1e5
-"""m; no element of a ring is longer."""
 EMPTY = ("DriftPass", "IdentityPass")
 """Of what has no field."""
 NO_ORBIT = ("AperturePass", "EAperturePass", "LongtAperturePass", "QuantDiffPass")
@@ -87,8 +86,8 @@ def _one_gradient(fields: dict[str, Any]) -> None:
     if "PolynomB" in fields and "K" in fields:
         gradient = fields.pop("K")
         if "Linear" in str(fields.get("PassMethod")):
-            orders = np.zeros(max(2, np.size(fields["PolynomB"])))
-            orders[: np.size(fields["PolynomB"])] = fields["PolynomB"]
+            given = np.ravel(fields["PolynomB"]).astype(float)
+            orders = np.pad(given, (0, max(0, 2 - len(given))))
             orders[1] = float(np.ravel(gradient)[0])
             fields["PolynomB"] = orders
             fields["MaxOrder"] = max(1, int(fields.get("MaxOrder", 1)))

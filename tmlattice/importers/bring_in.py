@@ -152,11 +152,7 @@ def bring_in(
     if brought.ring is None or not isinstance(brought.measurement, OrbitResponse):
         return brought
     confirmed, contradicted = compared(brought.ring, brought.measurement)
-    return replace(
-        brought,
-        assumed=(*brought.assumed, *confirmed),
-        doubts=(*brought.doubts, *contradicted),
-    )
+    return replace(brought.saying(*confirmed), doubts=(*brought.doubts, *contradicted))
 
 
 def import_data(
@@ -386,23 +382,20 @@ def read_measurement(
         MeasurementError: nothing there, or nothing that is known; one sentence.
         UnknownNameError: a monitor that the ring does not have.
     """
-    if is_frame(path):
-        return _logged(bring_in([path], Options(ring=ring, unit=unit)), label(path))
-    place = Path(path)
-    if turn_by_turn is not None or not place.is_file() or place.name == "measurement.json":
-        return folder.read_measurement(place, monitors, turn_by_turn, unit or "m")
-    if monitors is not None and place.suffix.lower() in (*CSV, *HDF5, *SDDS):
-        columns = read_columns(place)
-        if place.suffix.lower() not in CSV or not is_response_table(columns):
-            stated = with_unit(None, unit, None)
-            return _logged(bring_readings(str(place), columns, None, stated, monitors), str(place))
-    brought = bring_in([place], Options(ring=ring, unit=unit))
-    return _logged(brought, str(place))
-
-
-def _logged(brought: Imported, name: str) -> AnyMeasurement:
+    source = path if is_frame(path) else Path(path)
+    brought = None
+    if isinstance(source, Path):
+        suffix = source.suffix.lower()
+        if turn_by_turn is not None or not source.is_file() or source.name == "measurement.json":
+            return folder.read_measurement(source, monitors, turn_by_turn, unit or "m")
+        if monitors is not None and suffix in (*CSV, *HDF5, *SDDS):
+            columns = read_columns(source)
+            if suffix not in CSV or not is_response_table(columns):
+                stated = with_unit(None, unit, None)
+                brought = bring_readings(str(source), columns, None, stated, monitors)
+    brought = brought or bring_in([source], Options(ring=ring, unit=unit))
     for sentence in (*brought.assumed, *brought.doubts):
-        log.info("%s: %s", name, sentence)
+        log.info("%s: %s", label(source), sentence)
     return brought.measurement
 
 

@@ -133,12 +133,11 @@ def _single(own: Plane) -> list[str]:
         ("correctors", own.correctors, own.columns() * sign),
         ("BPMs", list(own.monitors), np.diagonal(monitors)),
     ):
-        against = [name for name, r in zip(names, alike.tolist(), strict=True) if r < -ODD]
-        nothing = [n for n, r in zip(names, alike.tolist(), strict=True) if 0 < abs(r) <= ODD]
-        for which, how in (
-            (against, "have the sign against the others"),
-            (nothing, "do not correlate with the design"),
+        for is_such, how in (
+            (alike < -ODD, "have the sign against the others"),
+            ((alike != 0) & (np.abs(alike) <= ODD), "do not correlate with the design"),
         ):
+            which = [names[k] for k in np.flatnonzero(is_such)]
             if 0 < len(which) < len(names) / 4:
                 said.append(f"single {what} of {own.plane} {how}: {counted(which)}")
     odd = np.flatnonzero((np.diagonal(monitors) < ODD) & own.measured.any(axis=0))

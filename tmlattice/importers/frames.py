@@ -101,11 +101,12 @@ def _as(cls: type, found: Any, rf: tuple[Any, ...]) -> Any:
 def _tunes(frame: Any) -> TuneReading | None:
     """Of columns such as `tune_x`, a row a shot; None where there is no such column."""
     columns = {column.name.lower(): column for column in read_columns(frame)}
+    label = type(frame).__name__
     if "quantity" in columns:
         return None
     if "tune_x" not in columns and "tune_y" not in columns:
         missing = " and ".join(f"'{name}'" for name in QUANTITIES[:2])
-        raise MeasurementError(f"{type(frame).__name__}: no columns {missing}; add them")
+        raise MeasurementError(f"{label}: no columns {missing}; add them")
 
     def pair(what: str, suffix: str = "") -> Any:
         names = [f"{what}_{plane}{suffix}" for plane in "xy"]
@@ -113,9 +114,7 @@ def _tunes(frame: Any) -> TuneReading | None:
             return None
         rows = len(next(iter(columns.values())).values)
         empty = Column("", "", [""] * rows)
-        return np.transpose([
-            numbers_of(type(frame).__name__, columns.get(name, empty)) for name in names
-        ])  # fmt: skip
+        return np.transpose([numbers_of(label, columns.get(name, empty)) for name in names])
 
     return TuneReading(
         pair("tune"), pair("tune", "_error"), pair("chromaticity"), pair("chromaticity", "_error")

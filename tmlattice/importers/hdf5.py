@@ -151,8 +151,8 @@ def _with(parts: Sequence[tuple[Path, Mapping[str, Any]]], name: str) -> Mapping
 
 def _by_plane(data: Mapping[str, Any], name: str, monitors: int) -> Array:
     """Two arrays of a file, of x and y, [monitor, 2]."""
-    planes = (numbers(data.get(f"{name}{p}"), f"{name}{p}", (monitors,)) for p in "xy")
-    return np.stack(list(planes), axis=1)
+    planes = [numbers(data.get(f"{name}{p}"), f"{name}{p}", (monitors,)) for p in "xy"]
+    return np.stack(planes, axis=1)
 
 
 def _orbits(data: Mapping[str, Any], steps: Array, rows: int) -> tuple[Array, str]:

@@ -23,9 +23,6 @@ from tmlattice.measurement.shots import FEWEST, MOST
 from tmlattice.measurement.trajectory import UNKNOWN_LAUNCH
 from tmlattice.measurement.write import check_free
 
-LIGHT = 299792458.0
-"""m/s."""
-
 
 @dataclass(frozen=True)
 class Imported:
@@ -73,13 +70,10 @@ def numbers(value: Any, what: str, shape: Sequence[int] | None = None) -> Array:
     return array
 
 
-Shape = Mapping[str, Any]
-"""Of fields by name: `str`, `float` (numbers of any shape) or another shape."""
-
-
-def check_fields(content: Any, shape: Shape, place: str) -> None:
-    """Whether the fields of a structure that are there have their types; MeasurementError: another
-    type, by the field's name in `place`."""
+def check_fields(content: Any, shape: Mapping[str, Any], place: str) -> None:
+    """Whether the fields of a structure that are there have their types, by name `str`, `float`
+    (numbers of any shape) or another shape; MeasurementError: another type, by the field's name in
+    `place`."""
     if not isinstance(content, Mapping):
         raise MeasurementError(f"{place} should be a structure with {', '.join(shape)}")
     for name, kind in shape.items():

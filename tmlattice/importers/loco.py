@@ -30,15 +30,13 @@ from tmlattice.importers.imported import (
     numbers,
 )
 from tmlattice.importers.loco_forms import usual_form
-from tmlattice.importers.matlab_ring import Placed, planes_by, ring_of_elements
+from tmlattice.importers.matlab_ring import LETTERS, Placed, planes_by, ring_of_elements
 from tmlattice.measurement import OrbitResponse
 from tmlattice.measurement.orbit_response import RfStep
 
 Fields = Mapping[str, Any]
 Iteration = Literal["first", "last"]
 
-LETTERS = {"x": "H", "y": "V"}
-"""LOCO's names of the planes."""
 FURTHEST = 1e9
 """No list of places goes there."""
 SAME = 1e-6
@@ -86,23 +84,17 @@ def bring_loco(
                 "BPMIndex; correct BPMData"
             )
     elements, of_lattice, model = _elements(lattice, content.get("FitParameters"), iteration)
-    kicks = planes_by(
-        (place, plane) for plane, index in kickers.items() for place in index.tolist()
-    )
-    placed = ring_of_elements(
-        elements,
-        path.name.split(".")[0],
-        _energy(lattice, elements),
-        at_monitor.tolist(),
-        kicks,
-    )
-    good, of_lists = _good(monitors, correctors, reads, kickers, placed, keep_bad)
+    kicks = planes_by((place, plane) for plane, own in kickers.items() for place in own.tolist())
+    name, ring_energy = path.name.split(".")[0], _energy(lattice, elements)
+    placed = ring_of_elements(elements, name, ring_energy, at_monitor.tolist(), kicks)
+    lists = Lists(reads, kickers, placed)
+    good, of_lists = _good(monitors, correctors, lists, keep_bad)
     measured = OrbitResponse(
-        **_columns(data, correctors, reads, kickers, placed, good),
-        rf=_rf(data, lattice, reads, good, placed),
+        **_columns(data, correctors, lists, good),
+        rf=_rf(data, lattice, lists, good),
         lattice="lattice.json",
         energy=placed.ring.energy,
-        devices=_device_names(data, reads, kickers, placed),
+        devices=_device_names(data, lists),
     )
     unkicked = sum(
         int(np.count_nonzero(_steps(correctors, letter, len(kickers[plane])) == 0))
@@ -265,36 +257,54 @@ def _put(elements: Sequence[dict[str, Any]], setting: Setting) -> None:
 
 
 # --- the measurement ------------------------------------------------------------------------------
+class Lists(NamedTuple):
+    """Monitors and correctors as the file lists them.
+
+    Attributes:
+        reads: places of the BPMs of each plane among the monitors of `placed`.
+        kickers: places of the correctors of each plane in the lattice.
+        placed: the ring, with their names.
+    """
+
+    reads: Mapping[str, Indices]
+    kickers: Mapping[str, Indices]
+    placed: Placed
+
+    def monitors(self, plane: str) -> list[str]:
+        """Names of the BPMs of a plane."""
+        return [self.placed.monitors[k] for k in self.reads[plane]]
+
+    def correctors(self, plane: str) -> list[str]:
+        """Names of the correctors of a plane."""
+        return [self.placed.correctors[place, plane] for place in self.kickers[plane].tolist()]
+
+    @property
+    def rows(self) -> int:
+        """Number of BPMs of both planes."""
+        return sum(map(len, self.reads.values()))
+
+
 def _good(
-    monitors: Fields,
-    correctors: Fields,
-    reads: Mapping[str, Indices],
-    kickers: Mapping[str, Indices],
-    placed: Placed,
-    keep_bad: bool,
+    monitors: Fields, correctors: Fields, lists: Lists, keep_bad: bool
 ) -> tuple[dict[str, Flags], list[str]]:
     """Flags of the good lists by list ("x" and "y" of monitors, "H" and "V" of correctors)."""
     good, said = {}, []
     for plane, letter in LETTERS.items():
-        for key, structure, index, kind in (
-            (plane, monitors, reads[plane], "BPM"), (letter, correctors, kickers[plane], "CM")
-        ):  # fmt: skip
+        for key, structure, every, kind, what in (
+            (plane, monitors, lists.monitors(plane), "BPM", "BPMs in"),
+            (letter, correctors, lists.correctors(plane), "CM", "correctors of"),
+        ):
             name = f"{letter}{kind}GoodDataIndex"
-            flags = np.full(len(index), name not in structure)
+            flags = np.full(len(every), name not in structure)
             if name in structure:
                 there = _counted(structure, name)
-                if len(there) and not 0 <= there.min() <= there.max() < len(index):
+                if len(there) and not 0 <= there.min() <= there.max() < len(every):
                     raise MeasurementError(
-                        f"{name} counts beyond the {len(index)} of its list; correct it in the file"
+                        f"{name} counts beyond the {len(every)} of its list; correct it in the file"
                     )
                 flags[there] = True
             if not flags.all():
-                bad = np.flatnonzero(~flags)
-                names = (
-                    [placed.monitors[index[k]] for k in bad] if kind == "BPM"
-                    else [placed.correctors[int(index[k]), plane] for k in bad]
-                )  # fmt: skip
-                what = "BPMs in" if kind == "BPM" else "correctors of"
+                names = [every[k] for k in np.flatnonzero(~flags)]
                 done = "kept" if keep_bad else "left out"
                 said.append(f"{what} {plane} that {name} calls bad, {done}: {counted(names)}")
             good[key] = np.ones_like(flags) if keep_bad else flags
@@ -302,67 +312,51 @@ def _good(
 
 
 def _columns(
-    data: Fields,
-    correctors: Fields,
-    reads: Mapping[str, Indices],
-    kickers: Mapping[str, Indices],
-    placed: Placed,
-    good: Mapping[str, Flags],
+    data: Fields, correctors: Fields, lists: Lists, good: Mapping[str, Flags]
 ) -> dict[str, Any]:
     """Correctors, planes, kicks, monitors, response and noise of the measurement."""
-    horizontal, vertical = len(kickers["x"]), len(kickers["y"])
-    rows = len(reads["x"]) + len(reads["y"])
-    M = 1e-3 * numbers(_field(data, "M"), "LocoMeasData.M", (rows, horizontal + vertical))
+    rows, columns = lists.rows, sum(map(len, lists.kickers.values()))
+    M = 1e-3 * numbers(_field(data, "M"), "LocoMeasData.M", (rows, columns))
     names, planes, kicks, kept = [], [], [], []
     for plane, letter in LETTERS.items():
-        index = kickers[plane]
-        names += [placed.correctors[place, plane] for place in index.tolist()]
-        planes += [plane] * len(index)
-        kicks += (1e-3 * _steps(correctors, letter, len(index))).tolist()
+        own = lists.correctors(plane)
+        names += own
+        planes += [plane] * len(own)
+        kicks += (1e-3 * _steps(correctors, letter, len(own))).tolist()
         kept += good[letter].tolist()
-    response = np.stack([_spread(column, reads, good, placed) for column in M.T])
+    response = np.stack([_spread(column, lists, good) for column in M.T])
     noise = None
     if np.size(data.get("BPMSTD", ())):
         given = 1e-3 * numbers(data["BPMSTD"], "LocoMeasData.BPMSTD")
         given = numbers(np.repeat(given, rows if given.size == 1 else 1), "BPMSTD", (rows,))
         every = {plane: np.ones_like(flags) for plane, flags in good.items()}
-        noise = _spread(np.where(given > 0, given, np.nan), reads, every, placed)
+        noise = _spread(np.where(given > 0, given, np.nan), lists, every)
     take = np.array(kept, dtype=bool) & (np.array(kicks) != 0)
     return {
         "correctors": [n for n, t in zip(names, take, strict=True) if t],
         "planes": [p for p, t in zip(planes, take, strict=True) if t],
         "kicks": np.array(kicks)[take],
-        "monitors": placed.monitors,
+        "monitors": lists.placed.monitors,
         "response": response[take],
         "noise": noise,
     }
 
 
-LISTS = (
-    ("x", "monitor", ("HBPM", "BPMx")),
-    ("y", "monitor", ("VBPM", "BPMy")),
-    ("x", "corrector", ("HCM",)),
-    ("y", "corrector", ("VCM",)),
-)
-"""Plane and kind of the Middle Layer's device lists in LocoMeasData, by their names."""
-
-
-def _device_names(
-    data: Fields, reads: Mapping[str, Indices], kickers: Mapping[str, Indices], placed: Placed
-) -> dict[str, str]:
+def _device_names(data: Fields, lists: Lists) -> dict[str, str]:
     """Names of the Middle Layer, family and device such as `HCM(1,2)`, by names of the lattice;
     lists that are missing, or of another length, are passed over."""
     pairs: list[tuple[str, str]] = []
-    for plane, kind, known in LISTS:
-        lists = (data[name] for name in known if isinstance(data.get(name), Mapping))
-        own: Fields = next(lists, {})
-        index = (reads if kind == "monitor" else kickers)[plane].tolist()
+    for names, *known in (
+        (lists.monitors("x"), "HBPM", "BPMx"), (lists.monitors("y"), "VBPM", "BPMy"),
+        (lists.correctors("x"), "HCM"), (lists.correctors("y"), "VCM"),
+    ):  # fmt: skip
+        found = (data[name] for name in known if isinstance(data.get(name), Mapping))
+        own: Fields = next(found, {})
         devices = np.atleast_2d(np.asarray(own.get("DeviceList", ()), dtype=float))
-        if devices.shape != (len(index), 2) or not np.isfinite(devices).all():
+        if devices.shape != (len(names), 2) or not np.isfinite(devices).all():
             continue
         family = str(own.get("FamilyName") or known[0])
-        for place, (sector, number) in zip(index, devices.astype(int).tolist(), strict=True):
-            name = placed.monitors[place] if kind == "monitor" else placed.correctors[place, plane]
+        for name, (sector, number) in zip(names, devices.astype(int).tolist(), strict=True):
             pairs.append((name, f"{family}({sector},{number})"))
     return device_names(pairs)
 
@@ -375,28 +369,16 @@ def _steps(correctors: Fields, letter: str, count: int) -> Array:
     return steps
 
 
-def _spread(
-    column: Array,
-    reads: Mapping[str, Indices],
-    good: Mapping[str, Flags],
-    placed: Placed,
-) -> Array:
+def _spread(column: Array, lists: Lists, good: Mapping[str, Flags]) -> Array:
     """Readings x then y as [monitor, 2], NaN where there is none or it is bad."""
-    spread = np.full((len(placed.monitors), 2), np.nan)
-    first = len(reads["x"])
-    for plane, part in ((0, column[:first]), (1, column[first:])):
-        key = "xy"[plane]
-        spread[reads[key], plane] = np.where(good[key], part, np.nan)
+    spread = np.full((len(lists.placed.monitors), 2), np.nan)
+    first = len(lists.reads["x"])
+    for k, (plane, part) in enumerate((("x", column[:first]), ("y", column[first:]))):
+        spread[lists.reads[plane], k] = np.where(good[plane], part, np.nan)
     return spread
 
 
-def _rf(
-    data: Fields,
-    lattice: Fields,
-    reads: Mapping[str, Indices],
-    good: Mapping[str, Flags],
-    placed: Placed,
-) -> RfStep | None:
+def _rf(data: Fields, lattice: Fields, lists: Lists, good: Mapping[str, Flags]) -> RfStep | None:
     step, eta = data.get("DeltaRF"), np.asarray(data.get("Eta", ()))
     cavity: Fields = next((e for e in lattice["Lattice"] if is_number(e.get("HarmNumber"))), {})
     frequency = lattice.get("CavityFrequency", cavity.get("Frequency"))
@@ -404,8 +386,8 @@ def _rf(
     harmonic = lattice.get("CavityHarmNumber", cavity.get("HarmNumber"))
     if not (is_number(step) and is_number(frequency) and is_number(harmonic) and eta.size):
         return None
-    rows = len(reads["x"]) + len(reads["y"])
-    orbit = _spread(1e-3 * numbers(eta, "LocoMeasData.Eta", (rows,)), reads, good, placed)
+    eta = 1e-3 * numbers(eta, "LocoMeasData.Eta", (lists.rows,))
+    orbit = _spread(eta, lists, good)
     return RfStep(float(frequency), round(harmonic), float(step), orbit)
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import Array, Indices
-from tmlattice.importers.imported import LIGHT, is_number, is_positive
+from tmlattice.importers.imported import is_number, is_positive
+from tmlattice.lattice.ring import LIGHT
 
 Fields = Mapping[str, Any]
 

@@ -15,8 +15,8 @@ corrector whatever its class, and keeps its name:
 """
 
 import warnings
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,9 +30,10 @@ from tmlattice.lattice import Ring
 from tmlattice.lattice.at_file import passes_freely, ring_from_at
 from tmlattice.lattice.checks import check_ring
 from tmlattice.lattice.mat_file import lattice_in
+from tmlattice.lattice.ring import number_names
 
-_LETTER = {"x": "h", "y": "v"}
-_MAD = {"x": "HKICKER", "y": "VKICKER"}
+LETTERS = {"x": "H", "y": "V"}
+"""Of the planes, in names of MAD and LOCO."""
 
 
 @dataclass(frozen=True)
@@ -190,27 +191,19 @@ def ring_of_elements(
     )
 
 
-def _names(ring: Ring, families: Sequence[str], places: Iterable[int]) -> dict[int, str]:
+def _names(ring: Ring, families: Sequence[str], places: Collection[int]) -> dict[int, str]:
     """Names in the ring of places in the sequence that it was made of: of each family the first is
     the first, whatever became of other families (slices of a wiggler are merged)."""
-    there = defaultdict(list)
-    for element in ring.elements:
-        there[element.family].append(element.name)
-    seen: Counter[str] = Counter()
-    number = []
-    for family in families:
-        number.append(seen[family])
-        seen[family] += 1
-    names = {}
-    for place in places:
-        family = families[place]
-        if len(there[family]) != seen[family]:
+    there = Counter(element.family for element in ring.elements)
+    here = Counter(families)
+    names = number_names(families)
+    for family in (families[place] for place in places):
+        if there[family] != here[family]:
             raise LatticeError(
                 f"'{family}' of the lattice is a BPM or corrector here and a wiggler's slice "
                 "there; give them names of their own"
             )
-        names[place] = there[family][number[place]]
-    return names
+    return {place: names[place] for place in places}
 
 
 def _family(element: Any) -> str:
@@ -220,11 +213,13 @@ def _family(element: Any) -> str:
 def _kicker(family: str, length: float, plane: str) -> Any:
     import at
 
-    return at.Corrector(family, length, [0.0, 0.0], MADType=_MAD[plane], Plane=plane)
+    mad = f"{LETTERS[plane]}KICKER"
+    return at.Corrector(family, length, [0.0, 0.0], MADType=mad, Plane=plane)
 
 
 def _thin(element: Any, planes: Iterable[str]) -> list[Any]:
-    return [_kicker(f"{_family(element)}_{_LETTER[plane]}", 0.0, plane) for plane in sorted(planes)]
+    family = _family(element)
+    return [_kicker(f"{family}_{LETTERS[p].lower()}", 0.0, p) for p in sorted(planes)]
 
 
 def _parts(
@@ -272,10 +267,9 @@ def _corrector(element: Any, planes: frozenset[str]) -> list[Any]:
 def _magnet(element: Any, planes: frozenset[str]) -> list[Any]:
     """A magnet with thin correctors in its middle."""
     thin = _thin(element, planes)
-    if not float(getattr(element, "Length", 0.0)):
-        return [element, *thin]
-    halves = element.divide([0.5, 0.5])
-    if len(halves) == 1:  # AT cannot divide it
+    long = float(getattr(element, "Length", 0.0)) != 0
+    halves = element.divide([0.5, 0.5]) if long else [element]
+    if len(halves) == 1:  # also where AT cannot divide it
         return [element, *thin]
     first, second = halves
     second.FamName = f"{_family(element)}_2"

@@ -77,7 +77,7 @@ def bring_middle_layer(
             at = _places(reads, r, block.get("Monitor"), "Monitor")
             length = str(block.get("UnitsString", "mm/")).split("/")[0]
             orbits = numbers(block["Data"], "Rmat.Data", (len(at), len(steps)))
-            change[:, at, r] = (_unit(length, METRES, "orbits") * steps * orbits).T
+            change[:, at, r] = (_unit(length, "orbits") * steps * orbits).T
         names += [model.correctors[i] for i in found]
         planes += [plane] * len(found)
         kicks += radians.tolist()
@@ -177,10 +177,12 @@ def _places(reads: Sequence[Mapping[Device, int]], p: int, structure: Any, what:
     return [_look_up(reads[p], d, f"BPM of {'xy'[p]}") for d in _devices(structure, what)]
 
 
-def _unit(text: Any, units: Mapping[str, float], what: str) -> float:
-    if str(text).strip().lower() not in units:
-        raise MeasurementError(f"{what} in '{text}': known units are {', '.join(units)}")
-    return units[str(text).strip().lower()]
+def _unit(text: Any, what: str) -> float:
+    """m."""
+    unit = str(text).strip().lower()
+    if unit not in METRES:
+        raise MeasurementError(f"{what} in '{text}': known units are {', '.join(METRES)}")
+    return METRES[unit]
 
 
 def _each(value: Any, what: str, count: int) -> Array:
@@ -234,7 +236,7 @@ def _noise(
         if part is None or "Sigma" not in part:
             return None
         at = _places(reads, p, part, "BPMxData")
-        unit = _unit(part.get("UnitsString", "mm"), METRES, "noise")
+        unit = _unit(part.get("UnitsString", "mm"), "noise")
         noise[at, p] = np.sqrt(2) * unit * numbers(part["Sigma"], "Sigma", (len(at),))
     return np.where(noise > 0, noise, np.nan)
 
@@ -253,7 +255,7 @@ def _rf(
             return None
         at = _places(reads, p, part.get("Monitor"), "BPMxDisp.Monitor")
         length, _, per = str(part.get("UnitsString", "")).partition("/")
-        unit = _unit(length, METRES, "dispersion")
+        unit = _unit(length, "dispersion")
         step = float(_each(part.get("ActuatorDelta"), "ActuatorDelta", 1)[0])
         dp = numbers(part.get("dp", np.nan), "dp", (1,))[0]
         times = (dp if "dp" in per else step) or np.nan

@@ -16,7 +16,6 @@ from tmlattice.arrays import Array
 from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.importers.columns import SDDS, Column
 from tmlattice.importers.imported import (
-    LIGHT,
     Imported,
     counted,
     device_names,
@@ -26,6 +25,7 @@ from tmlattice.importers.middle_layer import RADIANS
 from tmlattice.importers.stated import Stated
 from tmlattice.input_files import number
 from tmlattice.lattice import Ring
+from tmlattice.lattice.ring import LIGHT
 from tmlattice.measurement import Measurement, OrbitResponse, read_turn_by_turn
 from tmlattice.measurement.arrays import METRES, Unit
 from tmlattice.measurement.monitors import Names
@@ -158,6 +158,8 @@ def _of_ring(data: Measurement, ring: Ring, stated: Stated) -> tuple[Measurement
 # --- an orbit response ----------------------------------------------------------------------------
 Header = list[tuple[str, str]]
 """Name and unit of each column."""
+Step = tuple[float, dict[str, tuple[float, float]]]
+"""A kick, rad (or Hz), and the orbit change for it by monitor, (x, y), m."""
 
 
 def _number(path: str, line: int, text: str) -> float:
@@ -201,13 +203,11 @@ def _long(
         if monitor in own:
             raise MeasurementError(f"{path}, row {line}: '{corrector}', '{monitor}' stand twice")
         own[monitor] = x, y
-    rf = next((name for name in columns if name.lower() == "rf"), None)
-    rf_orbit = columns.pop(rf) if rf else None
+    name = next((name for name in columns if name.lower() == "rf"), None)
+    rf = None if name is None else (kicks[name], columns.pop(name))
     said = [f"x in {header[place['x']][1] or 'm'}, kicks in {header[place['kick']][1] or 'rad'}"]
-    return _response(
-        ring, {n: (angle * kicks[n], own) for n, own in columns.items()},
-        None if rf is None or rf_orbit is None else (kicks[rf], rf_orbit), said, stated,
-    )  # fmt: skip
+    steps = {n: (angle * kicks[n], own) for n, own in columns.items()}
+    return _response(ring, steps, rf, said, stated)
 
 
 def _wide(
@@ -218,7 +218,7 @@ def _wide(
         if name not in place:
             raise MeasurementError(f"{path}: no column '{name}'; a wide table has monitor, plane")
     per = {f"{m}/{r}": METRES[m] / RADIANS[r] for m in METRES for r in RADIANS}
-    columns: dict[str, tuple[float, dict[str, tuple[float, float]]]] = {}
+    columns: dict[str, Step] = {}
     for i, (name, unit) in enumerate(header):
         if i in (place["monitor"], place["plane"]):
             continue
@@ -240,11 +240,7 @@ def _wide(
 
 
 def _response(
-    ring: Ring,
-    columns: dict[str, tuple[float, dict[str, tuple[float, float]]]],
-    rf: tuple[float, dict[str, tuple[float, float]]] | None,
-    said: Sequence[str],
-    stated: Stated,
+    ring: Ring, columns: dict[str, Step], rf: Step | None, said: Sequence[str], stated: Stated
 ) -> Imported:
     every = dict.fromkeys(m for _, own in columns.values() for m in own)
     of = {device: ring[stated.name_of(device)].name for device in (*columns, *every)}

@@ -17,6 +17,7 @@ import numpy as np
 from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.expressions import MOST_ITEMS
 from tmlattice.lattice.matlab_code import Code, indices
+from tmlattice.lattice.ring import LIGHT
 
 Element = dict[str, Any]
 
@@ -334,7 +335,7 @@ def _properties(ring: list[Element], *given: Any) -> list[Element]:
 def _atsetcavity(ring: list[Element], voltage: Any, _: Any, harmonic: float) -> list[Element]:
     """The ring with a voltage in all, V, and the frequency of a harmonic."""
     cavities = _findcells(ring, "Frequency")
-    frequency = harmonic * 299792458.0 / _findspos(ring, len(ring) + 1.0)
+    frequency = harmonic * LIGHT / _findspos(ring, len(ring) + 1.0)
     for field, value in (("Voltage", voltage / cavities.size), ("Frequency", frequency),
                          ("HarmNumber", harmonic)):  # fmt: skip
         ring = _setcellstruct(ring, field, cavities, value)

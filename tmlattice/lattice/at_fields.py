@@ -16,32 +16,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmlattice.lattice.places import RADIUS, Place, halves
+from tmlattice.lattice.places import KIND_OF, Place, halves, strongest
 from tmlattice.lattice.ring import Kind
-
-KIND_OF: dict[int, Kind] = {1: "quadrupole", 2: "sextupole", 3: "octupole"}
 
 
 def strengths_of(element: Any) -> NDArray[np.complex128]:
     """B + i A of the orders that AT uses, scaled, four at least, kicks included, [order]; a linear
     pass method has the normal gradient alone."""
-    B = np.atleast_1d(np.asarray(getattr(element, "PolynomB", [0.0]), dtype=float))
-    A = np.atleast_1d(np.asarray(getattr(element, "PolynomA", [0.0]), dtype=float))
+    B, A = (
+        np.atleast_1d(np.asarray(getattr(element, key, 0.0), dtype=float))
+        for key in ("PolynomB", "PolynomA")
+    )
     orders = max(len(B), len(A), 4)
-    total = np.zeros(orders, dtype=complex)
-    total[: len(B)] += B
-    total[: len(A)] += 1j * A
+    total = np.pad(B, (0, orders - len(B))) + 1j * np.pad(A, (0, orders - len(A)))
     highest = int(getattr(element, "MaxOrder", orders - 1))
     total[highest + 1 :] = 0.0
-    kick = np.zeros(2)
-    given = np.asarray(getattr(element, "KickAngle", (0.0, 0.0)), dtype=float).ravel()[:2]
-    kick[: len(given)] = np.sin(given)
-    total[0] += complex(-kick[0], kick[1]) / (float(getattr(element, "Length", 0.0)) or 1.0)
+    x, y = np.sin(kicks_of(element))
+    total[0] += complex(-x, y) / (float(getattr(element, "Length", 0.0)) or 1.0)
     total *= float(getattr(element, "FieldScaling", 1.0))
     if "Linear" in element.PassMethod:
         total[[0, *range(2, orders)]] = 0.0
         total[1] = total[1].real
     return total
+
+
+def kicks_of(element: Any) -> NDArray[np.float64]:
+    """`KickAngle` in x and y, rad, [2]; 0 where it is missing."""
+    given = np.ravel(np.asarray(getattr(element, "KickAngle", ()), dtype=float))[:2]
+    return np.pad(given, (0, 2 - len(given)))
 
 
 def _normal(strength: complex, order: int) -> tuple[float, float]:
@@ -53,14 +55,6 @@ def _normal(strength: complex, order: int) -> tuple[float, float]:
     if k.real < 0.0:
         return -abs(k), -math.atan2(-k.imag, -k.real) / n
     return abs(k), -math.atan2(k.imag, k.real) / n
-
-
-def straight(
-    element: Any, family: str, length: float, mad: str, roll: float, left_out: Callable[[str], None]
-) -> tuple[Kind, Any]:
-    """A thick multipole of AT; see `straight_magnet`."""
-    strengths, own = strengths_of(element), _own_order(element, mad)
-    return straight_magnet(strengths, own, length, roll, family, left_out)
 
 
 def straight_magnet(
@@ -86,30 +80,25 @@ def straight_magnet(
     orders = [n for n in range(len(strengths)) if strengths[n] != 0]
     low = [n for n in orders if n <= 2]
     high = [n for n in orders if n > 2]
+    classes = {1: ocelot.Quadrupole, 2: ocelot.Sextupole, 3: ocelot.Octupole}
     if not orders:
-        match own:
-            case 1:
-                return "quadrupole", ocelot.Quadrupole(l=length, tilt=roll, eid=family)
-            case 2:
-                return "sextupole", ocelot.Sextupole(l=length, tilt=roll, eid=family)
-            case 3:
-                return "octupole", ocelot.Octupole(l=length, tilt=roll, eid=family)
+        if own in classes:
+            return KIND_OF[own], classes[own](l=length, tilt=roll, eid=family)
         return "multipole", ocelot.Quadrupole(l=length, k1=0.0, eid=family)
-    if not low:
-        if high == [3]:
-            k, tilt = _normal(complex(strengths[3]), 3)
-            return "octupole", ocelot.Octupole(l=length, k3=k, tilt=tilt + roll, eid=family)
+    if not low and high != [3]:
         left_out("multipoles above the sextupole")
         return "multipole", ocelot.Drift(l=length, eid=family)
-    if high:
+    if low and high:
         left_out("orders of multipoles above the sextupole")
-    kind = _kind(strengths, own)
-    if low == [1]:
-        k, tilt = _normal(complex(strengths[1]), 1)
-        return kind, ocelot.Quadrupole(l=length, k1=k, tilt=tilt + roll, eid=family)
-    if low == [2]:
-        k, tilt = _normal(complex(strengths[2]), 2)
-        return kind, ocelot.Sextupole(l=length, k2=k, tilt=tilt + roll, eid=family)
+    kind = KIND_OF[own] if own in (1, 2) and own in low else strongest(strengths)
+    kept = low or high
+    if kept == [3]:
+        k, tilt = _normal(complex(strengths[3]), 3)
+        return "octupole", ocelot.Octupole(l=length, k3=k, tilt=tilt + roll, eid=family)
+    if kept in ([1], [2]):
+        k, tilt = _normal(complex(strengths[kept[0]]), kept[0])
+        source = classes[kept[0]](l=length, tilt=tilt + roll, eid=family, **{f"k{kept[0]}": k})
+        return kind, source
     if low == [1, 2] and kind == "quadrupole" and not strengths[:3].imag.any():
         k1, k2 = strengths[1].real, 2 * strengths[2].real
         return kind, ocelot.Quadrupole(l=length, k1=k1, k2=k2, tilt=roll, eid=family)
@@ -138,23 +127,14 @@ def _combined(strengths: Any, length: float, roll: float, family: str) -> Any:
     )  # fmt: skip
 
 
-def _own_order(element: Any, mad: str) -> int | None:
+def own_order(element: Any, mad: str) -> int | None:
     """The order that a multipole's class, or its MADType, names."""
     import at
 
-    known = ((at.Quadrupole, "QUADRUPOLE"), (at.Sextupole, "SEXTUPOLE"), (at.Octupole, "OCTUPOLE"))
-    for order, (cls, name) in enumerate(known, 1):
-        if isinstance(element, cls) or mad == name:
+    for order, cls in enumerate((at.Quadrupole, at.Sextupole, at.Octupole), 1):
+        if isinstance(element, cls) or mad == cls.__name__.upper():
             return order
     return None
-
-
-def _kind(strengths: Any, own: int | None) -> Kind:
-    if own in (1, 2) and strengths[own] != 0:
-        return KIND_OF[own]
-    field = np.abs(strengths) * RADIUS ** np.arange(len(strengths))
-    strongest = int(np.argmax(field))
-    return KIND_OF[strongest] if strongest in (1, 2) else "multipole"
 
 
 def bend(

@@ -33,7 +33,15 @@ from tmlattice.errors import LatticeError, first_of, plain
 from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.at_child import check_methods, map_of
 from tmlattice.lattice.at_code import elements_of
-from tmlattice.lattice.at_fields import bend, straight, strengths_of, thin, with_coils
+from tmlattice.lattice.at_fields import (
+    bend,
+    kicks_of,
+    own_order,
+    straight_magnet,
+    strengths_of,
+    thin,
+    with_coils,
+)
 from tmlattice.lattice.expressions import STALE, nothing_run
 from tmlattice.lattice.mat_file import lattice_in, read_mat
 from tmlattice.lattice.parts import Report, assembled
@@ -159,7 +167,7 @@ def ring_from_at(lattice: Any, name: str, energy: float | None = None) -> Ring:
         if id(element) not in known:
             family = str(getattr(element, "CommonName", "") or element.FamName).strip().lower()
             entrance, exit_ = _frame(element, family, design.map_energy)
-            bare = _without_frame(element) if entrance else element
+            bare = _without(element, "T1", "T2", "R1", "R2") if entrance else element
 
             def left_out(reason: str, family: str = family, own: int = id(element)) -> None:
                 report.left_out(reason, family, own)
@@ -207,11 +215,17 @@ def _rotations(element: Any) -> tuple[Array, Array]:
     return R1, R2
 
 
+def _roll(element: Any) -> float:
+    """rad."""
+    R1, _ = _rotations(element)
+    return math.atan2(R1[0, 2], R1[0, 0])
+
+
 def _frame(element: Any, family: str, energy: float) -> tuple[list[Place], list[Place]]:
     """What T1, R1 and R2, T2 do before and behind an element, where they are neither an offset nor
     a roll: matrices of their own. x -> R1 (x + T1) and x -> R2 x + T2."""
     (T1, T2), (R1, R2) = _translations(element), _rotations(element)
-    turn = rotation(math.atan2(R1[0, 2], R1[0, 0]))
+    turn = rotation(_roll(element))
     offset = np.array_equal(T1, -T2) and not T1[[1, 3, 4, 5]].any()
     if offset and np.abs(R1 - turn).max() < 1e-9 and np.abs(R2 - turn.T).max() < 1e-9:
         return [], []
@@ -222,9 +236,9 @@ def _frame(element: Any, family: str, energy: float) -> tuple[list[Place], list[
     )
 
 
-def _without_frame(element: Any) -> Any:
+def _without(element: Any, *fields: str) -> Any:
     bare = element.deepcopy()
-    for name in ("T1", "T2", "R1", "R2"):
+    for name in fields:
         vars(bare).pop(name, None)
     return bare
 
@@ -259,20 +273,14 @@ def _places(
 
 
 def _as_tracked(
-    element: Any,
-    family: str,
-    own: list[Place],
-    energy: float,
-    left_out: Callable[[str], None],
+    element: Any, family: str, own: list[Place], energy: float, left_out: Callable[[str], None]
 ) -> list[Place]:
     """An element, and behind it a matrix of what AT tracks otherwise: linear fringes, fields that
     a pass method lacks or has about another axis. AT integrates in steps that are fine enough."""
-    fine = element.deepcopy()
-    vars(fine).pop("T1", None)
-    vars(fine).pop("T2", None)
+    fine = _without(element, "T1", "T2")
     fine.NumIntSteps = max(FINE, int(np.ravel(getattr(element, "NumIntSteps", 1))[0]))
     wanted, kick = map_of(fine, 1e9 * energy)
-    turn, matrix, shift = _from_ocelot(energy), np.eye(6), np.zeros(6)
+    turn, matrix, shift = from_ocelot(energy), np.eye(6), np.zeros(6)
     for _, _, source in own:
         for r, b in zip(source.R(energy), source.B(energy), strict=True):
             matrix, shift = r @ matrix, r @ shift + np.ravel(b)
@@ -283,7 +291,7 @@ def _as_tracked(
         return own
     name = f"{family}_rest"
     left_out(f"what {element.PassMethod} has beyond the model and a first-order matrix")
-    return [*own, (name, *_matrix(rest, name, 0.0, energy, across if across.any() else None))]
+    return [*own, (name, *_matrix(rest, name, 0.0, energy, across))]
 
 
 def _convert(
@@ -295,8 +303,7 @@ def _convert(
     from tmlattice.lattice.ocelot import elements as ocelot
 
     length = float(getattr(element, "Length", 0.0))
-    R1, R2 = _rotations(element)
-    roll = math.atan2(R1[0, 2], R1[0, 0])
+    roll = _roll(element)
     if isinstance(element, at.RFCavity) and passes_freely(element):
         voltage, frequency = (float(getattr(element, k, 0.0)) for k in ("Voltage", "Frequency"))
         return "cavity", ocelot.Cavity(l=length, v=1e-9 * voltage, freq=frequency, eid=family)
@@ -324,6 +331,7 @@ def _convert(
     if isinstance(element, at.M66) and method.startswith("Matrix66"):
         matrix = np.asarray(element.M66, dtype=float)
         if roll:
+            R1, R2 = _rotations(element)
             matrix = R2 @ matrix @ R1
         return _matrix(matrix, family, length, energy)
     if method == "ThinMPolePass":
@@ -335,19 +343,19 @@ def _convert(
                 left_out("that AT tracks bends straight ahead by a pass method Str...")
             return bend(element, family, length, roll, left_out)
     elif (acts or isinstance(element, at.Multipole)) and method.startswith(_FIELDS):
-        return straight(element, family, length, mad, roll, left_out)
+        strengths, own = strengths_of(element), own_order(element, mad)
+        return straight_magnet(strengths, own, length, roll, family, left_out)
     matrix, kick = map_of(element, 1e9 * energy)
     if method == "ChangePRefPass" and kick[4]:
         raise LatticeError(f"'{family}' changes the reference momentum ({method}); take it out")
-    across = kick * [1, 1, 1, 1, 0, 0]
-    kind, source = _matrix(matrix, family, length, energy, across if across.any() else None)
+    kind, source = _matrix(matrix, family, length, energy, kick * [1, 1, 1, 1, 0, 0])
     name = type(element).__name__
     if name in ("Element", "Drift", "Marker", "Monitor"):
         name = method.removesuffix("Pass")
     left_out(f"what {name} has beyond its first-order matrix")
-    if element.PassMethod.startswith(("GWig", "Wigg", "IdTable")):
+    if method.startswith(("GWig", "Wigg", "IdTable")):
         kind = "wiggler"
-    return ("solenoid" if element.PassMethod.startswith("Solenoid") else kind), source
+    return ("solenoid" if method.startswith("Solenoid") else kind), source
 
 
 _FIELDS = ("Str", "Bnd", "Bend", "Quad", "Exact", "ThinMPole")
@@ -382,19 +390,16 @@ def _is_short(method: str) -> bool:
 
 def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     """One corrector where something states its plane, else one of each plane."""
-    kicks = np.zeros(2)
-    given = np.asarray(element.KickAngle, dtype=float).ravel()[:2]
-    if element.PassMethod.startswith(("Corrector", *_FIELDS)):  # else it is switched off
-        kicks[: len(given)] = given * float(getattr(element, "FieldScaling", 1.0))
-    R1, _ = _rotations(element)
-    turned = complex(*kicks) * cmath.exp(1j * math.atan2(R1[0, 2], R1[0, 0]))
+    on = element.PassMethod.startswith(("Corrector", *_FIELDS))
+    kick = complex(*kicks_of(element)) if on else 0j
+    turned = kick * float(getattr(element, "FieldScaling", 1.0)) * cmath.exp(1j * _roll(element))
     x, y = turned.real, turned.imag
-    names = (str(element.FamName), family)
-    horizontal = mad == "HKICKER" or any(_HORIZONTAL.search(name) for name in names)
-    vertical = mad == "VKICKER" or any(_VERTICAL.search(name) for name in names)
     length = float(getattr(element, "Length", 0.0))
     if mad in ("HKICKER", "VKICKER"):
         horizontal, vertical = mad == "HKICKER", mad == "VKICKER"
+    else:
+        names = (str(element.FamName), family)
+        horizontal, vertical = (any(map(k.search, names)) for k in (_HORIZONTAL, _VERTICAL))
     if horizontal and not vertical and y == 0.0:
         return [corrector(family, "h", length, x)]
     if vertical and not horizontal and x == 0.0:
@@ -402,7 +407,7 @@ def _correctors(element: Any, family: str, mad: str) -> list[Place]:
     return corrector_pair(family, length, x, y)
 
 
-def _from_ocelot(energy: float) -> Array:
+def from_ocelot(energy: float) -> Array:
     """From OCELOT's coordinates (.., tau, p) to AT's (.., delta, ct), [6, 6]."""
     beta = math.sqrt(1.0 - (ELECTRON_GEV / energy) ** 2)
     turn = np.eye(6)
@@ -415,11 +420,11 @@ def _matrix(
 ) -> tuple[Kind, Any]:
     from tmlattice.lattice.ocelot import elements as ocelot
 
-    turn = _from_ocelot(energy)
+    turn = from_ocelot(energy)
     source = ocelot.Matrix(l=length, eid=family)
     source.r = np.linalg.inv(turn) @ r @ turn
     if source.r[4, 4] == 0.0 and source.r[5, 5] == 0.0:
         source.r[4, 4] = source.r[5, 5] = 1.0
-    if b is not None:
+    if b is not None and b.any():
         source.b = np.linalg.solve(turn, b).reshape(6, 1)
     return ("wiggler" if "wig" in family else "matrix"), source

@@ -183,13 +183,9 @@ class _Budget:
     def __init__(self, file: Any, size: int) -> None:
         self.file = file
         self.size = size
+        self.most = min(MOST, SMALL + RATIO * size)  # bytes of all data sets
         self.total = 0
         self.references = 0
-
-    @property
-    def most(self) -> int:
-        """Bytes of all data sets."""
-        return min(MOST, SMALL + RATIO * self.size)
 
     def child(self, group: Any, name: str) -> Any:
         """What a group holds under a name, inside the file.
@@ -263,10 +259,12 @@ class _Budget:
                 f"{self.size / 1e6:.3g} MB ('{name}' has the shape {item.shape}); at most "
                 f"{self.most / 1e6:.0f} MB are read"
             )
-        if (unwritten := _unwritten(item)) and not _is_nan(item.fillvalue):
+        fill = item.fillvalue
+        nan = isinstance(fill, np.floating) and np.isnan(fill)
+        if (unwritten := _unwritten(item)) and not nan:
             raise RefusedError(
                 f"{unwritten} of '{name}' was never written: such numbers would be read as "
-                f"{item.fillvalue}; save it whole, or with NaN as the fill value"
+                f"{fill}; save it whole, or with NaN as the fill value"
             )
 
     def read(self, item: Any, name: str, references: bool = False) -> Any:
@@ -319,10 +317,6 @@ def _unwritten(item: Any) -> str:
     chunks = math.prod(-(-n // m) for n, m in zip(item.shape, item.chunks, strict=True))
     there = item.id.get_num_chunks()
     return "" if there >= chunks else f"{chunks - there:,} of {chunks:,} parts"
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, np.floating) and bool(np.isnan(value))
 
 
 def _kind(kind: Any) -> str:

@@ -10,7 +10,7 @@ Nothing of a file is run: RPN is worked out by `_Rpn`, which knows numbers, name
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +19,17 @@ import numpy as np
 from tmlattice.errors import LatticeError, plain
 from tmlattice.input_files import content_of, decoded
 from tmlattice.lattice.lines import DEEPEST, Items, chosen, inner_names, items_of, laid_out
-from tmlattice.lattice.madx_language import split
+from tmlattice.lattice.madx_language import LONGEST_STATEMENT, split
 from tmlattice.lattice.parts import Part, Report, ring_of_parts
-from tmlattice.lattice.ring import ELECTRON_GEV, Ring
+from tmlattice.lattice.ring import ELECTRON_GEV, LIGHT, Ring
 
 MOST_FILES = 1000
 MOST_BYTES = 200_000_000
 MOST_WORK = 2_000_000
 """Words of RPN, and elements of lines."""
-LONGEST_STATEMENT = 5000
-"""Lines."""
-LIGHT = 299792458.0
 
+_CODE = re.compile(r'(?:[^!"]++|"[^"]*+"?+)*+')
+"""A line up to a `!` outside quotation marks."""
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 _DRIFTS = ("DRIF", "EDRIFT", "CSRDRIFT", "LSCDRIFT")
@@ -156,7 +155,7 @@ def read_elegant(
     """
     reader = _Reader()
     try:
-        reader.read(path)
+        reader.read(path, path.parent)
     except LatticeError as error:
         raise LatticeError(f"'{path}' cannot be read as elegant's lattice: {error}") from error
     inside = [name for items in reader.lines.values() for name in inner_names(items)]
@@ -305,6 +304,29 @@ class _Element:
     values: dict[str, float | str]
     where: str
 
+    @property
+    def named(self) -> str:
+        """For messages."""
+        return f"{self.cls} '{plain(self.name, 60)}'"
+
+    def part(self, keyword: str, **values: Any) -> Part:
+        """The element in MAD-X's words, with its own length where none is stated."""
+        values = {"l": self.number("L"), **values}
+        return Part(self.name.lower(), keyword, values, self.where)
+
+    def numbers(self, **keys: str) -> dict[str, float]:
+        """Attributes by MAD-X's names."""
+        return {name: self.number(key) for name, key in keys.items()}
+
+    def moved(self) -> dict[str, float]:
+        """Misalignments and tilt."""
+        return self.numbers(dx="DX", dy="DY", ds="DZ", tilt="TILT")
+
+    def kicks(self) -> tuple[float, float]:
+        """Of both planes, rad."""
+        h, v = (self.number(f"{p}KICK") * self.number(f"{p}CALIBRATION") for p in "HV")
+        return h, v
+
     def number(self, key: str) -> float:
         """An attribute's value, else elegant's default."""
         value = self.values.get(key, _DEFAULTS.get(key, 0.0))
@@ -327,11 +349,8 @@ class _Reader:
         self._rigidity = 0.0
         self._slip = 0.0
 
-    def read(self, path: Path) -> None:
-        """Carry out the statements of a file."""
-        self._read_file(path, path.parent, 0)
-
-    def _read_file(self, path: Path, folder: Path, depth: int) -> None:
+    def read(self, path: Path, folder: Path, depth: int = 0) -> None:
+        """Carry out the statements of a file; what it includes is looked for in a folder too."""
         self._files += 1
         if not path.is_file():
             path = folder / path.name if (folder / path.name).is_file() else path
@@ -348,7 +367,7 @@ class _Reader:
                 included = re.match(r"#include\s*:\s*(.*)", text, re.IGNORECASE)
                 if included:
                     name = included[1].strip().strip("\"'")
-                    self._read_file(path.parent / name, folder, depth + 1)
+                    self.read(path.parent / name, folder, depth + 1)
                 elif self._carry_out(text, where, after):
                     return
             except LatticeError as error:
@@ -358,7 +377,7 @@ class _Reader:
                     f"{error} (in the statement '{plain(text, 100)}', {where})"
                 ) from error
 
-    def _carry_out(self, text: str, where: str, after: Iterator[str]) -> bool:
+    def _carry_out(self, text: str, where: str, after: Iterator[Any]) -> bool:
         """Carry out a statement; whether it ends the file."""
         if text[0] == "%":
             self.rpn.value(text[1:])
@@ -384,11 +403,10 @@ class _Reader:
 
     def _define(self, name: str, rest: str, where: str) -> None:
         line = re.fullmatch(r"line\s*=\s*(.*)", rest, re.IGNORECASE | re.DOTALL)
-        known = self.lines if line else self.elements
         if name in self.lines or name in self.elements:
             raise LatticeError(f"'{plain(name, 60)}' is defined twice; give one another name")
         if line:
-            known[name] = items_of(line[1], _split, _bare)  # type: ignore[assignment]
+            self.lines[name] = items_of(line[1], _split, _bare)
             return
         head, *given = _split(rest) or [""]
         parent = self.elements.get(_bare(head))
@@ -481,8 +499,8 @@ class _Reader:
 
     def _converted(self, element: _Element, turned: bool, inner: tuple[bool, bool]) -> list[Part]:
         """What one element is in the ring."""
-        cls, name, where = element.cls, element.name.lower(), element.where
-        named = f"{cls} '{plain(element.name, 60)}' ({where})"
+        cls, name = element.cls, element.name.lower()
+        named = f"{element.named} ({element.where})"
         if cls in _REFUSED:
             raise LatticeError(
                 f"{named} acts on the beam and is not modelled; take it out, or replace it"
@@ -500,8 +518,7 @@ class _Reader:
             for key in element.values.keys() - NO_EFFECT - {"L"}:
                 self.report.left_out(key, name)
         if cls in (*_DRIFTS, *_SILENT, *_COLLECTIVE, *_INERT):
-            length = element.number("L")
-            return [Part(name, "drift" if length else "marker", {"l": length}, where)]
+            return [element.part("drift" if element.number("L") else "marker")]
         for key, value in element.values.items():
             if key in MODELLED[cls] or not value or value == _DEFAULTS.get(key):
                 continue
@@ -517,74 +534,59 @@ class _Reader:
                     f"the attribute {plain(key, 40)} of {named} is not modelled; set it to 0 or "
                     "take it out"
                 )
-        made = getattr(self, f"_as_{_FAMILY[cls]}")(element, name, turned, inner)
+        if _FAMILY[cls] == "bend":
+            return [self._as_bend(element, turned, inner)]
+        made = getattr(self, f"_as_{_FAMILY[cls]}")(element)
         return made if isinstance(made, list) else [made]
-
-    def _moved(self, element: _Element) -> dict[str, float]:
-        keys = {"dx": "DX", "dy": "DY", "ds": "DZ", "tilt": "TILT"}
-        return {key: element.number(own) for key, own in keys.items()}
 
     def _steered(self, element: _Element) -> dict[str, Any]:
         """Kicks of windings for steering, as integrated dipole fields of a magnet."""
-        x = element.number("HKICK") * element.number("HCALIBRATION")
-        y = element.number("VKICK") * element.number("VCALIBRATION")
+        x, y = element.kicks()
         return {"knl": [-x], "ksl": [y]} if x or y else {}
 
-    def _scaled(self, element: _Element, key: str, order: int) -> float:
+    def _scaled(self, element: _Element, key: str, order: int, field: str = "B") -> float:
         """A strength, by its pole-tip field where the bore is given."""
         bore = element.number("BORE")
         value = element.number(key)
         if bore:
-            value = math.factorial(order) * element.number("B") / bore**order / self._rigidity
+            value = math.factorial(order) * element.number(field) / bore**order / self._rigidity
         return value * (1 + element.number("FSE"))
 
-    def _as_quadrupole(self, element: _Element, name: str, *_: Any) -> Any:
-        values = {"l": element.number("L"), "k1": self._scaled(element, "K1", 1),
-                  **self._moved(element), **self._steered(element)}  # fmt: skip
+    def _as_quadrupole(self, element: _Element) -> Part | list[Part]:
+        k1 = self._scaled(element, "K1", 1)
+        values = {**element.moved(), **self._steered(element)}
         if element.cls == "DQCOR":
             values["k1s"] = element.number("J1") * (1 + element.number("FSE"))
         if element.cls != "QUFRINGE":
-            return Part(name, "quadrupole", values, element.where)
-        count, length = 10, element.number("L")
+            return element.part("quadrupole", k1=k1, **values)
+        count = 10
         shares = (np.arange(count) + 0.5) / count
         if element.number("DIRECTION") < 0:
             shares = shares[::-1]
-        return [
-            Part(name, "quadrupole", {**values, "l": length / count, "k1": values["k1"] * share},
-                 element.where)
-            for share in shares
-        ]  # fmt: skip
+        values["l"] = element.number("L") / count
+        return [element.part("quadrupole", k1=k1 * share, **values) for share in shares]
 
-    def _as_sextupole(self, element: _Element, name: str, *_: Any) -> Part:
-        values = {"l": element.number("L"), "k2": self._scaled(element, "K2", 2),
-                  "k1": element.number("K1"), "k1s": element.number("J1"),
-                  **self._moved(element), **self._steered(element)}  # fmt: skip
-        if element.cls == "KQUSE":
-            values["k1"] *= 1 + element.number("FSE1")
-            values["k2"] *= 1 + element.number("FSE2")
-        keyword = "quadrupole" if element.cls == "KQUSE" else "sextupole"
-        return Part(name, keyword, values, element.where)
+    def _as_sextupole(self, element: _Element) -> Part:
+        values = {"k2": self._scaled(element, "K2", 2), **element.numbers(k1="K1", k1s="J1"),
+                  **element.moved(), **self._steered(element)}  # fmt: skip
+        if element.cls != "KQUSE":
+            return element.part("sextupole", **values)
+        values["k1"] *= 1 + element.number("FSE1")
+        values["k2"] *= 1 + element.number("FSE2")
+        return element.part("quadrupole", **values)
 
-    def _as_octupole(self, element: _Element, name: str, *_: Any) -> Part:
-        values = {"l": element.number("L"), "k3": self._scaled(element, "K3", 3)}
-        return Part(name, "octupole", {**values, **self._moved(element)}, element.where)
+    def _as_octupole(self, element: _Element) -> Part:
+        return element.part("octupole", k3=self._scaled(element, "K3", 3), **element.moved())
 
-    def _as_multipole(self, element: _Element, name: str, *_: Any) -> Part:
+    def _as_multipole(self, element: _Element) -> Part:
         order = int(element.values.get("ORDER", 1.0))
         if not 0 <= order <= 20:
-            raise LatticeError(f"MULT '{plain(element.name, 60)}' has the ORDER {order}")
-        strength, bore = element.number("KNL"), element.number("BORE")
-        if bore:
-            strength = math.factorial(order) * element.number("BTIPL") / bore**order
-            strength /= self._rigidity
+            raise LatticeError(f"{element.named} has the ORDER {order}")
         knl = np.zeros(order + 1)
-        knl[order] = strength * element.number("FACTOR")
-        values = {"l": element.number("L"), "knl": knl, "angle": 0.0, **self._moved(element)}
-        return Part(name, "multipole", values, element.where)
+        knl[order] = self._scaled(element, "KNL", order, "BTIPL") * element.number("FACTOR")
+        return element.part("multipole", knl=knl, angle=0.0, **element.moved())
 
-    def _as_bend(
-        self, element: _Element, name: str, turned: bool, inner: tuple[bool, bool]
-    ) -> Part:
+    def _as_bend(self, element: _Element, turned: bool, inner: tuple[bool, bool]) -> Part:
         number = element.number
         length, angle = number("L"), number("ANGLE")
         e1, e2 = number("E1"), number("E2")
@@ -595,7 +597,7 @@ class _Reader:
             length *= (angle / 2) / math.sin(angle / 2)
         yaw = number("YAW")
         if yaw and element.cls != "CCBEND":
-            raise LatticeError(f"YAW of {element.cls} '{plain(element.name, 60)}' is not modelled")
+            raise LatticeError(f"YAW of {element.named} is not modelled")
         e1, e2 = e1 - yaw, e2 + yaw
         curvature = angle / length if length else 0.0
         k1, k2 = number("K1"), number("K2")
@@ -619,76 +621,69 @@ class _Reader:
         ]
         body: dict[str, Any] = {
             "l": length, "k1": k1, "k2": k2, "knl": [error], "ksl": [number("YKICK")],
-            **self._moved(element),
+            **element.moved(),
         }  # fmt: skip
         if not angle:
-            return Part(name, "quadrupole", body, element.where)
+            return element.part("quadrupole", **body)
         (e1, h1, first, _), (e2, h2, second, _) = faces
         edges = {"e1": e1, "e2": e2, "h1": h1, "h2": h2, "fint": first, "fintx": second}
         roll = math.copysign(number("ETILT"), number("ETILT") * number("ETILT_SIGN"))
         body |= {**edges, "angle": angle, "hgap": number("HGAP"), "dpsi": roll}
-        return Part(name, "sbend", body, element.where)
+        return element.part("sbend", **body)
 
-    def _as_corrector(self, element: _Element, name: str, *_: Any) -> Part:
-        values = {"l": element.number("L"), "tilt": element.number("TILT")}
+    def _as_corrector(self, element: _Element) -> Part:
+        number = element.number
         if element.cls in ("KICKER", "EKICKER"):
-            values["hkick"] = element.number("HKICK") * element.number("HCALIBRATION")
-            values["vkick"] = element.number("VKICK") * element.number("VCALIBRATION")
-            return Part(name, "kicker", values, element.where)
-        values["kick"] = element.number("KICK") * element.number("CALIBRATION")
+            x, y = element.kicks()
+            return element.part("kicker", hkick=x, vkick=y, tilt=number("TILT"))
         keyword = "hkicker" if "HK" in element.cls else "vkicker"
-        return Part(name, keyword, values, element.where)
+        kick = number("KICK") * number("CALIBRATION")
+        return element.part(keyword, kick=kick, tilt=number("TILT"))
 
-    def _as_monitor(self, element: _Element, name: str, *_: Any) -> Part:
-        keyword = {"HMON": "hmonitor", "VMON": "vmonitor"}.get(element.cls, "monitor")
-        return Part(name, keyword, {"l": element.number("L")}, element.where)
+    def _as_monitor(self, element: _Element) -> Part:
+        return element.part({"HMON": "hmonitor", "VMON": "vmonitor"}.get(element.cls, "monitor"))
 
-    def _as_cavity(self, element: _Element, name: str, *_: Any) -> Part:
+    def _as_cavity(self, element: _Element) -> Part:
         if element.number("CHANGE_P0"):
-            raise LatticeError(f"{element.cls} '{plain(element.name, 60)}' changes the momentum of "
-                               "the ring (CHANGE_P0); set it to 0")  # fmt: skip
-        values = {"l": element.number("L"), "volt": 1e-6 * element.number("VOLT"),
-                  "freq": 1e-6 * element.number("FREQ")}  # fmt: skip
-        return Part(name, "rfcavity", values, element.where)
+            raise LatticeError(
+                f"{element.named} changes the momentum of the ring (CHANGE_P0); set it to 0"
+            )
+        volt, freq = 1e-6 * element.number("VOLT"), 1e-6 * element.number("FREQ")
+        return element.part("rfcavity", volt=volt, freq=freq)
 
-    def _as_solenoid(self, element: _Element, name: str, *_: Any) -> Part:
+    def _as_solenoid(self, element: _Element) -> Part:
         ks = -element.number("KS")  # elegant's is -B / (B rho)
         if not ks and element.number("B"):
             ks = element.number("B") / self._rigidity
-        moved = {"dx": element.number("DX"), "dy": element.number("DY"), "ds": element.number("DZ")}
-        return Part(name, "solenoid", {"l": element.number("L"), "ks": ks, **moved}, element.where)
+        return element.part("solenoid", ks=ks, **element.numbers(dx="DX", dy="DY", ds="DZ"))
 
-    def _as_matrix(self, element: _Element, name: str, *_: Any) -> Part:
+    def _as_matrix(self, element: _Element) -> Part:
         """elegant's (s, delta) are OCELOT's (beta0 tau, p / beta0), but for the slip of a drift."""
         r = np.array([[element.number(f"R{i}{j}") for j in range(1, 7)] for i in range(1, 7)])
         b = np.array([element.number(f"C{i}") for i in range(1, 7)])
         b[4] = 0.0  # the length
         if element.number("DELTAP"):
-            raise LatticeError(f"EMATRIX '{plain(element.name, 60)}' changes the momentum (DELTAP)")
+            raise LatticeError(f"{element.named} changes the momentum (DELTAP)")
         if abs(np.linalg.det(r[:4, :4])) < 1e-6:
             raise LatticeError(
-                f"EMATRIX '{plain(element.name, 60)}' has no inverse: what it does not state is 0, "
-                "also on the diagonal; state R11 to R66"
+                f"{element.named} has no inverse: what it does not state is 0, also on the "
+                "diagonal; state R11 to R66"
             )
         if r[5, 5] == 0:
             r[4, 4] = r[5, 5] = 1.0
-        length = element.number("L")
-        if any(element.number(key) for key in ("DX", "DY", "DZ")):
-            raise LatticeError(f"EMATRIX '{plain(element.name, 60)}' is displaced; set DX to 0")
+        _not_displaced(element)
         beta = math.sqrt(1 - self._slip)
         turn = np.diag([1.0, 1.0, 1.0, 1.0, 1 / beta, beta])
         rmat = turn @ r @ np.linalg.inv(turn)
-        rmat[4, 5] -= length * self._slip / (1 - self._slip)
-        values: dict[str, Any] = {"l": length, "rmat": rmat, "tilt": element.number("TILT")}
-        if b.any():
-            values["b"] = turn @ b
-        return Part(name, "matrix", values, element.where)
+        rmat[4, 5] -= element.number("L") * self._slip / (1 - self._slip)
+        own = {"b": turn @ b} if b.any() else {}
+        return element.part("matrix", rmat=rmat, tilt=element.number("TILT"), **own)
 
-    def _as_rotation(self, element: _Element, name: str, *_: Any) -> Part:
+    def _as_rotation(self, element: _Element) -> Part:
         angle = 0.0 if element.number("EXCLUDE_OPTICS") else element.number("TILT")
-        return Part(name, "srotation", {"angle": angle}, element.where)
+        return element.part("srotation", angle=angle)
 
-    def _as_wiggler(self, element: _Element, name: str, *_: Any) -> Part:
+    def _as_wiggler(self, element: _Element) -> Part:
         """A wiggler focuses like half its curvature squared, in the plane of its field."""
         length, radius, poles = (element.number(key) for key in ("L", "RADIUS", "POLES"))
         if not radius and element.number("B"):
@@ -702,11 +697,15 @@ class _Reader:
             focus = 1 / (math.sqrt(2) * abs(radius))
             cos, sin = math.cos(focus * length), math.sin(focus * length)
             r[2:4, 2:4] = [[cos, sin / focus], [-focus * sin, cos]]
-        if any(element.number(key) for key in ("DX", "DY", "DZ")):
-            raise LatticeError(f"WIGGLER '{plain(element.name, 60)}' is displaced; set DX to 0")
-        self.report.left_out("what it has beyond its first-order matrix", name)
-        values = {"l": length, "rmat": r, "tilt": element.number("TILT")}
-        return Part(name if "wig" in name else f"{name}_wiggler", "matrix", values, element.where)
+        _not_displaced(element)
+        made = element.part("matrix", rmat=r, tilt=element.number("TILT"))
+        self.report.left_out("what it has beyond its first-order matrix", made.name)
+        return made if "wig" in made.name else replace(made, name=f"{made.name}_wiggler")
+
+
+def _not_displaced(element: _Element) -> None:
+    if any(element.number(key) for key in ("DX", "DY", "DZ")):
+        raise LatticeError(f"{element.named} is displaced; set DX to 0")
 
 
 _FAMILY_WITHOUT: dict[str, tuple[str, ...]] = {
@@ -731,21 +730,12 @@ _FAMILY_WITHOUT: dict[str, tuple[str, ...]] = {
 default alignment, and fringes of quadrupoles act by their integrals."""
 
 
-def _statements(lines: list[str]) -> Iterator[tuple[str, int, Iterator[str]]]:
+def _statements(lines: list[str]) -> Iterator[tuple[str, int, Iterator[Any]]]:
     """Each statement without comments, its line, and the lines behind it."""
-    rest = iter(lines)
-    number = 0
-
-    def following() -> Iterator[str]:
-        nonlocal number
-        for line in rest:
-            number += 1
-            yield line
-
-    source = following()
+    source = enumerate(lines, 1)
     text, first, joined = "", 0, 0
-    for line in source:
-        bare = _uncommented(line)
+    for number, line in source:
+        bare = next(_CODE.finditer(line))[0].strip()
         if not bare:
             continue
         first = first if text else number
@@ -761,17 +751,6 @@ def _statements(lines: list[str]) -> Iterator[tuple[str, int, Iterator[str]]]:
         text, joined = "", 0
     if text.strip():
         raise LatticeError(f"line {first}: the statement goes on (&) after the end of the file")
-
-
-def _uncommented(line: str) -> str:
-    """A line without what follows a `!` outside quotation marks."""
-    quoted = False
-    for k, sign in enumerate(line):
-        quoted ^= sign == '"'
-        if sign == "!" and not quoted:
-            line = line[:k]
-            break
-    return line.strip()
 
 
 def _split(text: str) -> list[str]:

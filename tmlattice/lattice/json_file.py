@@ -63,49 +63,41 @@ def save_json(ring: Ring, path: str | Path) -> None:
                 content = {"family": element.family, **content}
             keys[text], definitions[key] = key, content
         sequence.append(keys[text])
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "package": __version__,
+        "name": ring.name,
+        "energy_gev": ring.energy,
+        **({} if ring.mass == ELECTRON_GEV else {"mass_gev": ring.mass}),
+        **({} if ring.model == "design" else {"model": ring.model}),
+        "changes": {name: dict(change) for name, change in ring.changes.items()},
+        **({"supplies": ring.supplies} if ring.supplies else {}),
+        "definitions": definitions,
+        "sequence": sequence,
+    }
     with output_file(Path(path)) as temporary:
-        write_json(
-            temporary,
-            {
-                "format": FORMAT,
-                "version": VERSION,
-                "package": __version__,
-                "name": ring.name,
-                "energy_gev": ring.energy,
-                **({} if ring.mass == ELECTRON_GEV else {"mass_gev": ring.mass}),
-                **({} if ring.model == "design" else {"model": ring.model}),
-                "changes": {name: dict(change) for name, change in ring.changes.items()},
-                **({"supplies": ring.supplies} if ring.supplies else {}),
-                "definitions": definitions,
-                "sequence": sequence,
-            },
-        )
+        write_json(temporary, content)
 
 
-def is_own(path: Path) -> bool:
-    """Whether a JSON file is the package's own (AT's has no such `format`).
+def package_of(path: Path) -> str:
+    """Return whose lattice a JSON file holds: "tmlattice", "at" or "xsuite".
 
     Raises:
-        LatticeError: it is no JSON.
+        LatticeError: it is no JSON, or holds no lattice.
     """
     content = _content(path)
     if not isinstance(content, dict):
         raise LatticeError(f"'{path}' holds no lattice; give the package's own JSON or AT's")
-    return "format" in content or "atjson" not in content
-
-
-def is_xsuite(path: Path) -> bool:
-    """Whether a JSON file is a line or an environment of Xsuite.
-
-    Raises:
-        LatticeError: it is no JSON.
-    """
-    content = _content(path)
-    if not isinstance(content, dict) or "format" in content or "atjson" in content:
-        return False
-    line = content.get("line")
+    if "format" in content:
+        return "tmlattice"
+    if "atjson" in content:
+        return "at"
     ordered = {"element_names", "composer", "builder", "xtrack_version"} & content.keys()
-    return isinstance(content.get("lines") or line, dict) or bool("elements" in content and ordered)
+    line = content.get("lines") or content.get("line")
+    return (
+        "xsuite" if isinstance(line, dict) or ("elements" in content and ordered) else "tmlattice"
+    )
 
 
 def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
@@ -159,10 +151,9 @@ def read_json(path: Path, name: str, energy: float | None = None) -> Ring:
             raise LatticeError(
                 f"'{path}': {where} has '{strange[0]}', which is no element; take it out"
             )
-    ring = Ring(name, elements, energy, changes, mass, model=model)
-    return ring if supplies is None else replace(
-        ring, known_supplies={supply: tuple(names) for supply, names in supplies.items()}
-    )  # fmt: skip
+    if supplies is not None:
+        supplies = {supply: tuple(names) for supply, names in supplies.items()}
+    return Ring(name, elements, energy, changes, mass, supplies, model)
 
 
 def _content(path: Path) -> Any:

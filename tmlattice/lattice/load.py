@@ -16,10 +16,9 @@ from tmlattice.lattice.checks import check_ring, reading
 from tmlattice.lattice.marked import marked
 from tmlattice.lattice.ring import PARTICLES, Ring
 
-AT_SUFFIXES = (".mat", ".m", ".repr")
 MADX_SUFFIXES = (".seq", ".madx", ".lte")
 TFS_SUFFIXES = (".tfs", ".twiss", ".dat", ".outx")
-SUFFIXES = (".py", ".json", *AT_SUFFIXES, *MADX_SUFFIXES, *TFS_SUFFIXES)
+SUFFIXES = (".py", ".json", ".mat", ".m", ".repr", *MADX_SUFFIXES, *TFS_SUFFIXES)
 """Of lattice files."""
 
 
@@ -129,13 +128,14 @@ def _read(path: Path, name: str, sequence: str | None, energy: float | None) -> 
 
         return read_ocelot(path, name, sequence, energy)
     if suffix == ".json":
-        from tmlattice.lattice.json_file import is_own, is_xsuite, read_json
+        from tmlattice.lattice.json_file import package_of, read_json
 
-        if is_xsuite(path):
+        package = package_of(path)
+        if package == "xsuite":
             from tmlattice.lattice.xsuite_file import read_xsuite
 
             return read_xsuite(path, name, sequence, energy)
-        if is_own(path):
+        if package == "tmlattice":
             return read_json(path, name, energy)
     if suffix == ".lte":
         from tmlattice.lattice.elegant_file import read_elegant

@@ -102,6 +102,8 @@ WORDS = frozenset({
 """Attributes that are texts, or whose numbers nothing here asks for."""
 _FLAGS = frozenset({"kill_ent_fringe", "kill_exi_fringe"})
 
+Attributes = dict[str, Given]
+
 
 @dataclass
 class _Definition:
@@ -186,7 +188,7 @@ def read_madx(
     except LatticeError as error:
         raise LatticeError(f"'{path}' cannot be read as MAD-X: {error}") from error
     use = reader.chosen(path, sequence)
-    beam = reader.beam(use)
+    beam = reader.ring_beam = reader.beam(use)
     if energy is None and not beam.has_energy:
         raise LatticeError(f"'{path}' has no BEAM with an energy; give energy= (GeV)")
     try:
@@ -231,6 +233,7 @@ def ring_of_madx(madx: Any, sequence: str | None = None, energy: float | None = 
     stated = active.beam
     beam = Beam({k: float(stated[k]) for k in ("mass", "charge", "energy", "bv")})
     reader = _Reader(energy)
+    reader.ring_beam, reader.circumference = beam, float(active.length)
     reader.rbarc, reader.thin_focusing = bool(madx.options.rbarc), bool(madx.options.thin_foc)
     energy = beam.energy if energy is None else energy
     made: dict[Any, Part] = {}
@@ -252,7 +255,7 @@ def ring_of_madx(madx: Any, sequence: str | None = None, energy: float | None = 
             own = {k: v for k, v in given.items() if k != "at" and v != usual.get(k)}
             name = "drift" if keyword == "drift" else node.name
             definition = _Definition(name, keyword, own, "of the Madx")
-            part = reader._new_part(definition, length, beam, float(active.length))
+            part = reader._new_part(definition, length)
             made[key] = _with_errors_of(part, align, field, kicks, reader.report)
         parts.append(made[key])
     return ring_of_parts(parts, active.name, energy, beam.mass, beam.charge, reader.report)
@@ -345,6 +348,7 @@ class _Reader:
         self.warnings: list[str] = []
         self.report = Report()
         self.rbarc = self.thin_focusing = True
+        self.ring_beam, self.circumference = Beam(), 0.0
         self._open: _Sequence | None = None
         self._edited: _Sequence | None = None
         self._selected: list[dict[str, str]] = []
@@ -585,7 +589,7 @@ class _Reader:
             self.order.remove(name)
         self.order.append(name)
 
-    def _update(self, definition: _Definition, given: dict[str, Given]) -> None:
+    def _update(self, definition: _Definition, given: Attributes) -> None:
         for attribute, value in given.items():
             if attribute in ("at", "from"):
                 continue
@@ -601,7 +605,7 @@ class _Reader:
             else:
                 definition.values[attribute] = evaluated(value)(self)
 
-    def _set(self, owner: str, given: dict[str, Given]) -> None:
+    def _set(self, owner: str, given: Attributes) -> None:
         """`owner->attribute = value`, and an element that is named again with other values."""
         if owner == "beam" or owner.startswith("beam%"):
             raise LatticeError("MAD-X leaves its beam as it is here; state it by BEAM")
@@ -619,8 +623,7 @@ class _Reader:
         evaluate = compiled(given.text)
         if given.deferred:
             return evaluate
-        value = evaluate(self)
-        return lambda names: value
+        return _constant(evaluate(self))
 
     # --- commands -------------------------------------------------------------------------------
     def _command(self, text: str) -> None:
@@ -657,11 +660,11 @@ class _Reader:
                         setattr(self, name, bool(compiled(given[option].text)(self)))
                 return None
             case "beam":
-                owner = unquoted(given.pop("sequence").text).lower() if "sequence" in given else ""
+                owner = _word(given, "sequence")
+                given.pop("sequence", None)
                 return self._update_beam(owner, given)
             case "resbeam":
-                owner = unquoted(given["sequence"].text).lower() if "sequence" in given else ""
-                self.beams[owner] = Beam()
+                self.beams[_word(given, "sequence")] = Beam()
                 return None
             case "use":
                 return self._use(given)
@@ -680,12 +683,13 @@ class _Reader:
             case "extract":
                 return self._extract(given)
         if self._edited is not None and word in _EDITS:
-            return getattr(self, f"_{word}")(given)  # type: ignore[no-any-return]
+            slots = self.slots(self._edited)
+            return self._put(getattr(self, f"_{word}")(given, self._edited, slots))
         if self._open is not None and (word in self.elements or word in self.sequences):
             return self._place_again(word, given)
         return self._set(word, given)
 
-    def _call(self, given: dict[str, Given]) -> None:
+    def _call(self, given: Attributes) -> None:
         called = unquoted(given["file"].text if "file" in given else next(iter(given), ""))
         folders = [self._files[-1].parent, self._files[0].parent]
         found = [folder / called for folder in folders if (folder / called).is_file()]
@@ -730,7 +734,7 @@ class _Reader:
         kept = ENERGIES if "particle" in own.given else (*ENERGIES, "particle", "mass", "charge")
         return Beam({k: v for k, v in default.given.items() if k in kept} | own.given)
 
-    def _update_beam(self, owner: str, given: dict[str, Given]) -> None:
+    def _update_beam(self, owner: str, given: Attributes) -> None:
         beam = self.beams.setdefault(owner, Beam())
         own: dict[str, float | str] = {}
         for name, value in given.items():
@@ -744,46 +748,40 @@ class _Reader:
                 f"{what}: those of the {beam.given['particle']} are taken, as in MAD-X"
             )
 
-    def _use(self, given: dict[str, Given]) -> None:
+    def _use(self, given: Attributes) -> None:
         named = next((given[k].text for k in ("sequence", "period") if k in given), None)
         named = named or next((k for k in given if k not in ("range", "survey")), "")
-        if "range" in given and unquoted(given["range"].text).lower().replace(" ", "") not in (
-            "#s/#e", ""
-        ):  # fmt: skip
+        if _word(given, "range").replace(" ", "") not in ("#s/#e", ""):
             raise LatticeError("USE with a RANGE takes a part of the sequence; use all of it")
         self.used = unquoted(named).lower()
         if self.used not in self.sequences and self.used not in self.lines:
             raise LatticeError(f"USE names '{plain(self.used, 60)}', which no sequence or line is")
 
     # --- sequences ------------------------------------------------------------------------------
-    def _begin(self, name: str, given: dict[str, Given]) -> None:
+    def _begin(self, name: str, given: Attributes) -> None:
         if self._open is not None:
             raise LatticeError(f"SEQUENCE '{self._open.name}' has no ENDSEQUENCE before this one")
         if "l" not in given:
             raise LatticeError(f"SEQUENCE '{name}' has no length; give it L")
         for word in ("next_sequ", "add_pass"):
-            if word in given and unquoted(given[word].text).lower() not in ("", "0", "none"):
+            if _word(given, word) not in ("", "0", "none"):
                 raise LatticeError(f"{word.upper()} of a sequence is not read")
-        self._open = _Sequence(name, self._evaluate(given["l"]))
+        length = self._evaluate(given["l"])
+        self._open = _Sequence(name, length, refpos=_word(given, "refpos"))
         if "refer" in given:
             self._open.refer = _refer(given["refer"])
-        if "refpos" in given:
-            self._open.refpos = unquoted(given["refpos"].text).lower()
         self.sequences[name] = self._open
         self._known_as(name)
 
-    def _place(
-        self, name: str, given: dict[str, Given], moved: Mapping[str, Any] | None = None
-    ) -> None:
+    def _place(self, name: str, given: Attributes, moved: Mapping[str, Any] | None = None) -> None:
         """An element's place in the sequence that is open."""
         if self._open is None or "at" not in given:
             return
-        origin = unquoted(given["from"].text).lower() if "from" in given else ""
-        at = self._evaluate(given["at"])
+        at, origin = self._evaluate(given["at"]), _word(given, "from")
         count = self._open.counted(name)
         self._open.nodes.append(_Node(name, at, origin, count=count, moved=moved or {}))
 
-    def _place_again(self, name: str, given: dict[str, Given]) -> None:
+    def _place_again(self, name: str, given: Attributes) -> None:
         """Place what is defined already: of its attributes MAD-X changes shifts, at this place."""
         if "at" not in given:
             raise LatticeError(f"'{plain(name, 60)}' has no AT in its sequence")
@@ -874,7 +872,7 @@ class _Reader:
                 flat.append(replace(slot, centre=start + slot.centre))
         return flat
 
-    # --- SEQEDIT --------------------------------------------------------------------------------
+    # --- SEQEDIT: each edit returns the elements that the sequence then has, in any order ---------
     def _seqedit(self, name: str) -> None:
         if name not in self.sequences:
             raise LatticeError(f"SEQEDIT names '{plain(name, 60)}', which no sequence is")
@@ -882,20 +880,11 @@ class _Reader:
         self._unfound = set()
         self._put(self.slots(self._edited))
 
-    def _opened(self) -> tuple[_Sequence, list[_Slot]]:
-        """The sequence that is edited, and its elements."""
-        assert self._edited is not None
-        return self._edited, self.slots(self._edited)
-
     def _put(self, slots: Sequence[_Slot]) -> None:
         assert self._edited is not None
-        ordered = sorted(slots, key=lambda slot: slot.centre)
-        self._edited.nodes = [
-            _Node(s.name, _constant(s.centre), centred=True, count=s.count, moved=s.moved)
-            for s in ordered
-        ]
+        self._edited.nodes = _nodes(sorted(slots, key=lambda slot: slot.centre))
 
-    def _extract(self, given: dict[str, Given]) -> None:
+    def _extract(self, given: Attributes) -> None:
         """A sequence of what stands between two markers of another."""
         named, first, last, new = (
             unquoted(given[k].text).lower() for k in ("sequence", "from", "to", "newname")
@@ -908,25 +897,18 @@ class _Reader:
         if ends[0].length or ends[1].length or end < begin:
             raise LatticeError("EXTRACT is not from a marker to a marker behind it")
         made = _Sequence(new, _constant(end - begin), counts=self.sequences[named].counts.copy())
-        made.nodes = [
-            _Node(s.name, _constant(s.centre - begin), centred=True, count=s.count, moved=s.moved)
-            for s in slots[slots.index(ends[0]) : slots.index(ends[1]) + 1]
-        ]
+        made.nodes = _nodes(slots[slots.index(ends[0]) : slots.index(ends[1]) + 1], begin)
         self.sequences[new] = made
         self._known_as(new)
 
-    def _select(self, given: dict[str, Given]) -> None:
-        flag = unquoted(given["flag"].text).lower() if "flag" in given else ""
-        if flag != "seqedit":
+    def _select(self, given: Attributes) -> None:
+        if _word(given, "flag") != "seqedit":
             return
         if "clear" in given and given["clear"].text.lower() not in ("0", "false"):
             self._selected = []
         else:
             words = ("class", "pattern", "range")
             self._selected.append({k: unquoted(given[k].text) for k in words if k in given})
-
-    def _chosen_slots(self, slots: Sequence[_Slot]) -> list[_Slot]:
-        return [s for s in slots if any(self._matches(s, choice) for choice in self._selected)]
 
     def _matches(self, slot: _Slot, choice: dict[str, str]) -> bool:
         if "range" in choice:
@@ -946,13 +928,13 @@ class _Reader:
         except re.error as error:
             raise LatticeError(f"the pattern '{plain(pattern, 60)}' is none ({error})") from error
 
-    def _targets(self, given: dict[str, Given], slots: Sequence[_Slot]) -> list[_Slot]:
+    def _targets(self, given: Attributes, slots: Sequence[_Slot]) -> list[_Slot]:
         """The places that an edit names by ELEMENT, or those that SELECT has selected."""
         if "element" not in given:
             raise LatticeError("the edit names no ELEMENT")
         named = unquoted(given["element"].text).lower()
         if named == "selected":
-            return self._chosen_slots(slots)
+            return [s for s in slots if any(self._matches(s, own) for own in self._selected)]
         found = [slot for slot in slots if (slot.name, slot.count) == _occurrence(named)]
         if not found:
             raise LatticeError(f"the sequence has no element '{plain(named, 60)}'")
@@ -963,7 +945,7 @@ class _Reader:
             )
         return found
 
-    def _found(self, given: dict[str, Given], slots: Sequence[_Slot]) -> list[_Slot]:
+    def _found(self, given: Attributes, slots: Sequence[_Slot]) -> list[_Slot]:
         """As `_targets`, for edits that do not find what FLATTEN has just brought in."""
         found = self._targets(given, slots)
         unfound = sorted({slot.name for slot in found} & self._unfound)
@@ -974,8 +956,7 @@ class _Reader:
             )
         return found
 
-    def _install(self, given: dict[str, Given]) -> None:
-        edited, slots = self._opened()
+    def _install(self, given: Attributes, edited: _Sequence, slots: list[_Slot]) -> list[_Slot]:
         name = unquoted(given["element"].text).lower()
         if "class" in given and name not in self.elements:
             word = unquoted(given["class"].text).lower()
@@ -990,67 +971,60 @@ class _Reader:
         if "from" in given:
             origin = {"element": Given(given["from"].text)}
             origins = [slot.centre for slot in self._targets(origin, slots)]
-        count = edited.counted
-        self._put([*slots, *(_Slot(name, at + s, length, count(name)) for s in origins)])
+        return slots + [_Slot(name, at + s, length, edited.counted(name)) for s in origins]
 
     def _is_element(self, name: str) -> None:
         """Raises a LatticeError otherwise: MAD-X puts no sequence into another here."""
         if name not in self.elements:
             raise LatticeError(f"'{plain(name, 60)}' is no element; SEQEDIT puts in elements only")
 
-    def _remove(self, given: dict[str, Given]) -> None:
-        _, slots = self._opened()
+    def _remove(self, given: Attributes, edited: _Sequence, slots: list[_Slot]) -> list[_Slot]:
         gone = {id(slot) for slot in self._found(given, slots)}
-        self._put([slot for slot in slots if id(slot) not in gone])
+        return [slot for slot in slots if id(slot) not in gone]
 
-    def _replace(self, given: dict[str, Given]) -> None:
-        edited, slots = self._opened()
+    def _replace(self, given: Attributes, edited: _Sequence, slots: list[_Slot]) -> list[_Slot]:
         new = unquoted(given["by"].text).lower()
         self._is_element(new)
         old = {id(slot) for slot in self._targets(given, slots)}
         length = self._length(new)
-        self._put([
+        return [
             replace(s, name=new, length=length, count=edited.counted(new))
             if id(s) in old else s for s in slots
-        ])  # fmt: skip
+        ]  # fmt: skip
 
-    def _move(self, given: dict[str, Given]) -> None:
+    def _move(self, given: Attributes, edited: _Sequence, slots: list[_Slot]) -> list[_Slot]:
         """MAD-X counts from where REFER has an element, also with BY, and drops its shifts here."""
-        edited, slots = self._opened()
         moved = {id(slot) for slot in self._found(given, slots)}
         way = float(compiled(given["to" if "to" in given else "by"].text)(self))
         if "to" in given and "from" in given:
             way += self._targets({"element": Given(given["from"].text)}, slots)[0].centre
         share = _REFERENCE.get(edited.refer, 0.0)
-        self._put([
+        return [
             replace(
                 s, centre=way + self._offset(s.name, share) + ("by" in given) * s.centre, moved={}
             )
             if id(s) in moved else s for s in slots
-        ])  # fmt: skip
+        ]  # fmt: skip
 
-    def _flatten(self, given: dict[str, Given]) -> None:
-        edited, slots = self._opened()
+    def _flatten(self, given: Attributes, edited: _Sequence, slots: list[_Slot]) -> list[_Slot]:
         flat = self._flat(edited)
         self._unfound = {slot.name for slot in flat} - {slot.name for slot in slots}
         edited.refer = "centre"
-        self._put(flat)
+        return flat
 
-    def _cycle(self, given: dict[str, Given]) -> None:
-        edited, slots = self._opened()
+    def _cycle(self, given: Attributes, edited: _Sequence, slots: list[_Slot]) -> list[_Slot]:
         named = {"element": given.get("start", Given(""))}
         first = self._targets(named, slots)[0]
         if first.length:
             raise LatticeError(f"CYCLE starts at '{first.name}', which has a length; take a marker")
         length, zero = self._length(edited.name), first.centre
         before = slots.index(first)
-        self._put([replace(s, centre=s.centre - zero + (length if k < before else 0.0))
-                   for k, s in enumerate(slots)])  # fmt: skip
+        return [replace(s, centre=s.centre - zero + (length if k < before else 0.0))
+                for k, s in enumerate(slots)]  # fmt: skip
 
-    def _reflect(self, given: dict[str, Given]) -> None:
-        edited, slots = self._opened()
+    def _reflect(self, given: Attributes, edited: _Sequence, slots: list[_Slot]) -> list[_Slot]:
         length = self._length(edited.name)
-        self._put([replace(s, centre=length - s.centre) for s in slots[::-1]])
+        return [replace(s, centre=length - s.centre) for s in slots[::-1]]
 
     # --- the ring -------------------------------------------------------------------------------
     def chosen(self, path: Path, wanted: str | None) -> str:
@@ -1061,37 +1035,30 @@ class _Reader:
 
     def parts(self, use: str) -> list[Part | float]:
         """The elements of the ring in beam order, and the gaps between them."""
-        beam = self.beam(use)
-        if use in self.sequences:
-            sequence = self.sequences[use]
-            return self._laid_out(sequence, beam, self._length(use))
-        self._in_line = True
-        names = [name for name, _ in laid_out(self.lines[use], self.lines)]
-        self.work(len(names))
+        names = [use]
+        if use not in self.sequences:
+            self._in_line = True
+            names = [name for name, _ in laid_out(self.lines[use], self.lines)]
+            self.work(len(names))
+        self.circumference = sum(map(self._length, names))
         parts: list[Part | float] = []
-        circumference = sum(self._length(name) for name in names)
         for name in names:
             if name in self.sequences:
-                parts += self._laid_out(self.sequences[name], beam, circumference)
+                parts += self._laid_out(self.sequences[name])
             else:
-                parts.append(self._part(name, self._length(name), beam, circumference))
+                parts.append(self._part(name, self._length(name)))
         return parts
 
-    def _laid_out(
-        self, sequence: _Sequence, beam: Beam, circumference: float
-    ) -> list[Part | float]:
+    def _laid_out(self, sequence: _Sequence) -> list[Part | float]:
         placed = [
-            (self._part(slot.name, slot.length, beam, circumference, slot.moved), slot.name,
+            (self._part(slot.name, slot.length, slot.moved), slot.name,
              slot.centre - slot.length / 2, slot.length)
             for slot in self._flat(sequence)
         ]  # fmt: skip
         end = self._length(sequence.name)
         return with_gaps(placed, f"the sequence '{sequence.name}'", end, ROUNDING, SHORTEST_GAP)
 
-    def _part(
-        self, name: str, length: float, beam: Beam, circumference: float,
-        moved: Mapping[str, Any] | None = None,
-    ) -> Part:  # fmt: skip
+    def _part(self, name: str, length: float, moved: Mapping[str, Any] | None = None) -> Part:
         if name not in self.elements:
             raise LatticeError(f"no element '{plain(name, 60)}' is defined")
         key = (name, length, *(moved or {}).items())
@@ -1099,15 +1066,14 @@ class _Reader:
             definition = self.elements[name]
             if moved:
                 definition = replace(definition, values=definition.values | dict(moved))
-            self._made[key] = self._new_part(definition, length, beam, circumference)
+            self._made[key] = self._new_part(definition, length)
             if abs(length - self._element_length(definition)) > 1e-12:
                 self.report.left_out("the later L or ANGLE (as in MAD-X)", name)
         return self._made[key]
 
-    def _new_part(
-        self, definition: _Definition, length: float, beam: Beam, circumference: float
-    ) -> Part:
+    def _new_part(self, definition: _Definition, length: float) -> Part:
         """An element's attributes as numbers; rectangular bends as sector bends."""
+        beam = self.ring_beam
         keyword, half = definition.keyword, 0.0
         own = {k: self._value(definition, k) for k in definition.values if k not in WORDS}
         own["l"] = length
@@ -1119,7 +1085,7 @@ class _Reader:
             case "rfcavity" if not own.get("freq") and own.get("harmon"):
                 gamma = beam.energy / beam.mass
                 speed = CONSTANTS["clight"] * math.sqrt(1 - 1 / gamma**2)
-                own["freq"] = 1e-6 * float(own["harmon"]) * speed / circumference
+                own["freq"] = 1e-6 * float(own["harmon"]) * speed / self.circumference
             case "matrix":
                 own = _with_matrix(own)
             case "multipole":
@@ -1184,6 +1150,14 @@ def _constant(value: float) -> Evaluate:
     return lambda names: value
 
 
+def _nodes(slots: Sequence[_Slot], begin: float = 0.0) -> list[_Node]:
+    """Places of a sequence that begins at this position, m."""
+    return [
+        _Node(s.name, _constant(s.centre - begin), centred=True, count=s.count, moved=s.moved)
+        for s in slots
+    ]
+
+
 def _raising(error: LatticeError) -> Evaluate:
     def value(_: Any) -> float:
         raise error
@@ -1193,6 +1167,11 @@ def _raising(error: LatticeError) -> Evaluate:
 
 def _bare(word: str) -> str:
     return unquoted(word).lower()
+
+
+def _word(given: Mapping[str, Given], attribute: str) -> str:
+    """An attribute that is a word, in lower case; empty where it is not given."""
+    return _bare(given[attribute].text) if attribute in given else ""
 
 
 def _line_parts(text: str) -> list[str]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tmlattice.errors import LatticeError
-from tmlattice.lattice.ring import ELECTRON_GEV, PROTON_GEV
+from tmlattice.lattice.ring import ELECTRON_GEV, LIGHT, PROTON_GEV
 
 LONGEST_STATEMENT = 5000
 """Lines, comments apart: a file without its semicolons is none of MAD-X."""
@@ -22,7 +22,7 @@ DEEPEST = 60
 CONSTANTS: dict[str, float] = {
     "pi": math.pi, "twopi": 2 * math.pi, "degrad": 180 / math.pi, "raddeg": math.pi / 180,
     "e": math.e, "amu0": 4e-7 * math.pi, "emass": ELECTRON_GEV, "mumass": 0.1056583755,
-    "nmass": 0.93956542052, "pmass": PROTON_GEV, "umass": 0.93149410242, "clight": 299792458.0,
+    "nmass": 0.93956542052, "pmass": PROTON_GEV, "umass": 0.93149410242, "clight": LIGHT,
     "qelect": 1.602176634e-19, "hbar": 6.582119569e-25, "erad": 2.8179403262e-15,
     "prad": 1.5346982672e-18, "true": 1.0, "false": 0.0, "version": 50902.0,
 }  # fmt: skip

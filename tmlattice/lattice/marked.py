@@ -8,9 +8,8 @@ Many lattice files have their monitors as plain markers, and correctors as coils
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from fnmatch import fnmatchcase
 
-from tmlattice.errors import LatticeError, unknown_name
+from tmlattice.errors import LatticeError
 from tmlattice.lattice.places import Place, corrector_pair, halves, place_elements
 from tmlattice.lattice.ring import NO_ERRORS, Element, Errors, Ring
 
@@ -66,14 +65,7 @@ def _matched(ring: Ring, patterns: Iterable[str], what: str, kinds: frozenset[st
     """Names of the elements that a pattern means: of all that it matches, those that can be one."""
     found: set[str] = set()
     for pattern in patterns:
-        low = pattern.casefold()
-        matched = [
-            e for e in ring.elements
-            if fnmatchcase(e.name.casefold(), low) or fnmatchcase(e.family.casefold(), low)
-        ]  # fmt: skip
-        if not matched:
-            known = dict.fromkeys(e.family for e in ring.elements)
-            raise unknown_name(f"{what} like", pattern, known)
+        matched = ring.matching(pattern, what)
         able = [e for e in matched if e.kind in kinds]
         if not able:
             raise LatticeError(

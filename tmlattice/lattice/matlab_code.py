@@ -98,12 +98,12 @@ def statements_of(text: str) -> list[list[Token]]:
     return [statement for statement in found if statement]
 
 
-def _closing(tokens: Sequence[Token], at: int = 0) -> int:
-    """Where the bracket closes that opens here."""
+def _closing(tokens: Sequence[Token]) -> int:
+    """Where the bracket closes that opens with the first token."""
     depth = 0
-    for place in range(at, len(tokens)):
-        if tokens[place].kind == "sign":
-            depth += (tokens[place].value in _OPEN) - (tokens[place].value in _CLOSE)
+    for place, token in enumerate(tokens):
+        if token.kind == "sign":
+            depth += (token.value in _OPEN) - (token.value in _CLOSE)
         if not depth:
             return place
     raise LatticeError("a bracket is left open; close it")
@@ -215,7 +215,7 @@ def where_in(text: str, line: int) -> str:
 
 def _lines(word: str, own: list[Token], tokens: list[Token], depth: int) -> list[str]:
     """Python's syntax of a statement."""
-    equals = next((k for k, t in enumerate(_flat(own)) if t == "="), None)
+    equals = _equals(own)
     line = tokens[0].line
     value = partial(expression, line=line)
     match word:
@@ -235,7 +235,7 @@ def _lines(word: str, own: list[Token], tokens: list[Token], depth: int) -> list
             return ["else:", " pass"]
         case "for":
             own = own[1:-1] if own and own[0].value == "(" else own
-            equals = next((k for k, t in enumerate(_flat(own)) if t == "="), 0)
+            equals = _equals(own) or 0
             return [f"for {own[0].value}_ in own[{value(own[equals + 1 :])}]:", " pass"]
         case "global" | "persistent":
             return [f"global {','.join(f'{t.value}_' for t in own)}"]
@@ -247,7 +247,7 @@ def _lines(word: str, own: list[Token], tokens: list[Token], depth: int) -> list
             raise LatticeError(f"'{word}' is not read; write the ring with AT's atwritem")
     if own and word and own[0].kind in ("name", "number") and own[0].apart:
         return [f"own[{word}_[()]]"]  # a command and its words
-    if (at := next((k for k, t in enumerate(_flat(tokens)) if t == "="), None)) is None:
+    if (at := _equals(tokens)) is None:
         return [f"own[{value(tokens)}]"]
     left = tokens[:at]
     if left[0].value == "[":
@@ -258,13 +258,15 @@ def _lines(word: str, own: list[Token], tokens: list[Token], depth: int) -> list
     return [f"{target} = own[{value(tokens[at + 1 :])}]"]
 
 
-def _flat(tokens: Iterable[Token]) -> Iterable[str]:
-    """Signs that stand in no bracket; others are empty."""
+def _equals(tokens: Iterable[Token]) -> int | None:
+    """Where the first `=` is that stands in no bracket."""
     depth = 0
-    for token in tokens:
+    for k, token in enumerate(tokens):
         sign = token.value if token.kind == "sign" else ""
         depth += (sign in _OPEN) - (sign in _CLOSE)
-        yield sign if not depth else ""
+        if sign == "=" and not depth:
+            return k
+    return None
 
 
 class Code(Arithmetic):

@@ -17,11 +17,6 @@ from tmlattice.lattice.ring import Ring
 Read = Callable[[str | None, float | None], Ring]
 """From `sequence` and `energy` of `load_ring` to the ring."""
 
-TAKEN = (
-    "a lattice is a built-in name, a path, an open file, a Ring, an at.Lattice, an xtrack.Line or "
-    "Environment, an OCELOT MagneticLattice or list of elements, or a cpymad Madx"
-)
-
 
 def reader_of(lattice: Any) -> tuple[str, Read]:
     """The name of an object of another package, and what reads it.
@@ -52,7 +47,11 @@ def reader_of(lattice: Any) -> tuple[str, Read]:
     if isinstance(first, list | tuple):
         raise LatticeError(f"the {type(lattice).__name__} of elements is empty; give a ring's")
     what = plain(repr(first), 40)
-    raise LatticeError(f"{what} ({type(first).__name__}) is no lattice; {TAKEN}")
+    raise LatticeError(
+        f"{what} ({type(first).__name__}) is no lattice; a lattice is a built-in name, a path, an "
+        "open file, a Ring, an at.Lattice, an xtrack.Line or Environment, an OCELOT "
+        "MagneticLattice or list of elements, or a cpymad Madx"
+    )
 
 
 def _classes(thing: Any) -> list[str]:

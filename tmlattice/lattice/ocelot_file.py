@@ -153,6 +153,7 @@ def _modelled(source: Any, named: str) -> Any:
     """The element; a copy of a matrix element that was born without a longitudinal block, or of a
     displaced one without its offset; a thin bend in the place of a multipole that bends the design
     orbit. Messages call it `named`."""
+    from tmlattice.lattice.combined import CombinedMultipole
     from tmlattice.lattice.ocelot import elements
 
     cls = type(source).__name__
@@ -171,17 +172,11 @@ def _modelled(source: Any, named: str) -> Any:
         matrix[4, 4] = matrix[5, 5] = 1.0
         source.r = matrix
     if isinstance(source, elements.Multipole) and source.kn[0]:  # it bends the design orbit
-        source = _thin_bend(source, named)
+        angle, k1, k2, *higher = [*map(float, source.kn), 0.0, 0.0]
+        if any(higher):
+            warnings.warn(f"'{named}': fields above the sextupole are left out", stacklevel=2)
+        source = CombinedMultipole(angle=angle, k1=k1, k2=k2, tilt=source.tilt, eid=source.id)
     return source
-
-
-def _thin_bend(source: Any, named: str) -> Any:
-    from tmlattice.lattice.combined import CombinedMultipole
-
-    angle, k1, k2, *higher = [*map(float, source.kn), 0.0, 0.0]
-    if any(higher):
-        warnings.warn(f"'{named}': fields above the sextupole are left out", stacklevel=2)
-    return CombinedMultipole(angle=angle, k1=k1, k2=k2, tilt=source.tilt, eid=source.id)
 
 
 def _name_places(places: list[Any], variables: Mapping[str, Any]) -> tuple[Element, ...]:

@@ -18,7 +18,14 @@ import numpy as np
 from tmlattice.arrays import Array, ComplexArray
 from tmlattice.errors import LatticeError, first_of, plain
 from tmlattice.lattice.at_fields import straight_magnet
-from tmlattice.lattice.places import Place, corrector, corrector_pair, place_elements, rotation
+from tmlattice.lattice.places import (
+    MAIN_ORDER,
+    Place,
+    corrector,
+    corrector_pair,
+    place_elements,
+    rotation,
+)
 from tmlattice.lattice.ring import ELECTRON_GEV, Kind, Ring
 from tmlattice.lattice.wigglers import merge_wigglers
 
@@ -210,8 +217,10 @@ def assembled(
     return replace(design, elements=elements)
 
 
-def _acts(value: Any) -> bool:
+def acts(value: Any) -> bool:
     """Whether an attribute has a value other than zero; a word has."""
+    if isinstance(value, dict):
+        return any(map(acts, value.values()))
     if value is None:
         return False
     try:
@@ -231,20 +240,20 @@ def _check(part: Part, report: Report) -> None:
     named = f"{keyword.upper()} '{plain(part.name, 60)}'{where}"
     if keyword in ACTING:
         for attribute in ACTING[keyword]:
-            if _acts(part.values.get(attribute, _ASSUMED.get(attribute))):
+            if acts(part.values.get(attribute, _ASSUMED.get(attribute))):
                 raise LatticeError(
                     f"{named} acts on the beam by its {attribute.upper()}, which is not modelled; "
                     "set it to 0 or take the element out"
                 )
         return
     if keyword in STATIC:
-        if _acts(part.values.get(STATIC[keyword])):
+        if acts(part.values.get(STATIC[keyword])):
             report.left_out(f"what the voltage does in the {keyword.upper()}", part.name)
         return
     if keyword not in MODELLED:
         raise LatticeError(f"{named}: no element class {keyword.upper()} is known")
     for attribute, value in part.values.items() if MODELLED[keyword] is not _PASSIVE else ():
-        if attribute in MODELLED[keyword] or attribute in NO_EFFECT or not _acts(value):
+        if attribute in MODELLED[keyword] or attribute in NO_EFFECT or not acts(value):
             continue
         if attribute not in NONLINEAR:
             raise LatticeError(
@@ -364,17 +373,14 @@ def _places(part: Part, ring: Ring, charge: float, report: Report) -> list[Place
             return [(name, "bend", _bend(part, report))]
         case "sbend":
             raise LatticeError(f"the bend '{plain(name, 60)}' has no length; give it one")
-        case "multipole" if not length:
+        case "quadrupole" | "sextupole" | "octupole" | "multipole" if not length:
+            # K L of a thin magnet is nothing; KNL acts
             return [(name, "multipole", _thin(part, report))]
         case "quadrupole" | "sextupole" | "octupole" | "multipole":
-            own = {"quadrupole": 1, "sextupole": 2, "octupole": 3}.get(keyword)
-            if not length:  # K L of a thin magnet is nothing; KNL acts
-                return [(name, "multipole", _thin(part, report))]
-
-            def left_out(reason: str) -> None:
-                report.left_out(reason, name)
-
-            kind, source = straight_magnet(strengths(part), own, length, tilt, name, left_out)
+            kind, source = straight_magnet(
+                strengths(part), MAIN_ORDER.get(keyword), length, tilt, name,
+                lambda reason: report.left_out(reason, name),
+            )  # fmt: skip
             return [(name, kind, source)]
     if length:
         return [(name, "drift", ocelot.Drift(l=length, eid=name))]
@@ -385,14 +391,10 @@ def _corrector(part: Part) -> list[Place]:
     """A corrector of one plane by its keyword, turned by its tilt; else one of each plane."""
     name, length, tilt = part.name, part.number("l"), part.number("tilt")
     x, y = part.number("hkick"), part.number("vkick")
-    if part.keyword == "hkicker":
-        x = part.number("kick") or x
-    elif part.keyword == "vkicker":
-        y = part.number("kick") or y
     cos, sin = math.cos(tilt), math.sin(tilt)
     if part.keyword in ("hkicker", "vkicker"):
-        plane = "h" if part.keyword == "hkicker" else "v"
-        amount = x if plane == "h" else y
+        plane = part.keyword[0]
+        amount = part.number("kick") or (x if plane == "h" else y)
         quarter = round(2 * tilt / math.pi)
         if abs(tilt - quarter * math.pi / 2) < 1e-9:
             if quarter % 2:

@@ -15,10 +15,11 @@ from tmlattice.lattice.ring import Element, Kind, number_names
 
 log = logging.getLogger(__name__)
 
-NAMED = 3
-"""Octupoles that a warning names."""
 Place = tuple[str, Kind, Any]
 """Family, kind and OCELOT element, before its name has a number."""
+KIND_OF: dict[int, Kind] = {1: "quadrupole", 2: "sextupole", 3: "octupole"}
+MAIN_ORDER: dict[str, int] = {kind: order for order, kind in KIND_OF.items()}
+"""Of the main field of a kind of magnet: 1 of a quadrupole."""
 
 
 def rotation(angle: float) -> NDArray[np.float64]:
@@ -27,6 +28,14 @@ def rotation(angle: float) -> NDArray[np.float64]:
     cos, sin = math.cos(angle), math.sin(angle)
     matrix[:4, :4] = np.kron([[cos, sin], [-sin, cos]], np.eye(2))
     return matrix
+
+
+def first_order(source: Any, energy: float) -> NDArray[np.float64]:
+    """The matrix of an OCELOT element in its own coordinates, [6, 6]; energy in GeV."""
+    total = np.eye(6)
+    for part in source.R(energy):
+        total = np.asarray(part) @ total
+    return total
 
 
 def corrector(family: str, plane: Literal["h", "v"], length: float, kick: float = 0.0) -> Place:
@@ -77,7 +86,8 @@ def source_kind(source: Any, name: str) -> Kind:
         if isinstance(source, classes):
             return kind
     if type(source).__name__ == "CombinedMultipole":
-        return _strongest(source)
+        fields = ((source.k0, source.k0s), (source.k1, source.k1s), (source.k2 / 2, source.k2s / 2))
+        return strongest([complex(*own) for own in fields]) if source.l else "multipole"
     if isinstance(source, e.Matrix):  # OCELOT has no damping wiggler: the name tells
         return "wiggler" if "wig" in name.casefold() else "matrix"
     return "drift" if source.l else "marker"
@@ -98,16 +108,10 @@ RADIUS = 0.02
 """m; where fields of several orders are compared."""
 
 
-def _strongest(source: Any) -> Kind:
-    """Of a combined multipole, by its strongest field at `RADIUS`; a thin one has no kind."""
-    fields = (
-        math.hypot(source.k0, source.k0s),
-        math.hypot(source.k1, source.k1s) * RADIUS,
-        math.hypot(source.k2, source.k2s) * RADIUS**2 / 2,
-    )
-    order = fields.index(max(fields)) if source.l and any(fields) else 0
-    kinds: tuple[Kind, ...] = ("multipole", "quadrupole", "sextupole")
-    return kinds[order]
+def strongest(strengths: Any) -> Kind:
+    """What a magnet is by its strongest field at `RADIUS`, of (k_n + i k_ns) / n!, [order]."""
+    order = int(np.argmax(np.abs(strengths) * RADIUS ** np.arange(len(strengths))))
+    return KIND_OF[order] if order in (1, 2) else "multipole"
 
 
 def place_elements(
@@ -126,7 +130,13 @@ def place_elements(
         LatticeError: a length that is not finite.
     """
     for source in {id(source): source for source in sources}.values():
-        _check(source)
+        length = float(source.l)
+        if not math.isfinite(length):
+            raise LatticeError(
+                f"'{source.id}' has the length {length}; correct it in the lattice file"
+            )
+        if length < 0:
+            log.debug("element '%s' has the negative length %.3g m", source.id, length)
     _warn_of_octupoles(families, sources)
     if kinds is None:
         kinds = [source_kind(source, name) for source, name in zip(sources, families, strict=True)]
@@ -165,14 +175,6 @@ def _warn_of_octupoles(families: Sequence[str], sources: Sequence[Any]) -> None:
         kinds = list(dict.fromkeys(names))
         warnings.warn(
             "octupoles are drifts in the network and in optics; trajectories have them: "
-            f"{first_of(kinds, NAMED)} ({len(names)})",
+            f"{first_of(kinds, 3)} ({len(names)})",
             stacklevel=4,
         )
-
-
-def _check(source: Any) -> None:
-    length = float(source.l)
-    if not math.isfinite(length):
-        raise LatticeError(f"'{source.id}' has the length {length}; correct it in the lattice file")
-    if length < 0:
-        log.debug("element '%s' has the negative length %.3g m", source.id, length)

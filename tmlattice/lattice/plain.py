@@ -116,14 +116,6 @@ def part_of(element: Element) -> Part | None:
     return Part(element.family, keyword, {"l": length, **values})
 
 
-def first_order(element: Element, energy: float) -> Array:
-    """The matrix of an element in OCELOT's coordinates, [6, 6]."""
-    total = np.eye(6)
-    for part in element.source.R(energy):
-        total = np.asarray(part) @ total
-    return total
-
-
 def second_order(source: Any) -> bool:
     """Whether a matrix element does more than its matrix."""
     return bool(np.any(source.t) or np.any(source.b) or source.delta_e)

@@ -214,6 +214,8 @@ ELECTRON_GEV = 0.51099895069e-3
 PROTON_GEV = 0.93827208943
 """Rest energies, GeV. Source: CODATA 2022."""
 PARTICLES = {"electron": ELECTRON_GEV, "proton": PROTON_GEV}
+LIGHT = 299792458.0
+"""Velocity of light, m/s."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -358,14 +360,23 @@ class Ring(Speaks):
             return self.elements[name]
         if name.strip().casefold() in self._index or not any(c in name for c in "*?["):
             return self.elements[self.index(name)]
-        low = name.strip().casefold()
+        return self.matching(name, "element")  # type: ignore[return-value]
+
+    def matching(self, pattern: str, what: str) -> list[Element]:
+        """The elements whose name or family a pattern matches; `what` they are, for the error.
+
+        Raises:
+            UnknownNameError: none is.
+        """
+        low = pattern.strip().casefold()
         found = [
             e for e in self.elements
             if fnmatchcase(e.name.casefold(), low) or fnmatchcase(e.family.casefold(), low)
         ]  # fmt: skip
         if not found:
-            raise unknown_name("element like", name, dict.fromkeys(e.family for e in self.elements))
-        return found  # type: ignore[return-value]
+            families = dict.fromkeys(e.family for e in self.elements)
+            raise unknown_name(f"{what} like", pattern, families)
+        return found
 
     def __contains__(self, name: object) -> bool:
         """Whether it has an element of this name."""

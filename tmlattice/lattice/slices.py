@@ -8,6 +8,7 @@ shorter than a fiftieth of its neighbour is an edge of it, whatever its field.
 
 import re
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 from typing import Protocol
 
 
@@ -66,18 +67,10 @@ def slices_of(elements: Sequence[Piece]) -> dict[int, tuple[int, ...]]:
 
 
 def _touching(elements: Sequence[Piece]) -> Iterator[list[int]]:
-    run: list[int] = []
-    for i, element in enumerate(elements):
-        if abs(element.length) < THIN:
-            continue
-        if element.kind in BODIES:
-            run.append(i)
-            continue
-        if run:
-            yield run
-        run = []
-    if run:
-        yield run
+    thick = [i for i, element in enumerate(elements) if abs(element.length) >= THIN]
+    for are_bodies, run in groupby(thick, lambda i: elements[i].kind in BODIES):
+        if are_bodies:
+            yield list(run)
 
 
 def _same(a: Piece, b: Piece) -> bool:

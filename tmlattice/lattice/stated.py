@@ -233,6 +233,8 @@ def _maps(ring: Ring, faces: float = 1.0) -> list[tuple[Array, Array, Array]]:
 
 
 def _maps_of_elements(ring: Ring) -> list[list[tuple[Array, Array, Array]]]:
+    from tmlattice.lattice.ocelot import elements, parts_of_ocelot
+
     known: dict[Any, list[tuple[Array, Array, Array]]] = {}
     chain: list[list[tuple[Array, Array, Array]]] = []
     for element in ring.elements:
@@ -240,18 +242,12 @@ def _maps_of_elements(ring: Ring) -> list[list[tuple[Array, Array, Array]]]:
         numbers = (v for v in own if isinstance(v, int | float | list | tuple | np.ndarray))
         key = (type(element.source), element.kind, *(np.asarray(v).tobytes() for v in numbers))
         if key not in known:
-            known[key] = _parts(element, ring.map_energy)
+            cavity = element.kind == "cavity"  # a drift in the static optics
+            source = elements.Drift(l=element.length) if cavity else element.source
+            maps = parts_of_ocelot(source, ring.map_energy, False)
+            known[key] = [(b, r, 0.5 * (t + t.swapaxes(1, 2))) for b, r, t in maps]
         chain.append(known[key])
     return chain
-
-
-def _parts(element: Element, energy: float) -> list[tuple[Array, Array, Array]]:
-    """Of one element; a cavity is a drift in the static optics."""
-    from tmlattice.lattice.ocelot import elements, parts_of_ocelot
-
-    source = elements.Drift(l=element.length) if element.kind == "cavity" else element.source
-    maps = parts_of_ocelot(source, energy, False)
-    return [(b, r, 0.5 * (t + t.swapaxes(1, 2))) for b, r, t in maps]
 
 
 def _turn(chain: list[tuple[Array, Array, Array]], launch: Array) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ from tmlattice.errors import LatticeError, plain
 from tmlattice.lattice.lines import with_gaps
 from tmlattice.lattice.madx_beam import Beam
 from tmlattice.lattice.parts import MODELLED, Part, Report, ring_of_parts
+from tmlattice.lattice.places import MAIN_ORDER
 from tmlattice.lattice.ring import Ring
 from tmlattice.lattice.stated import Stated, contradiction, curvatures
 
@@ -147,8 +148,6 @@ def _bends_thinly(row: Row) -> bool:
 
 
 _FACES = {"SBEND": ("E1", "E2"), "RBEND": ("E1", "E2"), "SROTATION": ("ANGLE",)}
-OWN_ORDER = {"quadrupole": 1, "sextupole": 2, "octupole": 3}
-"""The one order of which MAD-X's TWISS takes account in these, if they have a length."""
 NEEDED_BY = {
     "QUADRUPOLE": ("K1L",), "SEXTUPOLE": ("K2L",), "SBEND": ("ANGLE", "K0L"),
     "RBEND": ("ANGLE", "K0L"), "SOLENOID": ("KS", "KSI"), "MULTIPOLE": ("K1L", "K2L"),
@@ -261,9 +260,9 @@ def _part(path: Path, row: Row, half: bool, report: Report) -> Part:
         own.pop("angle", None)
     for attribute, column in STRENGTHS.items():
         values = [float(row.get(column.format(n)) or 0.0) for n in ORDERS]
-        if keyword in OWN_ORDER:
-            acting = [v if n == OWN_ORDER[keyword] and length else 0.0
-                      for n, v in enumerate(values)]  # fmt: skip
+        if keyword in MAIN_ORDER:
+            own_order = MAIN_ORDER[keyword] if length else None
+            acting = [v if n == own_order else 0.0 for n, v in enumerate(values)]
             if acting != values:
                 what = f"fields of the {keyword.upper()} beyond its own (as in MAD-X's TWISS)"
                 report.left_out(what, name)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.lattice.places import Place
+from tmlattice.lattice.places import Place, first_order
 
 log = logging.getLogger(__name__)
 
@@ -37,10 +37,7 @@ def merge_wigglers(places: list[Place], energy: float) -> list[Place]:
         total = np.eye(6)
         for source in sources:
             if id(source) not in matrices:
-                own = np.eye(6)
-                for part in source.R(energy):
-                    own = part @ own
-                matrices[id(source)] = own
+                matrices[id(source)] = first_order(source, energy)
             total = matrices[id(source)] @ total
         return total
 

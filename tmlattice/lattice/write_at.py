@@ -8,21 +8,19 @@ from typing import Any
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.lattice.at_file import quiet_at
+from tmlattice.lattice.at_file import from_ocelot, quiet_at
 from tmlattice.lattice.parts import Part, strengths
-from tmlattice.lattice.places import rotation
+from tmlattice.lattice.places import first_order, rotation
 from tmlattice.lattice.plain import (
     BENDS,
     FIELDS,
     STRAIGHT,
     error_fields,
-    first_order,
     part_of,
     second_order,
 )
-from tmlattice.lattice.ring import Element, Ring
+from tmlattice.lattice.ring import LIGHT, Element, Ring
 
-LIGHT = 299792458.0
 STEP = 0.035
 """rad; phase sqrt(|k1|) l of a step of AT's integrator: the tunes of a ring are right to 1e-5."""
 
@@ -117,7 +115,9 @@ def _element(element: Element, ring: Ring, left_out: Counter[str]) -> Any:
                 left_out["what matrix elements do beyond their matrix is left out"] += 1
         case _:
             left_out["elements that AT has not are written as first-order matrices"] += 1
-    matrix = _to_at(first_order(element, ring.map_energy), ring.beta)
+    turn = from_ocelot(ring.map_energy)
+    matrix = turn @ first_order(source, ring.map_energy) @ np.linalg.inv(turn)
+    matrix = np.asfortranarray(matrix)
     shifts = {k: v for k, v in frame.items() if k[0] == "T"}  # its tilt is in the matrix
     return at.M66(name, matrix, Length=length, **shifts)
 
@@ -145,10 +145,3 @@ def _cavity(element: Element, ring: Ring) -> Any:
         ring.energy * 1e9,
         PassMethod="DriftPass" if element.length else "IdentityPass",
     )
-
-
-def _to_at(r: Array, beta: float) -> Array:
-    """The matrix in AT's coordinates: the last two swap places and differ by beta."""
-    to_ocelot = np.eye(6)
-    to_ocelot[4:, 4:] = [[0.0, 1.0], [beta, 0.0]]
-    return np.asfortranarray(np.linalg.inv(to_ocelot) @ r @ to_ocelot)

@@ -13,14 +13,8 @@ import numpy as np
 
 from tmlattice.errors import first_of
 from tmlattice.lattice.parts import Part
-from tmlattice.lattice.plain import (
-    BENDS,
-    STRAIGHT,
-    definitions,
-    first_order,
-    part_of,
-    second_order,
-)
+from tmlattice.lattice.places import first_order
+from tmlattice.lattice.plain import BENDS, STRAIGHT, definitions, part_of, second_order
 from tmlattice.lattice.ring import PROTON_GEV, Element, Ring
 
 KEYWORDS = (
@@ -184,5 +178,5 @@ def _bend(element: Element, left_out: Counter[str]) -> dict[str, float]:
 def _matrix(element: Element, energy: float) -> dict[str, float]:
     """In MAD-X's coordinates: its time has the opposite sign."""
     sign = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
-    r = sign @ first_order(element, energy) @ sign
+    r = sign @ first_order(element.source, energy) @ sign
     return {f"rm{i + 1}{j + 1}": r[i, j] for i in range(6) for j in range(6) if r[i, j] != (i == j)}

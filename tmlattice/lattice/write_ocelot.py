@@ -28,11 +28,9 @@ def holds(element: Element) -> tuple[str, ...]:
 def displaced(ring: Ring) -> Ring:
     """The ring with the offsets of its elements in their sources."""
     moved = {
-        place: replace(
-            element.changed(dx=element.errors.dx, dy=element.errors.dy), errors=NO_ERRORS
-        )
-        for place, element in enumerate(ring.elements)
-        if element.errors != NO_ERRORS
+        k: replace(e.changed(dx=e.errors.dx, dy=e.errors.dy), errors=NO_ERRORS)
+        for k, e in enumerate(ring.elements)
+        if e.errors != NO_ERRORS
     }
     return ring.with_elements(moved)
 
@@ -125,20 +123,15 @@ def _lines(variable: str, family: str, content: dict[str, Any]) -> list[str]:
     lines = [f"{variable} = {content['class']}(eid={family!r})"]
     entries = []
     for name, value in content["parameters"].items():
-        if isinstance(value, dict):
-            entries += _entries(variable, name, value)
+        own = f"{variable}.{name}"
+        if isinstance(value, dict):  # the entries of a matrix, from nothing on
+            entries.append(f"{own} = np.zeros_like({own})")
+            for index, entry in value.items():
+                at = ", ".join(str(int(digit) - 1) for digit in index)
+                at += ", 0" if len(index) == 1 else ""  # a column
+                entries.append(f"{own}[{at}] = {entry!r}")
         elif isinstance(value, list):
-            lines.append(f"{variable}.{name} = np.array({value!r})")
+            lines.append(f"{own} = np.array({value!r})")
         else:
-            lines.append(f"{variable}.{name} = {value!r}")
+            lines.append(f"{own} = {value!r}")
     return lines + entries
-
-
-def _entries(variable: str, name: str, value: dict[str, float]) -> list[str]:
-    """The entries of a matrix, from nothing on."""
-    lines = [f"{variable}.{name} = np.zeros_like({variable}.{name})"]
-    for index, entry in value.items():
-        at = ", ".join(str(int(digit) - 1) for digit in index)
-        at += ", 0" if len(index) == 1 else ""  # a column
-        lines.append(f"{variable}.{name}[{at}] = {entry!r}")
-    return lines

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from tmlattice.files import write_json
 from tmlattice.lattice.parts import Part, fields
+from tmlattice.lattice.places import MAIN_ORDER, first_order
 from tmlattice.lattice.plain import (
     BENDS,
     FIELDS,
     STRAIGHT,
     definitions,
     error_fields,
-    first_order,
     part_of,
 )
 from tmlattice.lattice.ring import Element, Ring
@@ -77,9 +77,6 @@ def made(ring: Ring) -> tuple[dict[str, Any], tuple[str, ...]]:
     return content, (*lacks, *names)
 
 
-ORDER = {"quadrupole": 1, "sextupole": 2, "octupole": 3}
-
-
 def _element(element: Element, ring: Ring, left_out: Counter[str]) -> dict[str, Any]:
     part, length = part_of(element), element.length
     if part is None:
@@ -107,10 +104,10 @@ def _element(element: Element, ring: Ring, left_out: Counter[str]) -> dict[str, 
         own[0] += number("angle")
         values = {"hxl": number("angle"), "length": number("lrad")}
         return _magnet("Multipole", element, own, {k: v for k, v in values.items() if v})
-    main = ORDER.get(part.keyword, 1)
+    main = MAIN_ORDER.get(part.keyword, 1)
     values = {"length": length, f"k{main}": own[main].real, f"k{main}s": own[main].imag}
     own[main] = 0.0
-    cls = part.keyword if part.keyword in ORDER else "quadrupole"
+    cls = part.keyword if part.keyword in MAIN_ORDER else "quadrupole"
     return _magnet(cls.capitalize(), element, length * own, values)
 
 
@@ -150,7 +147,7 @@ def _matrix(element: Element, ring: Ring, left_out: Counter[str]) -> dict[str, A
     elif not own:
         left_out["elements that Xsuite has not are written as first-order matrices"] += 1
     turn = np.diag([1.0, 1.0, 1.0, 1.0, -ring.beta, 1 / ring.beta])  # zeta = -beta tau
-    matrix = turn @ first_order(element, ring.map_energy) @ np.linalg.inv(turn)
+    matrix = turn @ first_order(source, ring.map_energy) @ np.linalg.inv(turn)
     content = {"__class__": "FirstOrderTaylorMap", "length": element.length, "m1": matrix.tolist()}
     if own and np.any(source.b):
         content["m0"] = (turn @ np.ravel(source.b)).tolist()

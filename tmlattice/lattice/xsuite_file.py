@@ -20,13 +20,13 @@ from tmlattice.errors import LatticeError, plain
 from tmlattice.input_files import json_of
 from tmlattice.lattice.expressions import Arithmetic
 from tmlattice.lattice.lines import chosen, with_gaps
-from tmlattice.lattice.parts import Part, Report, edge_focusing, fringe_of, ring_of_parts
-from tmlattice.lattice.ring import ELECTRON_GEV, Ring
+from tmlattice.lattice.parts import Part, Report, acts, edge_focusing, fringe_of, ring_of_parts
+from tmlattice.lattice.places import KIND_OF
+from tmlattice.lattice.ring import ELECTRON_GEV, LIGHT, Ring
 
 MOST_BYTES = 1_000_000_000
 DEEPEST = 50
 """Lines in lines, and elements that are copies of copies."""
-LIGHT = 299792458.0
 
 PASSIVE = frozenset({
     "Marker", "Drift", "DriftExact", "DriftExactSlice", "Device", "LimitEllipse", "LimitPolygon",
@@ -94,6 +94,7 @@ SKEW_SHARE = 0.1
 ROUNDING = 1e-9
 """Relative; a dipole field that differs by less from the design's is the design's."""
 EDGES = {-1: "suppressed", 0: "linear", 1: "full", 2: "dipole-only"}
+SIDES = ("entry", "exit")
 
 
 def read_xsuite(
@@ -235,7 +236,7 @@ class _Fields:
 
     def acts(self, key: str) -> bool:
         """Whether a field is neither zero nor empty."""
-        return _acts(self.values.get(key))
+        return acts(self.values.get(key))
 
     def check(self) -> None:
         """Raises a LatticeError for a field that acts and was not asked for."""
@@ -245,15 +246,6 @@ class _Fields:
                     f"the field {plain(key, 40)} of {self.named} is not modelled; set it to 0 or "
                     "take it out"
                 )
-
-
-def _acts(value: Any) -> bool:
-    if isinstance(value, dict):
-        return any(map(_acts, value.values()))
-    try:
-        return bool(np.any(np.asarray(value, dtype=float))) if value is not None else False
-    except (TypeError, ValueError):
-        return bool(value)
 
 
 class _Reader:
@@ -284,9 +276,7 @@ class _Reader:
     def parts(self) -> list[Part | float]:
         """The line's elements in beam order, and the gaps between them."""
         placed = self._names(self.line, 0)
-        self._length = sum(
-            item if isinstance(item, float) else self._element_length(item) for item in placed
-        )
+        self._length = sum(map(self._way, placed))
         parts: list[Part | float] = []
         for item in placed:
             if isinstance(item, float):
@@ -449,11 +439,8 @@ class _Reader:
         sliced = SLICE.fullmatch(fields.cls)
         if sliced:
             thin = sliced[1] == "Thin" or sliced[3]
-            return 0.0 if thin else self._weight(fields) * _way_of(self._parent(fields))
+            return 0.0 if thin else fields.number("weight", 1.0) * _way_of(self._parent(fields))
         return _way_of(fields)
-
-    def _weight(self, fields: _Fields) -> float:
-        return fields.number("weight", 1.0)
 
     def _converted(self, fields: _Fields, name: str) -> list[Part]:
         """What one element of the file is in the ring."""
@@ -501,15 +488,18 @@ class _Reader:
             "Rotation": self._rotation,
             "XYShift": self._shift,
             "Translation": self._shift,
-            "BeamPositionMonitor": lambda f, name, where: [_monitor(f, name, where)],
+            "BeamPositionMonitor": self._monitor,
         }
+
+    def _monitor(self, fields: _Fields, name: str, where: str) -> list[Part]:
+        fields.used |= set(fields.values)
+        return [Part(name, "monitor", {}, where)]
 
     def _inert(self, fields: _Fields, name: str) -> Part:
         """An element of a class that is not modelled, where its strength is zero."""
-        change = fields.cls == "ReferenceEnergyChange"
         off = fields.values.get("scale_strength", 1) == 0
-        if change and abs(fields.number("p0c", self.momentum) / self.momentum - 1) < 1e-9:
-            off = True
+        if fields.cls == "ReferenceEnergyChange":
+            off |= abs(fields.number("p0c", self.momentum) / self.momentum - 1) < 1e-9
         if not off and any(map(fields.acts, ACTING[fields.cls])):
             raise _not_modelled(fields)
         return _passive(name, _way_of(fields))
@@ -571,15 +561,13 @@ class _Reader:
         return knl, ksl
 
     def _slice(self, fields: _Fields, name: str, where: str, sliced: Any) -> list[Part]:
-        parent, weight = self._parent(fields), self._weight(fields)
+        parent, weight = self._parent(fields), fields.number("weight", 1.0)
         if sliced is None or sliced[1] == "Drift" or parent.cls in PASSIVE:
             return [_passive(name, weight * _way_of(parent))]
         if sliced[3]:
             if parent.cls not in BENDS:
                 return [_passive(name, 0.0)]
-            bend = _Bend(parent, self)
-            edge = bend.edges()[sliced[3] == "Exit"]
-            parts = edge(name, where)
+            parts = _Bend(parent, self).edge(sliced[3] == "Exit", name, where)
         elif sliced[1] == "Thin":
             parts = self._thin_slice(parent, name, where, weight)
         elif parent.cls in BENDS[:3]:
@@ -607,16 +595,14 @@ class _Reader:
             parts = self._cavity(parent, name, where, weight)
             return [Part(p.name, p.keyword, {**p.values, "l": 0.0}, where) for p in parts]
         length = _way_of(parent)
-        values: dict[str, Any] = {"angle": 0.0}
         if parent.cls in BENDS:
             bend = _Bend(parent, self)
-            values["angle"] = weight * bend.angle
-            dipole = bend.dipole
+            angle, dipole = bend.angle, bend.dipole
         else:
-            dipole = parent.number("k0")
-            values["angle"] = weight * parent.number("hxl")
+            angle, dipole = parent.number("hxl"), parent.number("k0")
         knl, ksl = self._strengths(parent, length, dipole)
-        values |= {"knl": weight * knl, "ksl": weight * ksl, "lrad": weight * length}
+        values = {"angle": weight * angle, "knl": weight * knl, "ksl": weight * ksl,
+                  "lrad": weight * length}  # fmt: skip
         return [Part(name, "multipole", {**values, **self._alignment(parent)}, where)]
 
     def _bend(self, fields: _Fields, name: str, where: str) -> list[Part]:
@@ -638,9 +624,8 @@ class _Reader:
     def _straight(self, fields: _Fields, name: str, where: str) -> list[Part]:
         if fields.cls == "Magnet":
             bend = _Bend(fields, self)
-            if bend.angle:
-                return self._bend(fields, name, where)
-            if any(bend.face(k) or bend.fringe(k)[0] for k in (0, 1)) and bend.dipole:
+            oblique = (bend.face(k) or bend.fringe(k)[0] for k in (0, 1))
+            if bend.angle or (bend.dipole and any(oblique)):
                 return self._bend(fields, name, where)
         fields.used |= {"edge_entry_active", "edge_exit_active"}  # fringes of the third order
         return self._in_kicks(fields, self._thick(fields, name, where))
@@ -674,15 +659,11 @@ class _Reader:
 
     def _thick(self, fields: _Fields, name: str, where: str, weight: float = 1.0) -> Part:
         length = _way_of(fields)
-        own = "quadrupole" if fields.cls == "Magnet" else fields.cls.lower()
-        if fields.cls == "Magnet":
-            fields.used |= {"angle", "h"}
         knl, ksl = self._strengths(fields, length, fields.number("k0"))
-        if fields.cls == "Magnet":
-            orders = [n for n in range(1, 4) if knl[n] or ksl[n]]
-            own = {1: "quadrupole", 2: "sextupole", 3: "octupole"}.get(
-                orders[0] if orders else 0, "multipole"
-            )
+        own = fields.cls.lower()
+        if own == "magnet":
+            fields.used |= {"angle", "h"}
+            own = next((KIND_OF[n] for n in KIND_OF if knl[n] or ksl[n]), "multipole")
         values = {"l": weight * length, "knl": weight * knl, "ksl": weight * ksl}
         return Part(name, own, {**values, **self._alignment(fields)}, where)
 
@@ -740,11 +721,11 @@ class _Reader:
                 f"{fields.named} is displaced or has other fields (knl, ksl), which is not "
                 "modelled; set them to 0"
             )
-        if fields.cls != "VariableSolenoid":
-            values = {"l": length, "ks": fields.number("ks"), "ksi": fields.number("ksi")}
-            return [Part(name, "solenoid", values, where)]
-        mean = float(fields.list("ks_profile", 2)[:2].mean())  # in the body, as in Xsuite
-        return [Part(name, "solenoid", {"l": length, "ks": mean}, where)]
+        if fields.cls == "VariableSolenoid":  # the mean in the body, as in Xsuite
+            own = {"ks": float(fields.list("ks_profile", 2)[:2].mean())}
+        else:
+            own = {"ks": fields.number("ks"), "ksi": fields.number("ksi")}
+        return [Part(name, "solenoid", {"l": length, **own}, where)]
 
     def _dipole_edge(self, fields: _Fields, name: str, where: str) -> list[Part]:
         fields.used.add("side")
@@ -822,7 +803,7 @@ class _Bend:
             self.dipole = 0.0 if fields.cls == "Magnet" and from_h is False else self.curvature
         else:
             self.dipole = fields.number("k0")
-        for side in ("entry", "exit"):
+        for side in SIDES:
             fields.used |= {f"edge_{side}_{key}" for key in (
                 "active", "model", "angle", "angle_fdown", "hgap", "fint")}  # fmt: skip
         if self.length == 0 and (self.angle or self.dipole):
@@ -830,8 +811,7 @@ class _Bend:
 
     def face(self, side: int) -> float:
         """The whole angle of the entrance's (0) or the exit's (1) face against the sector, rad."""
-        key = ("entry", "exit")[side]
-        angle = self.fields.number(f"edge_{key}_angle")
+        angle = self.fields.number(f"edge_{SIDES[side]}_angle")
         if self.fields.cls == "RBend":
             difference = self.fields.number("rbend_angle_diff") / 2
             angle += self.angle / 2 + (difference if side else -difference)
@@ -839,7 +819,7 @@ class _Bend:
 
     def fringe(self, side: int) -> tuple[float, float, float]:
         """Feed-down angle (rad), half gap (m) and fringe integral of a face."""
-        key = f"edge_{('entry', 'exit')[side]}"
+        key = f"edge_{SIDES[side]}"
         number = self.fields.number
         linear = self.fields.word(f"{key}_model", "linear", EDGES) == "linear"
         down = number(f"{key}_angle_fdown") if linear else 0.0
@@ -847,26 +827,16 @@ class _Bend:
 
     def active(self, side: int) -> bool:
         """Whether a face acts."""
-        key = f"edge_{('entry', 'exit')[side]}"
+        key = f"edge_{SIDES[side]}"
         model = self.fields.word(f"{key}_model", "linear", EDGES)
         return bool(self.fields.number(f"{key}_active", 1.0)) and model != "suppressed"
 
-    def edges(self) -> tuple[Callable[[str, str], list[Part]], Callable[[str, str], list[Part]]]:
-        """What the two faces are where they are elements of their own."""
+    def edge(self, side: int, name: str, where: str) -> list[Part]:
+        """What a face is where it is an element of its own."""
         tilt = self.reader._alignment(self.fields)["tilt"]
-
-        def made(side: int) -> Callable[[str, str], list[Part]]:
-            down, gap, integral = self.fringe(side)
-            field = self._field()
-            edge = (field if self.active(side) else 0.0, self.face(side), down, gap, integral)
-            return lambda name, where: _edge(name, where, edge, tilt)
-
-        return made(0), made(1)
-
-    def _field(self) -> float:
-        """The whole normal dipole field, 1/m."""
         knl, _ = self.reader._strengths(self.fields, self.length, self.dipole)
-        return float(knl[0]) / self.length if self.length else 0.0
+        field = float(knl[0]) / self.length if self.length and self.active(side) else 0.0
+        return _edge(name, where, (field, self.face(side), *self.fringe(side)), tilt)
 
     def body(self, name: str, where: str, weight: float = 1.0) -> Part:
         """The bend between its faces, or a slice of it."""
@@ -883,7 +853,7 @@ class _Bend:
         body = self.fields.word("rbend_model", "adaptive", {2: "straight-body"})
         turned = any(
             self.active(side) and self.fields.number(f"edge_{key}_angle")
-            for side, key in enumerate(("entry", "exit"))
+            for side, key in enumerate(SIDES)
         )
         if body == "straight-body" and (knl[1:].any() or ksl[1:].any() or turned):
             raise LatticeError(
@@ -900,8 +870,8 @@ class _Bend:
         )
         focusing = any(faces) or first * gap or last * gap2 or down or down2
         if focusing and not self.curvature and self.dipole:
-            entry, exit_ = self.edges()
-            return [*entry(f"{name}_entry", where), body, *exit_(f"{name}_exit", where)]
+            entry, exit_ = (self.edge(k, f"{name}_{s}", where) for k, s in enumerate(SIDES))
+            return [*entry, body, *exit_]
         if self.curvature and (down or down2):
             first = fringe_of(self.curvature, faces[0], gap, first, down)
             last = fringe_of(self.curvature, faces[1], gap2, last, down2)
@@ -921,11 +891,6 @@ def _not_modelled(fields: _Fields) -> LatticeError:
 
 def _passive(name: str, length: float) -> Part:
     return Part(name, "drift" if length else "marker", {"l": length})
-
-
-def _monitor(fields: _Fields, name: str, where: str) -> Part:
-    fields.used |= set(fields.values)
-    return Part(name, "monitor", {}, where)
 
 
 def _coarse(k1: float, length: float, slices: int) -> bool:

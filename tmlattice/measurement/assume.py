@@ -186,10 +186,6 @@ def _alphabet(monitors: Sequence[str]) -> Order:
     return np.argsort(np.argsort(names, kind="stable"))
 
 
-def _no_noise(data: Measurement) -> Measurement:
-    return _with(data, noise=None)
-
-
 # --- launches, settings, turns --------------------------------------------------------------------
 def _launches(data: Measurement, *factor: float) -> Measurement:
     """x, px, y, py, and delta where it is named, in another unit or of another sign."""
@@ -386,7 +382,7 @@ _TABLE: tuple[_Row, ...] = (
     ("settings-not-there", _FIRST, "the kicks in the shots' settings were not there",
      "take them out", _kicks_set, 0),
     ("noise-from-data", _FIRST, "the stated noise is not that of the readings", "leave it out",
-     _no_noise),
+     partial(_with, noise=None)),
     ("kicks-reversed", _RESPONSE, "the kicks have the wrong sign", SIGN.format("all of them"),
      _kicks, -1, -1),
     ("kicks-x-reversed", _RESPONSE, "the horizontal kicks have the wrong sign", SIGN.format("them"),

@@ -81,9 +81,3 @@ def located(place: Path) -> Iterator[None]:
         yield
     except (MeasurementError, UnknownNameError) as error:
         raise MeasurementError(f"{place}: {error}") from error
-
-
-def not_utf8(path: Path, error: UnicodeDecodeError, before: int = 0) -> MeasurementError:
-    """The error for a text file in another encoding; `before` lines were already read."""
-    line = before + error.object[: error.start].count(b"\n") + 1
-    return MeasurementError(f"{path}, line {line}: not UTF-8; save the file as UTF-8")

@@ -2,7 +2,6 @@
 table, and a writer of the table that completes the document.
 """
 
-import csv
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
@@ -284,12 +283,11 @@ def _write_tunes(table: TextIO, m: TuneReading) -> Document:
         np.concatenate([nothing if part is None else part for part in parts], axis=1)
         for parts in ((m.tune, m.chromaticity), (m.tune_error, m.chromaticity_error))
     )
-    write = csv.writer(table, lineterminator="\n").writerow
-    write(TUNES)
-    for shot, own, sigma in zip(m.shots, values.tolist(), errors.tolist(), strict=True):
-        for name, pair in zip(QUANTITIES, zip(own, sigma, strict=True), strict=True):
-            if not np.isnan(pair).all():
-                write((shot, name, *fields(pair)))
+    table.write(",".join(TUNES) + "\n")
+    for shot, pairs in zip(m.shots, np.stack([values, errors], axis=2), strict=True):
+        measured = np.flatnonzero(~np.isnan(pairs).all(axis=1))
+        names = [QUANTITIES[k] for k in measured]
+        table.writelines(reading_lines(f"{shot},", names, pairs[measured].tolist()))
     return header("tunes", m) | _written_shots(m)
 
 
@@ -317,15 +315,13 @@ def quoted(names: Sequence[str]) -> list[str]:
     ]
 
 
-def fields(pair: Sequence[float]) -> list[str]:
-    """repr is the shortest text that reads back as the same number; a missing one is empty."""
-    return [repr(v) if v == v else "" for v in pair]  # noqa: PLR0124  (NaN)
-
-
 def reading_lines(
     start: str, names: Sequence[str], readings: Sequence[Sequence[float]]
 ) -> Iterator[str]:
-    """Rows of readings [monitor, 2] that begin with the same columns; names are `quoted`."""
+    """Rows of readings [monitor, 2] that begin with the same columns; names are `quoted`.
+
+    repr is the shortest text that reads back as the same number; a missing one is empty.
+    """
     for name, (x, y) in zip(names, readings, strict=True):
         yield f"{start}{name},{repr(x) if x == x else ''},{repr(y) if y == y else ''}\n"  # noqa: PLR0124
 

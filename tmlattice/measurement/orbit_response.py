@@ -155,21 +155,19 @@ class OrbitResponse(OfMonitors):
                     f"corrector '{name}' has a step of {kick:g} rad; it is a small part of one "
                     "and not zero"
                 )
+        orbits = response
         if self.rf is not None:
-            rf = self.rf
-            check_rf(rf)
-            if rf.orbit is not None:
-                orbit = np.asarray(rf.orbit, dtype=float)
+            check_rf(self.rf)
+            if self.rf.orbit is not None:
+                orbit = np.asarray(self.rf.orbit, dtype=float)
                 if orbit.shape != (monitors, 2):
                     raise MeasurementError(
                         f"the RF step's orbit has the shape {orbit.shape}, not [{monitors}, 2]"
                     )
-                self._keep(rf=replace(rf, orbit=orbit))
+                self._keep(rf=replace(self.rf, orbit=orbit))
+                orbits = np.concatenate([response, orbit[None]])
         check_energy(self.energy)
-        orbits = [response] if self.rf is None or self.rf.orbit is None else [
-            response, self.rf.orbit[None]
-        ]  # fmt: skip
-        check_values(np.concatenate(orbits), "orbit change")
+        check_values(orbits, "orbit change")
         self._keep(noise=noise_table(self.noise, self.monitors))
 
     def read_with(self, change: Callable[[Array], Array]) -> dict[str, Any]:

@@ -13,10 +13,7 @@ import numpy as np
 from tmlattice.arrays import Array, Indices
 from tmlattice.errors import MeasurementError, UnknownNameError
 from tmlattice.input_files import check_regular
-from tmlattice.measurement.documents import not_utf8
 from tmlattice.measurement.monitors import LARGEST_READING, Names, merge_spellings
-
-Integers = Indices
 
 _MOST_CELLS = 50_000_000
 """Readings that an array may have without having a hundredth of them in the table: 0.8 GB."""
@@ -38,8 +35,8 @@ class Rows:
     """
 
     path: Path
-    whole: dict[str, Integers]
-    names: dict[str, tuple[tuple[str, ...], Integers]]
+    whole: dict[str, Indices]
+    names: dict[str, tuple[tuple[str, ...], Indices]]
     xy: Array
 
     def __len__(self) -> int:
@@ -148,7 +145,7 @@ def not_csv(path: Path | str, line: int, error: csv.Error) -> MeasurementError:
 
 def match_names(
     rows: Rows, column: str, known: Sequence[str] | None, all_of_them: bool = False
-) -> tuple[tuple[str, ...], Integers]:
+) -> tuple[tuple[str, ...], Indices]:
     """The names of a column and each row's place among them; the known ones' order if given.
 
     With `all_of_them`, known names without rows stay.
@@ -170,7 +167,7 @@ def match_names(
     return tuple(names.names[i] for i in kept), np.searchsorted(kept, there)[place]
 
 
-def dense(rows: Rows, shot: Integers, shots: int, monitor: Integers, monitors: int) -> Array:
+def dense(rows: Rows, shot: Indices, shots: int, monitor: Indices, monitors: int) -> Array:
     """Readings [shot, turn, monitor, 2] of rows, NaN where there is none; MeasurementError: a turn
     so late that the array would be all but empty."""
     turn = rows.whole.get("turn", np.zeros(len(rows), dtype=np.int64))
@@ -274,9 +271,9 @@ def _error(path: Path, row: int, text: str) -> MeasurementError:
 
 def _encoding(path: Path) -> MeasurementError:
     with path.open("rb") as file:
-        for before, line in enumerate(file):
+        for number, line in enumerate(file, 1):
             try:
-                line.decode("utf-8-sig" if before == 0 else "utf-8")
-            except UnicodeDecodeError as error:
-                return not_utf8(path, error, before)
+                line.decode("utf-8-sig" if number == 1 else "utf-8")
+            except UnicodeDecodeError:
+                return MeasurementError(f"{path}, line {number}: not UTF-8; save the file as UTF-8")
     return MeasurementError(f"{path}: not UTF-8; save the file as UTF-8")

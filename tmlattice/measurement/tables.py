@@ -11,11 +11,10 @@ from tmlattice.errors import MeasurementError, OtherFormatError
 from tmlattice.lattice.mat_file import read_apart
 from tmlattice.measurement.arrays import Unit, metres
 from tmlattice.measurement.documents import located
+from tmlattice.measurement.kinds import TURNS
 from tmlattice.measurement.monitors import LARGEST_READING, Names, merge_spellings
 from tmlattice.measurement.rows import dense, match_names, read_rows
 from tmlattice.measurement.trajectory import Measurement
-
-COLUMNS = ("shot", "turn", "monitor", "x", "y")
 
 
 def read_table(
@@ -43,9 +42,9 @@ def read_table(
     Raises:
         MeasurementError: one sentence with the file, the line and the correction.
     """
-    rows = read_rows(Path(path), COLUMNS, optional=("shot", "turn"))
+    rows = read_rows(Path(path), TURNS, optional=("shot", "turn"))
     rows = replace(rows, xy=rows.xy * metres(unit))
-    rows.check(*(k for k in COLUMNS if k in rows.whole), "monitor")
+    rows.check(*(k for k in TURNS if k in rows.whole), "monitor")
     numbers = rows.whole.get("shot", np.zeros(len(rows), dtype=np.int64))
     shots, place = np.unique(numbers, return_inverse=True)
     names, monitor = match_names(rows, "monitor", monitors)

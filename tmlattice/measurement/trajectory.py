@@ -156,10 +156,7 @@ class Measurement(Shots):
             return self.launches[:, :4].copy()
         if dimension != 6:
             raise MeasurementError(f"a state has 4 or 6 coordinates, not {dimension}")
-        states = np.zeros((len(self.launches), 6))
-        states[:, :4] = self.launches[:, :4]
-        states[:, 5] = self.launches[:, 4]
-        return states
+        return np.insert(self.launches, 4, 0.0, axis=1)
 
     def select(
         self,
