@@ -271,6 +271,8 @@ def test_every_public_result_is_pickled_and_copied(diagnoses, small_ring, small_
         value for name in tmlattice.__all__ if inspect.isclass(value := getattr(tmlattice, name))
     } - {TmlatticeError}  # fmt: skip
     assert classes <= {type(one) for one in results}
+    estimated = dataclasses.replace(small_ring, model="estimated")
+    assert pickle.loads(pickle.dumps(estimated)).model == "estimated"
     other = pickle.loads(pickle.dumps(found))
     assert other.report() == found.report()
     assert other.plot("scan") is not None

@@ -14,9 +14,8 @@ from tmlattice.arrays import Array, Indices
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import Diagnosis
-from tmlattice.diagnosis.load import changes_beam
 from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
-from tmlattice.effects import Cause, apply
+from tmlattice.effects import Cause, apply, changes_beam
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.newton import STEP_SHARES

@@ -23,7 +23,7 @@ from tmlattice.diagnosis.result import Diagnosis, Finding
 from tmlattice.diagnosis.support import Support
 from tmlattice.diagnosis.suspects import Suspect
 from tmlattice.diagnosis.views import PartView, StoredView
-from tmlattice.effects import Cause, RingEffect, apply, find
+from tmlattice.effects import Cause, apply, changes_beam
 from tmlattice.errors import MeasurementError, TmlatticeError
 from tmlattice.inference.validation import Gap, Misfit
 from tmlattice.input_files import check_no_code
@@ -136,9 +136,3 @@ def _diagnosis(cls: type, d: Mapping[str, Any], ring: Ring) -> Diagnosis:
         },
     )  # fmt: skip
     return made
-
-
-def changes_beam(name: str) -> bool:
-    """Whether an effect changes the stored beam of a ring with these settings."""
-    effect = find(name)
-    return isinstance(effect, RingEffect) and not (effect.calibrates or effect.acts_on_settings)

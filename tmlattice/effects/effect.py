@@ -481,3 +481,9 @@ def modelled(chosen: Iterable[str] | None = None, turns: bool = False) -> list[s
         chosen = [name for name, effect in CATALOGUE.items() if effect.usual or effect.of_turns]
     effects = [CATALOGUE[name] for name in names(chosen)]
     return [one.name for one in effects if one.modelled and (turns or not one.of_turns)]
+
+
+def changes_beam(name: str) -> bool:
+    """Whether an effect changes the stored beam of a ring with these settings."""
+    effect = find(name)
+    return isinstance(effect, RingEffect) and not (effect.calibrates or effect.acts_on_settings)

@@ -4,7 +4,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args
@@ -312,7 +312,7 @@ class Ring(Speaks):
 
     def __getstate__(self) -> dict[str, Any]:
         """Only the fields travel: what is worked out from them can be worked out again."""
-        return {name: self.__dict__[name] for name in FIELDS}
+        return {own.name: self.__dict__[own.name] for own in fields(self)}
 
     @cached_property
     def length(self) -> float:
@@ -467,8 +467,6 @@ def number_names(names: Iterable[str]) -> list[str]:
         seen[key] += 1
     return numbered
 
-
-FIELDS = ("name", "elements", "energy", "changes", "mass", "known_supplies")
 
 KEPT = ("kept",)
 """Where a ring's `memory` has the key under which it is kept in the cache, if it is."""
