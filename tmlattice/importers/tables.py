@@ -203,8 +203,8 @@ def _long(
         if monitor in own:
             raise MeasurementError(f"{path}, row {line}: '{corrector}', '{monitor}' stand twice")
         own[monitor] = x, y
-    name = next((name for name in columns if name.lower() == "rf"), None)
-    rf = None if name is None else (kicks[name], columns.pop(name))
+    of_rf = next((name for name in columns if name.lower() == "rf"), None)
+    rf = None if of_rf is None else (kicks[of_rf], columns.pop(of_rf))
     said = [f"x in {header[place['x']][1] or 'm'}, kicks in {header[place['kick']][1] or 'rad'}"]
     steps = {n: (angle * kicks[n], own) for n, own in columns.items()}
     return _response(ring, steps, rf, said, stated)
