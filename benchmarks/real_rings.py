@@ -124,7 +124,7 @@ def ring(name, files, data, place, options):
     """One ring: what each seed found."""
     found = []
     source = None
-    made_with = {"code": code(), "iteration": options.iteration, "families": options.families,
+    made_with = {"code": code(), "iteration": options.iteration, "no_faults": options.families,
                  "missing": options.missing}  # fmt: skip
     for seed in range(options.seed, options.seed + options.seeds):
         path = options.into and options.into / f"{name}-{seed}.json"
@@ -360,7 +360,7 @@ def main():
         stored = [json.loads(path.read_text()) for path in sorted(options.into.glob("*.json"))]
         for one in stored:
             print(
-                *(f"{key} {one[key]}" for key in ("ring", "seed", "code", "iteration", "families"))
+                *(f"{key} {one[key]}" for key in ("ring", "seed", "code", "iteration", "no_faults"))
             )
         names = dict.fromkeys(one["ring"] for one in stored)
         rings = [[one for one in stored if one["ring"] == name] for name in names]

@@ -12,6 +12,7 @@ from tmlattice.diagnosis.response import hierarchical, rounds
 from tmlattice.diagnosis.response.hierarchical import rough_fit
 from tmlattice.diagnosis.response.linear import Linear
 from tmlattice.diagnosis.response.state import begin
+from tmlattice.diagnosis.response.stated import fitted_causes
 from tmlattice.effects import Cause
 from tmlattice.inference import normal as blocks
 from tmlattice.inference.normal import Normal, Slopes, normal_equations, solve
@@ -204,6 +205,12 @@ def test_a_step_in_one_plane_that_spoils_the_other_does_not_end_the_fit(small_ri
              "corrector_roll", "skew_gradient")  # fmt: skip
     fit = hierarchical.fit_families(data, split, [own for own in STEPS if own[0].name in names])
     assert {block.name: block.ratio for block in fit.blocks if block.ratio > 1.15} == {}
+    found = {(own.effect, own.element): (own.amount, error)
+             for own, error in fitted_causes(fit.state)[0]}  # fmt: skip
+    for own in causes:  # of the right sign, at the right magnet
+        amount, error = found[own.effect, own.element]
+        assert abs(amount - own.amount) < 4 * error
+        assert error < 5e-4
 
 
 def test_numbers_that_have_a_lowest_value_vs_bounded_least_squares(rng):

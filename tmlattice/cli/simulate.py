@@ -293,7 +293,7 @@ def _warn_of_large(effects: tuple[tuple[str, str | None, float], ...]) -> None:
 
 
 def _place(ring: Any, effect: str, element: str | None) -> str | None:
-    """The place of an effect as the ring spells it; one that there is not, as it is given."""
+    """The place of an effect as the ring spells it; an unknown one as it is given."""
     from tmlattice.effects import find
 
     if element is None:

@@ -377,7 +377,7 @@ class _Reader:
                     f"{error} (in the statement '{plain(text, 100)}', {where})"
                 ) from error
 
-    def _carry_out(self, text: str, where: str, after: Iterator[Any]) -> bool:
+    def _carry_out(self, text: str, where: str, after: Iterator[tuple[int, str]]) -> bool:
         """Carry out a statement; whether it ends the file."""
         if text[0] == "%":
             self.rpn.value(text[1:])
@@ -730,7 +730,7 @@ _FAMILY_WITHOUT: dict[str, tuple[str, ...]] = {
 default alignment, and fringes of quadrupoles act by their integrals."""
 
 
-def _statements(lines: list[str]) -> Iterator[tuple[str, int, Iterator[Any]]]:
+def _statements(lines: list[str]) -> Iterator[tuple[str, int, Iterator[tuple[int, str]]]]:
     """Each statement without comments, its line, and the lines behind it."""
     source = enumerate(lines, 1)
     text, first, joined = "", 0, 0

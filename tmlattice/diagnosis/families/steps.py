@@ -316,8 +316,8 @@ STEPS: tuple[Trial, ...] = (
     (HorizontalOrbit(),), (VerticalOrbit(),), (HorizontalKicks(),), (EnergyOffset(),),
     (VerticalKicks(),),
 )  # fmt: skip
-"""The trials, in order. The energy offset changes the dispersion, and comes after the kicks that do
-so, too."""
+"""The trials. The first ones determine the optics. Implausible ones are rejected last first: the
+energy offset before the kicks, because both change the dispersion."""
 
 CHANGES: tuple[Trial, ...] = (
     (CorrectorCalibration(),), (MonitorGain(),),
