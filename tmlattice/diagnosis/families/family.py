@@ -33,6 +33,7 @@ class Family(ABC):
         trust: step bound of a number in one round, rms.
         gross: limit above which a column's number starts from its own estimate; otherwise the
             column would have no weight until the rounds reach that value.
+        late: whether it is added once the others have converged.
         single: whether one member may be faulty; not a pattern, or a type with one design.
         rms, tails, most: prior of a single number: rms, degrees of freedom, largest rms.
     """
@@ -44,6 +45,7 @@ class Family(ABC):
     variable: ClassVar[str]
     trust: ClassVar[float]
     gross: ClassVar[float] = np.inf
+    late: ClassVar[bool] = False
     single: ClassVar[bool] = True
     rms: ClassVar[float]
     tails: ClassVar[float] = np.inf

@@ -65,10 +65,11 @@ class _OfBeam(Family):
 
 class EnergyOffset(_OfBeam):
     """The beam's energy relative to that of the magnets' settings, by an RF frequency that does not
-    match the circumference."""
+    match the circumference. Gradients, kicks and orbits in sextupoles together do nearly the same:
+    while these are far from the ring, it would follow their errors."""
 
     name, effects = "energy_offset", ("energy_offset",)
-    variable, trust = "energy", 1e-3
+    variable, trust, late = "energy", 1e-3, True
 
     def groups(self, data: ResponseData) -> list[Group]:
         """The usual prior."""

@@ -219,7 +219,7 @@ def _not_validated(split: Split) -> Split:
     """A split in which all correctors, and all of the RF's orbit, are fitted."""
     none, half = np.zeros_like(split.held), split.half.copy()
     half[-1] = True
-    return Split(none, none, half, np.zeros_like(split.inner_rf))
+    return Split(none, half)
 
 
 def _same(first: ResponseData, second: ResponseData) -> bool:
@@ -233,7 +233,7 @@ def _reference(
     data: ResponseData, split: Split, steps: Sequence[Trial], progress: Callable[[str], Any]
 ) -> tuple[State, list[str]]:
     """The state fitted to the first measurement, and messages; the design if the fit diverges."""
-    nothing = replace(begin(data, _not_validated(split)), exploring=False)
+    nothing = begin(data, _not_validated(split))
     if not steps:
         return nothing, []
     try:
@@ -278,7 +278,7 @@ def _fit_change(
     data: ResponseData, split: Split, trials: Sequence[Trial], progress: Callable[[str], Any]
 ) -> HierarchicalFit:
     """The fit of all possible changes, with the estimated noise of the difference."""
-    design = replace(begin(data, split), exploring=False, guessed=ANY)
+    design = replace(begin(data, split), guessed=ANY)
     trials = readable(design, trials)
     state = settle(bend(jump(rough_fit(design, trials, progress))))
     state = settle(_learnt_noise(state))

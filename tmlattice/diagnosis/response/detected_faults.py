@@ -110,8 +110,8 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     for column in np.flatnonzero(split.held):
         half[column, np.flatnonzero(half[column])[::2]] = False  # half of the remaining ones
     data, none = replace(data, orbits=orbits), np.zeros_like(split.held)
-    split = Split(none, none, half, np.zeros_like(split.inner_rf))
-    design = replace(begin(data, split), good=fitted.good, exploring=False)
+    split = Split(none, half)
+    design = replace(begin(data, split), good=fitted.good)
     names = [family.name for family in USUAL]
     known = [*USUAL, *(family for family in fitted.families if family.name not in names)]
     families = [f for f in known if design.reads(f.block) and f.size(data)]

@@ -65,7 +65,7 @@ class Guess(NamedTuple):
 def elsewhere(data: ResponseData) -> Guess | None:
     """Return the first guess by all readings."""
     none, all_of_them = (np.full(data.shape, own) for own in (False, True))
-    split = Split(held=none[:, 0], inner=none[:, 0], half=all_of_them, inner_rf=none[0])
+    split = Split(held=none[:, 0], half=all_of_them)
     return first_guess(begin(data, split))
 
 

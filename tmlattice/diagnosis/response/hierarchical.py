@@ -27,7 +27,7 @@ from tmlattice.diagnosis.response.labels import (
     rejected,
     without_readings,
 )
-from tmlattice.diagnosis.response.linear import Linear, linear, rf_by_others
+from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.rounds import (
     evidence_of,
@@ -43,18 +43,10 @@ from tmlattice.diagnosis.response.state import (
     forbid,
     jump,
 )
-from tmlattice.diagnosis.response.validation import (
-    WORTH,
-    Step,
-    against,
-    inner,
-    lost,
-    remainder,
-    score,
-)
+from tmlattice.diagnosis.response.validation import Step, remainder, score
 from tmlattice.diagnosis.response.weights import COUPLING, good_monitors
 from tmlattice.effects import with_labels
-from tmlattice.errors import TmlatticeError
+from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import GROSS
 from tmlattice.observe.response_data import ResponseData, Split
 
@@ -62,8 +54,6 @@ log = logging.getLogger(__name__)
 
 LEAST = 5.0
 """Log evidence required for a family."""
-SPOILT = 0.05
-"""Largest rise of the validation score with all families together."""
 ASTRAY, NEAR = 1.2, 1e-3
 """Largest unexplained share of the typical column's mean square: as a ratio to the design's, or
 itself if that is more. Above it the fit has diverged."""
@@ -144,7 +134,8 @@ def fit_families(
     """
     design = begin(data, split)
     trials = readable(design, trials)
-    state = rough_fit(begun(design, trials), trials, progress)
+    late = [own for own in trials if any(family.late for family in own)]
+    state = rough_fit(begun(design, trials), [own for own in trials if own not in late], progress)
     single, labels = _outliers(state)
     progress("all families without outliers")
     state, notes = _together(without_readings(state, single | rejected(state, labels)), trials)
@@ -154,37 +145,31 @@ def fit_families(
     odd = single | rejected(state, labels)
     design, state = (without_readings(own, odd) for own in (design, state))
     notes = [*told_gross(data, single, "the fit"), *label_messages(labels), *notes]
-    state, moving = _beside_jitter(state, progress)
+    state, moving = _with_jitter(state, progress)
     before = score(design, "design")
-    state, gone, others, evidence = _needed(state, trials, most, progress)
-    notes += others
-    validated = inner(state)
-    change = lost(inner(replace(design, jitter=state.jitter)), validated)
-    nothing = HierarchicalFit(
-        design, design, (before,), decisions(data, trials, (), evidence), tuple(notes),
-        tuple(labels),
-    )  # fmt: skip
-    if against(change, SPOILT):  # together they worsen the validation
-        return nothing
+    state = allow(state, [family for own in late for family in own])
+    gone, evidence = _unneeded(state, trials, most, progress)
     progress("result")
-    # inner validation columns start at their own estimates: far from them they have no weight
-    state = bend(jump(replace(state, exploring=False), beyond=1.0))
-    if moving is not None:
-        moving = sought(state, moving.planes) or moving
-        state = replace(state, jitter=moving.orbits)
-    state = taken_back(settle(replace(state, robust=True)))
+    try:
+        state = settle(replace(bend(_without(state, gone)), robust=True))
+    except UnstableRingError:  # no beam is stored without them
+        gone, state = [], settle(replace(bend(state), robust=True))
+    state = taken_back(state)
     kept = [own for own in trials if own not in gone]
     for trial in [own for own in kept if _doubts(state, own)]:  # it has moved since
         notes += _doubts(state, trial)
-        state = _without(state, trial)
+        state = settle(_without(state, [trial]), FIRST, ROUGH)
         kept.remove(trial)
-    then = replace(design, good=state.good, exploring=False)
+    then = replace(design, good=state.good)
     if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
         diverged = (
             "the fit diverged: the residual of its own readings is larger than the design's; the "
             "lattice may be too far from the ring, and no effect is reported"
         )
-        return replace(nothing, messages=(*nothing.messages, diverged))
+        return HierarchicalFit(
+            design, design, (before,), decisions(data, trials, (), evidence),
+            (*notes, diverged), tuple(labels),
+        )  # fmt: skip
     notes += [] if moving is None else [moving.sentence]
     return HierarchicalFit(
         design, state, steps_of(before, state, kept), decisions(data, trials, kept, evidence),
@@ -202,44 +187,35 @@ def _outliers(state: State) -> tuple[Flags, list[Label]]:
     return single & ~rejected(state, labels), labels
 
 
-def _needed(
+def _unneeded(
     state: State, trials: Collection[Trial], most: int, progress: Callable[[str], Any]
-) -> tuple[State, list[Trial], list[str], dict[Trial, float]]:
-    """The state with the needed families alone, `most` trials at most; the rejected trials;
-    messages about implausible ones; and the log evidence of each plausible trial.
+) -> tuple[list[Trial], dict[Trial, float]]:
+    """The trials that the readings do not require, and the log evidence of each that was fitted.
 
-    The least needed one is rejected first. A trial that is needed given all others is needed
-    without some of them, and is not tested again."""
-    there = {family.name for family in state.families}
-    untested = [own for own in trials if there & {family.name for family in own}
-                and any(state.values[family.variable].any() for family in own)]  # fmt: skip
-    gone = [own for own in trials if own not in untested]
-    # at zero: nothing is lost
-    state = forbid(state, [f for own in gone for f in own if state.allows(f.name)])
-    doubts: list[str] = []
-    worth: dict[Trial, float] = {}
+    The least needed one is left out first, and the others are tested again, all linearised at the
+    fit: separate fits agree only to a share of their cost. At most `most` are needed."""
     evidence: dict[Trial, float] = {}
-    while untested:
-        tested = _tested(state, untested, progress)
-        worth |= {own: gained for own, (gained, _) in tested.items()}
-        evidence |= {own: log for own, (_, log) in tested.items() if np.isfinite(log)}
-        untested = sorted((own for own in untested if worth[own] <= 0), key=worth.__getitem__)
-        if untested:
-            least = untested.pop(0)
-            progress(with_labels(f"without {_title(least)}"))
-            doubted = _doubts(state, least)
-            try:
-                state = _without(state, least)
-            except TmlatticeError:  # no closed orbit without it
-                worth[least] = np.inf
-                continue
-            doubts += doubted
-            gone.append(least)
-            del worth[least]
-    for least in sorted(worth, key=worth.__getitem__)[: max(len(worth) - most, 0)]:
-        state = _without(state, least)
-        gone.append(least)
-    return state, gone, doubts, evidence
+    gone = [own for own in trials if not any(state.allows(family.name) for family in own)]
+    for block in (0, 1):
+        untested = [own for own in trials if own not in gone and own[0].block == block]
+        if not untested:
+            continue
+        there, left = linear(state, block), set[str]()
+        while untested:
+            whole = linear_evidence(there, left)[0]
+            for own in untested:
+                progress(with_labels(f"is {_title(own)} needed"))
+                evidence[own] = whole - linear_evidence(there, left | _priors(own, state))[0]
+                log.info("%s: log evidence %+.1f", _title(own), evidence[own])
+            # a trial that is needed given all others is needed without some of them
+            untested = [own for own in untested if evidence[own] <= LEAST]
+            if untested:
+                least = min(untested, key=evidence.__getitem__)
+                untested.remove(least)
+                left |= _priors(least, state)
+                gone.append(least)
+    needed = sorted((own for own in evidence if own not in gone), key=evidence.__getitem__)
+    return [*gone, *needed[: max(len(needed) - most, 0)]], evidence
 
 
 def readable(state: State, trials: Iterable[Trial]) -> list[Trial]:
@@ -355,21 +331,16 @@ def taken_back(state: State) -> State:
     return settle(replace(trial, good=state.good | back))
 
 
-def _beside_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
-    """The state with beam jitter, where it is detected and validation does not reject it. It is
-    sought again given the first result, because errors of the ring had taken a part of it."""
+def _with_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
+    """The state with detected beam jitter. It is sought again given the first result, because
+    errors of the ring had taken a part of it."""
     moving = sought(state)
     if moving is None:
         return state, None
     progress("beam jitter")
-    with_it = settle(replace(state, jitter=moving.orbits))
-    again = sought(with_it)
-    if again is not None:
-        moving, with_it = again, settle(replace(with_it, jitter=again.orbits))
-    not_refitted = replace(state, jitter=moving.orbits)
-    messages = lost(inner(not_refitted), inner(with_it))
-    log.info("%s: validation %+.3f +- %.3f", moving.sentence, *messages)
-    return (state, None) if against(messages, WORTH) else (with_it, moving)
+    state = settle(replace(state, jitter=moving.orbits))
+    moving = sought(state) or moving
+    return replace(state, jitter=moving.orbits), moving
 
 
 def _title(trial: Trial) -> str:
@@ -385,52 +356,6 @@ def _blocks(trial: Trial) -> list[int]:
     return [1, 0] if any(own.name == COUPLING for own in trial) else [trial[0].block]
 
 
-def _tested(
-    state: State, trials: Collection[Trial], progress: Callable[[str], Any]
-) -> dict[Trial, tuple[float, float]]:
-    """Worth of each trial and its log evidence, both linearised at the fit: two separate fits agree
-    only to a share of their cost. The worth is the evidence beyond `LEAST`, or less by validation
-    (0 or less: not needed).
-
-    Validation has a veto, because the evidence assumes independent readings, and model discrepancy
-    is not.
-    """
-    blocks = {}
-    for block in {trial[0].block for trial in trials} | {0}:
-        if state.of_block(block):
-            there = linear(state, block)
-            blocks[block] = there, linear_evidence(there)
-    in_plane = blocks.get(0)
-    of_rf = rf_by_others(state, in_plane and in_plane[0], in_plane and in_plane[1][2])
-    best = {name: values for _, (_, own, _) in blocks.values() for name, values in own.items()}
-    try:
-        validated = inner(state.moved({**state.values, **best}), of_rf)
-    except TmlatticeError:  # the linear model is wrong there: no closed orbit
-        best, validated = {}, inner(state, of_rf)
-    worth: dict[Trial, tuple[float, float]] = {}
-    for trial in trials:
-        progress(with_labels(f"is {_title(trial)} needed"))
-        if _doubts(state, trial):
-            worth[trial] = -np.inf, np.nan
-            continue
-        block = trial[0].block
-        there, (whole, _, _) = blocks[block]
-        other, values, found = linear_evidence(there, _priors(trial, state))
-        gained = whole - other - LEAST
-        without_it = of_rf if block else rf_by_others(state, there, found)
-        try:
-            change = lost(inner(state.moved({**state.values, **best, **values}), without_it),
-                          validated)  # fmt: skip
-        except TmlatticeError:  # no closed orbit without it
-            worth[trial] = np.inf, gained + LEAST
-            continue
-        log.info("%s: log evidence %+.1f, validation %+.3f +- %.3f", _title(trial), gained + LEAST,
-                 *change)  # fmt: skip
-        vetoed = _asked(trial) and against(change)
-        worth[trial] = min(gained, change[0]) if vetoed else gained, gained + LEAST
-    return worth
-
-
 def _doubts(state: State, trial: Trial) -> list[str]:
     """Messages about implausible values of a trial's families."""
     own = [family for family in trial if state.allows(family.name)]
@@ -440,11 +365,6 @@ def _doubts(state: State, trial: Trial) -> list[str]:
 
 def _priors(trial: Trial, state: State) -> set[str]:
     return {group.name for family in trial for group in family.groups(state.data)}
-
-
-def _asked(trial: Trial) -> bool:
-    """Whether held-out correctors can validate a trial: not numbers of fitted correctors."""
-    return any(family.per != "column" for family in trial)
 
 
 def _moved_without(state: State, block: int, there: Linear, names: Collection[str]) -> State | None:
@@ -461,10 +381,12 @@ def _moved_without(state: State, block: int, there: Linear, names: Collection[st
     return moved if np.isfinite(after) else None
 
 
-def _without(state: State, trial: Trial) -> State:
-    """The state without a trial's families and the others fitted again, first with the derivatives
-    here."""
-    block = trial[0].block
-    there = linear(state, block)
-    moved = _moved_without(state, block, there, _priors(trial, state))
-    return settle(forbid(moved or state, trial), FIRST, ROUGH)
+def _without(state: State, trials: Sequence[Trial]) -> State:
+    """The state without the families of some trials, after one step of the others with the
+    derivatives here; unchanged if no beam is stored without them."""
+    families = [f for own in trials for f in own if state.allows(f.name)]
+    moved = state
+    for block in sorted({family.block for family in families}):
+        names = {name for own in trials for name in _priors(own, state)}
+        moved = _moved_without(moved, block, linear(moved, block), names) or moved
+    return forbid(moved, families)

@@ -2,8 +2,9 @@
 
 The two orbits of a step are read seconds or minutes apart. If a noisy supply, a pulsed element or
 ground motion kicks the beam in between, all BPMs read the same additional closed orbit, in each
-step with another amplitude. So jitter is a covariance of each column's readings, whose amplitudes
-are integrated out (`inference.common`), and not noise of single BPMs.
+step with another amplitude. A drift of the energy does the same with the orbit of the RF step. So
+jitter is a covariance of each column's readings, whose amplitudes are integrated out
+(`inference.common`), and not noise of single BPMs.
 
 Jitter is sought in the plane that is not kicked, where errors of the ring have little effect, given
 the roll of each corrector. Sources are added one by one by their evidence. Their positions are
@@ -14,7 +15,7 @@ known up to the phase of the betatron oscillation.
 """
 
 import logging
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,9 +34,8 @@ log = logging.getLogger(__name__)
 
 MOST = 3
 """Most sources of a plane: two span all betatron phases, a third is for deviations from that."""
-SHARE = 0.25
-"""Least share of the typical column's mean square residual, given its own roll, that jitter must
-explain: less is not worth a covariance."""
+ENERGY = "energy"
+"""Name of the source that changes the beam's energy."""
 SIZES = np.geomspace(0.01, 3.0, 30)
 """Prior rms of the amplitudes that are tried, in units of the typical column's rms residual."""
 ROUNDS = 30
@@ -48,23 +48,18 @@ class Jitter:
 
     Attributes:
         orbits: of typical amplitude, m, [plane that is read, pattern, monitor], padded with zeros.
-        places: magnets behind which a kick makes these orbits, of each plane.
+        places: magnets behind which a kick makes these orbits, or `ENERGY`, of each plane.
     """
 
     orbits: Array
     places: tuple[tuple[str, ...], tuple[str, ...]]
 
     @property
-    def planes(self) -> tuple[int, ...]:
-        """The planes in which jitter was detected."""
-        return tuple(plane for plane, own in enumerate(self.places) if own)
-
-    @property
     def sentence(self) -> str:
         """The message about it."""
         sizes = " and ".join(
             f"{1e6 * np.sqrt(np.mean((own**2).sum(axis=0))):.2g} µm rms in {plane} "
-            f"(as by kicks behind {', '.join(places)})"
+            f"(as by {_sources(places)})"
             for own, places, plane in zip(self.orbits, self.places, "xy", strict=True)
             if places
         )
@@ -75,17 +70,22 @@ class Jitter:
         )
 
 
-def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
+def _sources(places: Sequence[str]) -> str:
+    kicks = [place for place in places if place != ENERGY]
+    energy = ["changes of the beam's energy"] * (ENERGY in places)
+    return " and ".join([*energy, *([f"kicks behind {', '.join(kicks)}"] * bool(kicks))])
+
+
+def sought(state: State) -> Jitter | None:
     """Return the detected jitter; None if there is none.
 
     Args:
         state: with gains, rolls and gradients; jitter in the state is ignored.
-        planes: to search.
     """
     still = replace(state, jitter=None)
     orbits = np.zeros((2, MOST, len(state.data.at)))
     places: list[tuple[str, ...]] = [(), ()]
-    for plane in planes:
+    for plane in (0, 1):
         found, places[plane] = _in_plane(still, plane)
         orbits[plane, : len(found)] = found
     most = max(len(own) for own in places)
@@ -93,8 +93,7 @@ def sought(state: State, planes: Collection[int] = (0, 1)) -> Jitter | None:
 
 
 def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
-    """The orbits of one plane, [pattern, monitor], and the magnets behind which a kick makes
-    them."""
+    """The orbits of one plane, [pattern, monitor], and their sources."""
     data, at, model = state.data, state.at, state.at.model
     none = np.zeros((0, len(data.at)))
     weights = weight(state, 1)
@@ -108,8 +107,9 @@ def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
     without = rest = _rest(weights, left, _patterns(rolls, none))
     exits, rows = model.maps.at[data.at], model.reading_slopes[data.at, plane]
     layers = np.arange(len(model.maps.layers))
-    orbits = orbits_of_kicks(model, layers, exits, rows, plane).T
-    orbits *= at.errors.monitors[:, plane, plane]
+    kicked = orbits_of_kicks(model, layers, exits, rows, plane).T
+    kicked *= at.errors.monitors[:, plane, plane]
+    orbits = np.concatenate([kicked, at.read[-1:, :, plane]])
     orbits *= np.median(_rms(without)) / np.maximum(_rms(orbits), TINY)
     least = (NOISE_LEFT * data.noise_of(1)[read]) ** 2
     count = 1.0  # jitter itself would reduce the effective sample size
@@ -118,13 +118,10 @@ def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
         found, which = _places(weights, left, rolls, orbits)
         rest = _rest(weights, left, _patterns(rolls, found))
         count = independent(np.where(weights > 0, rest, np.nan), np.sqrt(least))
-    places = tuple(model.maps.layers[i] for i in which)
-    before, after = np.median(_rms(without)), np.median(_rms(rest))
-    if not before > 0:
-        return none, ()
-    log.info("plane %d: jitter from %s, residual %.3g of %.3g m", plane, places, after, before)
-    share = 1 - float((after / before) ** 2)
-    return (none, ()) if share < SHARE else (found, places)
+    names = [*model.maps.layers, ENERGY]
+    log.info("plane %d: jitter from %s, residual %.3g of %.3g m", plane, [names[i] for i in which],
+             np.median(_rms(rest)), np.median(_rms(without)))  # fmt: skip
+    return found, tuple(names[i] for i in which)
 
 
 def _weights(seen: Flags, rest: Array, least: Array) -> Array:

@@ -390,7 +390,7 @@ def outlier_steps(state: State) -> list[Label]:
             found.setdefault(label.columns[0], label)
     gone = rejected(state, list(found.values())).any(axis=(1, 2))
     split = state.split
-    if not all((own & ~gone).any() for own in (split.held, split.inner, state.fitted)):
+    if not all((own & ~gone).any() for own in (split.held, state.fitted)):
         return []
     return list(found.values())
 
@@ -413,7 +413,7 @@ def without_readings(state: State, flags: Flags) -> State:
     measured = replace(data.measured, response=orbits[:-1].copy())
     data = replace(data, orbits=orbits, measured=measured)
     gone = flags.all(axis=(1, 2))
-    split = replace(state.split, held=state.split.held & ~gone, inner=state.split.inner & ~gone)
+    split = replace(state.split, held=state.split.held & ~gone)
     values = dict(state.values)
     for family in state.families:
         if family.per == "column":

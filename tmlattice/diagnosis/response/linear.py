@@ -9,9 +9,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
-from tmlattice.arrays import INVISIBLE, Array, Indices
+from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.response.state import Kept, State
 from tmlattice.diagnosis.response.weights import taken, weighed, weight
@@ -243,33 +242,6 @@ def gathered(there: Linear, plane: Indices, weighted: Array) -> Array:
     alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
     by_column = (there.by_column * weighted).sum(axis=1)
     return np.concatenate([alone.ravel(), by_column, *(r.times(weighted) for r in there.ring)])
-
-
-def rf_by_others(state: State, there: Linear | None, found: Posterior | None) -> Array:
-    """Return the residual of each reading of the RF's orbit by a fit to all others, m, NaN if not
-    fitted, [monitor]. It reveals families that fit each BPM by itself and predict none.
-
-    For readings y with precision matrix Q the residual is (Q y) / Q_ii. For a linear fit with
-    priors, Q y is the weighted residual, and Q the weights less the information that the fit takes.
-
-    Args:
-        state: of the fit.
-        there: `linear` of it, in-plane; None: nothing is fitted.
-        found: its solution; None: all numbers at zero.
-    """
-    column = len(state.data.plane) - 1
-    read, weights, left = rf_fitted(state)
-    precision = weights.diagonal().copy()
-    if there is not None:
-        rows = there.of_column(column, read, int(state.data.plane[column]))
-        values = np.zeros_like(there.start) if found is None else found.values
-        left = left - rows @ (values - there.start)
-    if there is not None and found is not None:
-        fitted = solve_triangular(found.factor, (weights @ rows @ found.spread).T, lower=True)
-        precision -= (fitted**2).sum(axis=0)
-    out = np.full(state.data.shape[1], np.nan)
-    out[read] = weights @ left / np.maximum(precision, INVISIBLE * weights.diagonal())
-    return out
 
 
 def rf_fitted(state: State) -> tuple[Indices, Array, Array]:

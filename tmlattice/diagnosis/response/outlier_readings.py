@@ -159,8 +159,14 @@ def outlier_readings(state: State) -> list[str]:
 
 
 def _odd_rf(state: State) -> list[str]:
-    """A message about outliers of the RF's orbit."""
-    odd = np.flatnonzero((state.share[:, -1] < 1).any(axis=0) & state.good)
+    """A message about outliers of the RF's orbit, at fitted and at other BPMs."""
+    if not state.has_fitted(DISPERSION):
+        return []
+    pulls = []
+    for block in (0, 1):
+        left = np.where(state.good, state.data.pick(state.at.left, block), np.nan)
+        pulls.append(_pulls(state, block, left)[-1])
+    odd = np.flatnonzero((np.nan_to_num(np.abs(pulls)) > SIGNIFICANT).any(axis=0))
     if not len(odd):
         return []
     names = first_of([state.data.measured.monitors[i] for i in odd])

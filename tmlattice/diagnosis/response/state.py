@@ -81,7 +81,6 @@ class State:
         families: that are fitted.
         values: of the numbers, by variable.
         groups: the families' priors with learnt scales, by name.
-        exploring: the inner validation correctors are not fitted, and select families.
         kept: derivatives by the ring's variables, used until the ring has moved.
         share: factors on the weights, less for outliers, [block, column, monitor].
         robust: whether outliers among the correctors' readings have less weight, too.
@@ -106,7 +105,6 @@ class State:
     families: tuple[Family, ...] = ()
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
-    exploring: bool = True
     kept: Mapping[str, Kept] = field(default_factory=dict)
     robust: bool = False
     apart: tuple[Candidate, ...] = ()
@@ -136,8 +134,9 @@ class State:
     @property
     def fitted(self) -> Flags:
         """Fitted correctors, [column]; of the RF's column the BPMs are split instead."""
-        out = self.split.held | (self.split.inner & self.exploring)
-        return np.asarray(~out & (np.arange(len(out)) < len(out) - 1))
+        out = ~self.split.held
+        out[-1] = False
+        return out
 
     def moved(self, values: Mapping[str, Array]) -> "State":
         """The state with other values, and the model's readings with them."""

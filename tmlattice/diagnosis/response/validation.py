@@ -14,7 +14,7 @@ free.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -28,17 +28,6 @@ from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.stated import of_sizes
 from tmlattice.effects import with_labels
 from tmlattice.inference.normal import Posterior
-
-JUDGES, VETO = np.array([1.0, 1.0, 0.25]), 0.01
-"""Weights of log rms in the validation score: in-plane, coupling, RF (one reading per BPM); and the
-fall of the score that rejects a family against the evidence, which may fit model discrepancy."""
-FEWEST = 3
-"""Fewest correctors of a validation: a single one may agree by chance."""
-FLOOR = np.array([0.1, 0.1, 1.0])
-"""Share of the noise that is added to each rms in quadrature, in-plane, coupling and RF: for
-readings without noise (simulated ones) a smaller residual is no improvement."""
-WORTH = 0.05
-"""Least fall of the score that rejects jitter."""
 
 
 @dataclass(frozen=True)
@@ -78,86 +67,6 @@ class Step:
         return f"{'without' if self.kept else 'with'} {with_labels(self.effect)}"
 
 
-class _Missed(NamedTuple):
-    """Residuals of held-out correctors, m, [column, monitor], NaN except at BPMs that validate.
-
-    Attributes:
-        inside, outside: in-plane, coupling.
-        jumped: in-plane, with a position jump of the corrector.
-        rolled: coupling, with a roll of the corrector, if it has one.
-        squares, cross: squares in-plane and coupling, in units of the noise.
-        spread: factor on the variance of `squares` by the error of the kick.
-        rf: of the RF's orbit, [monitor].
-        rf_squares: squares of these, in units of the noise.
-    """
-
-    inside: Array
-    outside: Array
-    jumped: Array
-    rolled: Array
-    squares: Array
-    cross: Array
-    spread: Array
-    rf: Array
-    rf_squares: Array
-
-
-def _missed(
-    state: State, validation: Flags, rf: Flags | None = None, jitter: Array | None = None
-) -> _Missed:
-    """Residuals of held-out correctors; see `score`.
-
-    Args:
-        state, validation: as there.
-        rf: BPMs that validate the RF's response, [monitor]; None: those that are not fitted.
-        jitter: orbits of beam jitter, see `State`, whose amplitudes the near BPMs determine, too.
-    """
-    data, at, half = state.data, state.at, state.split.half
-    orbits = data.pick(data.orbits)
-    seen = np.isfinite(orbits) & state.good
-    columns = np.flatnonzero(validation & (seen & half).any(axis=1) & (seen & ~half).any(axis=1))
-    near, far = seen[columns] & half[columns], seen[columns] & ~half[columns]
-
-    def picked(readings: Array, block: int = 0) -> Array:
-        return data.pick(readings, block)[columns]
-
-    read = at.seen(at.beam)
-    straight = picked(read)
-    moving = np.zeros((2, 0, data.shape[1])) if jitter is None else jitter
-    moving, typical = moving.swapaxes(1, 2), np.median(data.noise, axis=0)
-    held = np.broadcast_to(typical[:, None], (2, moving.shape[2]))
-    # equal weights: model discrepancy does not scale with the noise
-    plane = data.plane[columns]
-    patterns = np.concatenate([straight[..., None], moving[plane]], axis=2)
-    (kick, *_), left = amplitudes(
-        patterns, picked(data.orbits), near, np.pad(held[plane], ((0, 0), (1, 0)))
-    )
-    inside = np.where(far, left, np.nan)
-    # the error of the kick adds to that of the reading
-    spread = 1 + straight**2 / np.sum(straight**2, axis=1, where=near, keepdims=True)
-    both = np.stack([straight, picked(at.seen(at.jumps))], axis=2)
-    jumped = np.where(far, amplitudes(both, picked(data.orbits), near)[1], np.nan)
-    left = picked(data.orbits, 1) - kick[:, None] * picked(read, 1)
-    near, far = near & np.isfinite(left), far & np.isfinite(left)
-    left = amplitudes(moving[1 - plane], left, near, held[1 - plane])[1]
-    outside = np.where(far, left, np.nan)
-    rolled = np.full_like(outside, np.nan)
-    if state.allows("corrector_roll"):
-        rolls = picked(at.seen(at.across), 1)
-        known = far & np.any(near & (rolls != 0), axis=1, keepdims=True)
-        rolled = np.where(known, amplitudes(rolls[..., None], left, near)[1], np.nan)
-    left = orbits[-1] - data.pick(read)[-1]
-    scored = state.good & np.isfinite(left) & (~half[-1] if rf is None else rf)
-    near = state.good & np.isfinite(left) & half[-1] & ~scored
-    left = amplitudes(moving[0], left, near, held[0])[1]
-    of_rf = np.where(scored, left, np.nan)
-    variance = [data.noise_of(block) ** 2 for block in (0, 1)]
-    return _Missed(
-        inside, outside, jumped, rolled, inside**2 / variance[0][columns],
-        outside**2 / variance[1][columns], spread, of_rf, of_rf**2 / variance[0][-1],
-    )  # fmt: skip
-
-
 def score(state: State, effect: str, parameters: int = 0) -> Step:
     """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
@@ -165,97 +74,52 @@ def score(state: State, effect: str, parameters: int = 0) -> Step:
         state: to validate on its held-out correctors.
         effect, parameters: of the step.
     """
-    missed = _missed(state, state.split.held)
-    squares = {"in-plane": missed.squares / missed.spread, "coupling": missed.cross,
-               "RF": missed.rf_squares}  # fmt: skip
+    data, at, half = state.data, state.at, state.split.half
+    orbits = data.pick(data.orbits)
+    seen = np.isfinite(orbits) & state.good
+    both_halves = (seen & half).any(axis=1) & (seen & ~half).any(axis=1)
+    columns = np.flatnonzero(state.split.held & both_halves)
+    near, far = seen[columns] & half[columns], seen[columns] & ~half[columns]
+
+    def picked(readings: Array, block: int = 0) -> Array:
+        return data.pick(readings, block)[columns]
+
+    read = at.seen(at.beam)
+    straight = picked(read)
+    # equal weights: model discrepancy does not scale with the noise
+    (kick,), left = amplitudes(straight[..., None], orbits[columns], near)
+    inside = np.where(far, left, np.nan)
+    # the error of the kick adds to that of the reading
+    spread = 1 + straight**2 / np.sum(straight**2, axis=1, where=near, keepdims=True)
+    patterns = np.stack([straight, picked(at.seen(at.jumps))], axis=2)
+    jumped = np.where(far, amplitudes(patterns, orbits[columns], near)[1], np.nan)
+    left = picked(data.orbits, 1) - kick[:, None] * picked(read, 1)
+    near, far = near & np.isfinite(left), far & np.isfinite(left)
+    outside = np.where(far, left, np.nan)
+    rolled = np.full_like(outside, np.nan)
+    if state.allows("corrector_roll"):
+        rolls = picked(at.seen(at.across), 1)
+        known = far & np.any(near & (rolls != 0), axis=1, keepdims=True)
+        rolled = np.where(known, amplitudes(rolls[..., None], left, near)[1], np.nan)
+    of_rf = np.where(state.good & ~half[-1], orbits[-1] - data.pick(read)[-1], np.nan)
+    noise = [data.noise_of(block) for block in (0, 1)]
+    squares = (inside / noise[0][columns]) ** 2
+    compared = {"in-plane": squares / spread, "coupling": (outside / noise[1][columns]) ** 2,
+                "RF": (of_rf / noise[0][-1]) ** 2}  # fmt: skip
     return Step(
         effect,
         parameters,
-        heldout_rms_in_plane=rms_of(missed.inside),
-        heldout_rms_coupling=rms_of(missed.outside),
-        heldout_chi2_per_dof=float(np.nanmean(missed.squares)),
-        dispersion_rms=rms_of(missed.rf),
-        heldout_rms_position=rms_of(missed.jumped),
-        heldout_rms_roll=rms_of(missed.rolled),
+        heldout_rms_in_plane=rms_of(inside),
+        heldout_rms_coupling=rms_of(outside),
+        heldout_chi2_per_dof=float(np.nanmean(squares)),
+        dispersion_rms=rms_of(of_rf),
+        heldout_rms_position=rms_of(jumped),
+        heldout_rms_roll=rms_of(rolled),
         compared=tuple(
             Block(name, float(np.nansum(own)), int(np.isfinite(own).sum()))
-            for name, own in squares.items()
+            for name, own in compared.items()
         ),
     )
-
-
-class Validated(NamedTuple):
-    """Residuals of the inner validation set: sums of squares, m^2, and numbers of readings.
-
-    Attributes:
-        columns: of each corrector, in-plane and coupling, [column, 2, (sum, count)].
-        rf: of each BPM, of the RF's orbit, [monitor, (sum, count)].
-    """
-
-    columns: Array
-    rf: Array
-
-    @property
-    def logs(self) -> Array:
-        """Log rms in-plane, coupling and RF; NaN without readings."""
-        return _logs(np.concatenate([self.columns.sum(axis=0), self.rf.sum(axis=0)[None]]))
-
-
-def _logs(sums: Array) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(0.5 * np.log(sums[..., 0] / sums[..., 1]))
-
-
-def inner(state: State, by_others: Array | None = None) -> Validated:
-    """Return the residuals of the inner validation set: in-plane, coupling and dispersion.
-
-    Each half of the BPMs determines the kicks once, and the amplitudes of the state's beam jitter.
-    Otherwise the jitter of the held-out steps would hide improvements.
-
-    Args:
-        state: to validate.
-        by_others: leave-one-out residuals of the RF's fitted BPMs, see `rf_by_others`, m,
-            [monitor]; they count in the validation, too.
-    """
-    other = replace(state, split=replace(state.split, half=~state.split.half))
-    missed = [
-        _missed(one, state.split.inner, state.split.inner_rf, state.jitter)
-        for one in (state, other)
-    ]
-    left = np.stack([[one.inside, one.outside] for one in missed])
-    columns = np.stack([np.nansum(left**2, axis=(0, 3)), np.isfinite(left).sum(axis=(0, 3))]).T
-    of_rf = missed[0].rf
-    if by_others is not None:
-        of_rf = np.where(np.isfinite(of_rf), of_rf, by_others)
-    rf = np.stack([np.nan_to_num(of_rf) ** 2, np.isfinite(of_rf)], axis=1)
-    floor = (FLOOR * float(np.median(state.data.noise))) ** 2
-    columns[..., 0] += floor[:2] * columns[..., 1]
-    rf[:, 0] += floor[2] * rf[:, 1]
-    return Validated(columns, rf)
-
-
-def lost(without: Validated, within: Validated) -> tuple[float, float]:
-    """Return the rise of the validation score (weighted log rms; lower is better) without a family,
-    and its standard error by the jackknife over correctors and over BPMs of the RF's orbit. It is
-    infinite for fewer than `FEWEST` correctors."""
-    whole = float(np.nansum(JUDGES * (without.logs - within.logs)))
-    variance = 0.0
-    for now, then, weights in (
-        (within.columns, without.columns, JUDGES[:2]),
-        (within.rf[:, None], without.rf[:, None], JUDGES[2:]),
-    ):
-        counted = now[:, 0, 1] > 0
-        if counted.sum() > 1:
-            one_less = [_logs(own.sum(axis=0) - own[counted]) for own in (then, now)]
-            changes = np.nansum(weights * (one_less[0] - one_less[1]), axis=1)
-            variance += (len(changes) - 1) * float(np.var(changes))
-    enough = np.count_nonzero(within.columns[:, 0, 1]) >= FEWEST
-    return whole, float(np.sqrt(variance)) if enough else np.inf
-
-
-def against(change: tuple[float, float], least: float = VETO) -> bool:
-    """Return whether validation is better without, by `lost`: by a standard error and `least`."""
-    return change[0] < -max(least, change[1])
 
 
 BLOCKS = ("in-plane", "coupling", "RF")

@@ -34,8 +34,6 @@ def weight(state: State, block: int) -> Array:
     use = np.isfinite(data.pick(data.orbits, block)) & state.good
     use[:-1] &= state.fitted[:-1, None]
     use[-1] &= split.half[-1]
-    if state.exploring:
-        use[-1] &= ~split.inner_rf
     variance = data.noise_of(block) ** 2 + state.lacking[block][:, None] ** 2
     return np.where(use, counts(state, block) * state.share[block] / variance, 0.0)
 
