@@ -140,7 +140,8 @@ def settle(
     each number. A step that increases the cost of its own block is repeated with smaller bounds. It
     may increase the cost of the other block, which its derivatives omit, because the next step may
     compensate. Weights and bad BPMs are updated at a new lowest cost only, so that costs in between
-    are comparable. The fit ends when a step of each block was no progress.
+    are comparable. The fit ends when a step of each block was no progress, two where they increased
+    the cost.
 
     Args:
         state: the start.
@@ -188,7 +189,7 @@ def settle(
             if gained >= 0:
                 best, gained = looked(state), 0.0
                 state = best
-        if idle == len(blocks):
+        if idle >= len(blocks) * (1 if gained >= 0 else 2):
             break
     best = looked(start) if best is start else best
     return replace(best, kept=state.kept)
