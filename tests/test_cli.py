@@ -35,17 +35,8 @@ QUICK = ["--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--epochs", "20"]
 @pytest.fixture(scope="module")
 def outcome(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    done = tmlattice(
-        "tune-fit",
-        "--epochs",
-        200,
-        "--json",
-        "result.json",
-        "--out",
-        "figures",
-        cwd=folder,
-        check=0,
-    )
+    words = ("tune-fit", "--epochs", 200, "--json", "result.json", "--out", "figures")
+    done = tmlattice(*words, cwd=folder, check=0)
     return folder, done
 
 

@@ -552,13 +552,14 @@ def displaced(ring, rms, seed):
 
 def measured_with(ring, causes, kicks, seed):
     settings = [{name: {"kick": kick} for name, kick in kicks.items()}] * 3
-    return simulate(ring, causes, turns=2, settings=settings, seed=seed).measurement()
+    made = simulate(ring, causes, shots=3, turns=2, settings=settings, seed=seed)
+    return made.measurement()
 
 
 def test_first_turns_of_a_lost_beam_thread_it(ring_kicking_x):
     """Measured and steered, again with all measurements so far, AT's beam comes round."""
     ring = ring_kicking_x("i % 2")
-    causes = displaced(ring, 3e-3, 5)
+    causes = displaced(ring, 3e-3, 2)
     machine = apply(ring, causes)
     kicks, measured, reached = {}, [], [turns_of_at(machine)[0]]
     while reached[-1] < 1.0 and len(measured) < 4:

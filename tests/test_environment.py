@@ -13,7 +13,6 @@ from conftest import SMALL
 
 from tmlattice.temporaries import PREFIX
 
-
 QUICK = ("diagnose", "ring.py", "M", "--effects", "quadrupole_gradient")
 
 

@@ -47,10 +47,8 @@ def written(diagnosis, folder):
 def first_turns(small_ring, tmp_path_factory):
     data = simulate(small_ring, [WEAK], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
                     noise=2e-6).measurement()  # fmt: skip
-    return written(
-        fits_terminals(diagnose(small_ring, data, effects=EFFECTS)),
-        tmp_path_factory.mktemp("first_turns"),
-    )
+    found = diagnose(small_ring, data, effects=EFFECTS)
+    return written(fits_terminals(found), tmp_path_factory.mktemp("first_turns"))
 
 
 @pytest.fixture(scope="module")
