@@ -136,13 +136,14 @@ def test_many_measurements_are_diagnosed_with_one_file_each(tmp_path, small_ring
 
     for i, name in enumerate(("QD::5", "QF::2")):
         fault = [tmlattice.Cause("quadrupole_gradient", name, 0.05)]
-        made = tmlattice.simulate(small_ring, fault, shots=4, amplitude=1e-4, noise=1e-6,
+        made = tmlattice.simulate(small_ring, fault, shots=3, amplitude=1e-4, noise=1e-6,
                                   engine="ocelot", seed=i)  # fmt: skip
         made.write(tmp_path / "shift" / str(i), progress=False)
     paths = [*sorted((tmp_path / "shift").iterdir()), tmp_path / "nowhere"]
 
     def run(out, **where):
-        files = batch.diagnose(small_ring, paths, tmp_path / out, progress=False, **where)
+        where |= {"effects": ["quadrupole_gradient"], "progress": False}
+        files = batch.diagnose(small_ring, paths, tmp_path / out, **where)
         return {name: json.loads(path.read_text()) for name, path in files.items()}
 
     local = run("local", jobs=2)

@@ -35,17 +35,8 @@ QUICK = ["--launch", "1e-4,0,1e-4,0", "--change", "-0.02", "--epochs", "20"]
 @pytest.fixture(scope="module")
 def outcome(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    done = tmlattice(
-        "tune-fit",
-        "--epochs",
-        200,
-        "--json",
-        "result.json",
-        "--out",
-        "figures",
-        cwd=folder,
-        check=0,
-    )
+    words = ("tune-fit", "--epochs", 200, "--json", "result.json", "--out", "figures")
+    done = tmlattice(*words, cwd=folder, check=0)
     return folder, done
 
 
@@ -327,7 +318,7 @@ def folders(tmp_path_factory, small_ring):
 @pytest.mark.parametrize(("name", "coordinates"), [("on", 4), ("off", 6)])
 def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
     done = tmlattice(
-        "tune-fit", SMALL, "--measurement", folders / name, "--epochs", 150, "--method", "adam",
+        "tune-fit", SMALL, "--measurement", folders / name, "--epochs", 100, "--method", "adam",
         "--out", "fit", cwd=tmp_path, check=0,
     )  # fmt: skip
     result = valid(tmp_path / "fit" / "tune-fit.json", "tune-fit")
@@ -347,7 +338,7 @@ def test_tune_fit_on_a_measurement(folders, tmp_path, name, coordinates):
 
 def test_launches_and_noise_that_nobody_states_are_fitted_beside(folders, tmp_path, small_ring):
     """Launches of 1e-4 m and rad, stated as unknown about the axis; 0.2 µm of noise."""
-    done = tmlattice("tune-fit", SMALL, "--measurement", folders / "blind", "--epochs", 300,
+    done = tmlattice("tune-fit", SMALL, "--measurement", folders / "blind", "--epochs", 100,
                      "--out", "fit", cwd=tmp_path, check=0)  # fmt: skip
     result = json.loads((tmp_path / "fit" / "tune-fit.json").read_text())
     assert result["noise_estimated"]

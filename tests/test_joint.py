@@ -77,9 +77,10 @@ def test_each_sees_its_part_and_both_are_named(small_ring):
         "dispersion": _dispersion(small_ring, truth),
         "tunes": _tunes(small_ring, truth),
         "turns": _turns(small_ring, truth),
-        "injection": simulate(small_ring, truth, shots=4, seed=1).measurement(),
+        "injection": simulate(small_ring, truth, shots=3, seed=1).measurement(),
     }
-    diagnosis = diagnose(small_ring, whole)
+    effects = ["quadrupole_gradient", "quadrupole_offset_x", KICK.effect, "monitor_gain_x"]
+    diagnosis = diagnose(small_ring, whole, effects=effects)
     assert diagnosis.verdict in ("identified", "ambiguous")
     assert _found(diagnosis) == {(KICK.effect, KICK.element), (WEAK.effect, WEAK.element)}
     amount, sigma = diagnosis.error(WEAK.effect, WEAK.element)

@@ -140,9 +140,16 @@ def variables(simulated):  # noqa: F811
     return copy.deepcopy(simulated)
 
 
+@pytest.fixture(scope="module")
+def usual(simulated, tmp_path_factory):  # noqa: F811
+    """What the usual file holds."""
+    path = tmp_path_factory.mktemp("usual") / "usual.loco.mat"
+    scipy.io.savemat(path, simulated)
+    return bring_in([path], Options())
+
+
 @pytest.mark.parametrize("form", FORMS)
-def test_other_forms_are_the_usual_one(variables, brought, form):  # noqa: F811
-    usual = brought(variables)
+def test_other_forms_are_the_usual_one(usual, variables, brought, form):  # noqa: F811
     change, said = FORMS[form]
     change(variables)
     found = brought(variables)

@@ -192,8 +192,9 @@ def hdf5_file(path, data, readings, sums, name):
     return path
 
 
-@pytest.mark.parametrize("write", [long_table, wide_table, hdf5_file])
-@pytest.mark.parametrize("name", ["sum", "Intensity"])
+@pytest.mark.parametrize(
+    ("write", "name"), [(long_table, "sum"), (wide_table, "Intensity"), (hdf5_file, "sum")]
+)
 def test_sum_signals_say_where_the_beam_was(small_ring, data, tmp_path, rng, write, name):
     path = write(tmp_path / "readings.csv", data, *with_sums(data, rng), name)
     brought = bring_in([path], Options(ring=small_ring, noise=2e-5))

@@ -48,7 +48,8 @@ def test_noise_is_estimated_once_from_measurement_and_reference(small_ring):
     after = simulate(small_ring, [fault], shots=5, seed=2, **options).measurement()
     told = []
     before, after = (replace(own, noise=None) for own in (before, after))
-    found = diagnose(small_ring, after, reference=before, progress=told.append)
+    effects = ["quadrupole_gradient", "quadrupole_offset_x", "quadrupole_offset_y"]
+    found = diagnose(small_ring, after, reference=before, effects=effects, progress=told.append)
     assert found.noise == pytest.approx((NOISE, NOISE), rel=0.5)  # neighbours leave ten times it
     assert found.noise_estimated
     assert [(one.effect, one.element) for one in found.findings] == [(fault.effect, fault.element)]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tmlattice import TaylorNetwork, load_ring, off_momentum
+from tmlattice import TaylorNetwork, off_momentum
 
 
 def test_counts(petra3):
@@ -55,23 +55,3 @@ def test_five_millimetres_survive_5000_turns(petra3_network):
     states = petra3_network.track(launch, 5000)
     assert np.isfinite(states).all()
     assert np.abs(states[..., [0, 2]]).max() < 0.03
-
-
-def test_lattice_file_is_plain_ocelot(tmp_path):
-    """It runs with OCELOT alone, from anywhere."""
-    import shutil
-    import subprocess
-    import sys
-    from importlib.resources import files
-
-    shutil.copy(str(files("tmlattice") / "lattices" / "petra3.py"), tmp_path)
-    code = (
-        "import sys; sys.path.insert(0, '.'); sys.modules['tmlattice'] = None\n"
-        "from petra3 import ring, energy\nfrom ocelot import MagneticLattice\n"
-        "print(round(MagneticLattice(ring).totalLen, 2), energy)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip().endswith("2303.95 6.0")
-    assert len(load_ring(tmp_path / "petra3.py").elements) > 3000

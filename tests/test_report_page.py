@@ -23,6 +23,7 @@ CHROMIUM = next(filter(None, BROWSERS), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt install chromium")
 
 WEAK = Cause("quadrupole_gradient", "QD::5", -0.02)
+EFFECTS = ["quadrupole_gradient", "quadrupole_roll", "monitor_gain_x", "corrector_kick_x"]
 TERMINALS = (40, 60, 80, 100)
 PHONE = {"width": 390, "height": 800}
 
@@ -46,9 +47,8 @@ def written(diagnosis, folder):
 def first_turns(small_ring, tmp_path_factory):
     data = simulate(small_ring, [WEAK], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
                     noise=2e-6).measurement()  # fmt: skip
-    return written(
-        fits_terminals(diagnose(small_ring, data)), tmp_path_factory.mktemp("first_turns")
-    )
+    found = diagnose(small_ring, data, effects=EFFECTS)
+    return written(fits_terminals(found), tmp_path_factory.mktemp("first_turns"))
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def together(small_ring, tmp_path_factory):
                      noise=2e-6).measurement()  # fmt: skip
     beam = StoredBeam(ResponseModel(apply(small_ring, [WEAK])))
     tunes = TuneReading(tune=beam.tunes[None], tune_error=np.full((1, 2), 1e-4))
-    found = diagnose(small_ring, {"turns": turns, "tunes": tunes})
+    found = diagnose(small_ring, {"turns": turns, "tunes": tunes}, effects=EFFECTS)
     return written(fits_terminals(found), tmp_path_factory.mktemp("together"))
 
 
@@ -227,7 +227,7 @@ def test_names_that_are_markup_are_shown_as_they_stand(opened, small_ring, tmp_p
     weak = Cause("quadrupole_gradient", f"{name}::5", -0.02)
     data = simulate(ring, [weak], shots=4, seed=1, engine="ocelot", amplitude=3e-4,
                     noise=2e-6).measurement()  # fmt: skip
-    tab = opened(written(diagnose(ring, data), tmp_path))
+    tab = opened(written(diagnose(ring, data, effects=EFFECTS), tmp_path))
     assert name in tab.inner_text("#answer")
     for figure in ("plan", "scan"):
         assert f"{name}::5" in hovered(tab, figure, "z&#60;/a&#62;&#60;/script&#62;::5")

@@ -52,9 +52,9 @@ def diagnoses(small_ring):
     small = response(ring, seed=7, background=ALL, machine_seed=4)
     families = ["quadrupole_gradient", "monitor_gain_x", "corrector_calibration", "monitor_roll"]
     return {
-        "first turns": tmlattice.diagnose(ring, shots(ring, [FAULT])),
-        "none": tmlattice.diagnose(ring, shots(ring, [])),
-        "together": tmlattice.diagnose(ring, both),
+        "first turns": tmlattice.diagnose(ring, shots(ring, [FAULT]), effects=families),
+        "none": tmlattice.diagnose(ring, shots(ring, []), effects=families),
+        "together": tmlattice.diagnose(ring, both, effects=families),
         "response": tmlattice.diagnose(ring, small, effects=families, missing=True),
         "change": tmlattice.diagnose(
             ring, response(ring, [FAULT]), reference=response(ring, seed=7), effects=families
@@ -242,7 +242,7 @@ def test_every_public_result_is_pickled_and_copied(diagnoses, small_ring, small_
     quick = {"epochs": 3, "progress": False}
     step = tmlattice.RfStep(5e8, 100, 10.0, orbits.orbit[0])
     machine = tmp_path / "tmlattice.toml"
-    machine.write_text('[lattice]\nfile = "petra3"\n')
+    machine.write_text(f'[lattice]\nfile = "{SMALL}"\n')
     results = [
         small_ring, small_ring.magnets[0], FAULT, *diagnoses.values(), *found.findings,
         measured, response(small_ring), orbits, simulate_tunes(small_ring).measured, step,
@@ -326,10 +326,9 @@ def test_two_responses_differ_by_calibrations(small_ring):
 
 
 def test_commands_render_and_compare(diagnoses, small_ring, tmp_path):
-    diagnoses["first turns"].save(tmp_path / "a")
+    saved(diagnoses["first turns"], tmp_path / "a")
     saved(diagnoses["together"], tmp_path / "b")
-    before = (tmp_path / "a" / "report.txt").read_text()
-    (tmp_path / "a" / "report.txt").unlink()
+    before = diagnoses["first turns"].report() + "\n"
     done = command("report", tmp_path / "a", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "a" / "report.txt").read_text() == before

@@ -189,7 +189,7 @@ def test_a_user_without_a_name_or_a_home_can_work(open_folder, beside):
         copy = shutil.copytree if (beside / name).is_dir() else shutil.copy
         copy(beside / name, open_folder / name)
     ring, data = open_folder / "ring.json", open_folder / "M"
-    words = ("diagnose", ring, data, "--out", "R", "-q")
+    words = ("diagnose", ring, data, "--effects", "quadrupole_gradient", "--out", "R", "-q")
     done = subprocess.run(
         [sys.executable, "-P", "-c", TWICE, *words], cwd=open_folder, capture_output=True,
         text=True, check=False,
@@ -288,7 +288,7 @@ MODULES = (
 SIMULATE = ("simulate", "ring.json", "--shots", "66", "--engine", "ocelot", "--jobs", "2", "-q")
 STUDY = ("dev", "study", "tune-fit", "ring.json", "--magnets", "2", "--methods", "sparse", "-q")
 COMMANDS = {
-    "diagnose": ("diagnose", "ring.py", "M", "--out", "R"),
+    "diagnose": ("diagnose", "ring.py", "M", "--effects", "quadrupole_gradient", "--out", "R"),
     "simulate": (*SIMULATE, "--out", "N", "--force"),
     "challenge run": ("dev", "challenge", "run", "set", "--jobs", "2", "-q"),
     "study": (*STUDY, "--jobs", "2", "--out", "study"),
@@ -331,7 +331,7 @@ def test_no_module_of_the_working_directory_is_loaded_and_no_port_is_open(beside
                 assert not [s for s in sockets if s.status == psutil.CONN_LISTEN]
                 assert not [s for s in sockets if s.type == socket.SOCK_DGRAM]
                 assert not [s for s in sockets if s.family == socket.AF_UNIX and one != process]
-        time.sleep(0.05)
+        time.sleep(0.2)
     assert not (beside / "MARK").exists(), (beside / "MARK").read_text()
     assert process.returncode == 0
     assert len(workers) >= 3 or "--jobs" not in words

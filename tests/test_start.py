@@ -7,6 +7,7 @@ import shutil
 import sys
 import threading
 import warnings
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -87,11 +88,19 @@ def test_ocelot_is_whole_for_a_user_who_imports_it_after_the_package(tmp_path):
 
 
 def test_ocelot_stays_as_it_is_for_a_user_who_imported_it_before(tmp_path):
+    """And the built-in lattice is plain OCELOT: it runs without the package, from anywhere."""
+    shutil.copy(str(files("tmlattice") / "lattices" / "petra3.py"), tmp_path)
     python(
         "import ocelot, sys\n"
         "before = dict(vars(ocelot))\n"
+        "sys.modules['tmlattice'] = None\n"
+        "import petra3\n"
+        "length = ocelot.MagneticLattice(petra3.ring).totalLen\n"
+        "assert (round(length, 2), petra3.energy) == (2303.95, 6.0)\n"
+        "del sys.modules['tmlattice']\n"
         "import tmlattice\n"
-        "ring = tmlattice.load_ring('petra3')\n"
+        "ring = tmlattice.load_ring('petra3.py')\n"
+        "assert len(ring.elements) > 3000\n"
         "tmlattice.element_map(ring.magnets[0], ring.energy)\n"
         "assert sys.modules['ocelot'] is ocelot and type(ocelot) is type(sys)\n"
         "assert all(vars(ocelot)[name] is value for name, value in before.items())\n"

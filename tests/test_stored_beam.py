@@ -153,7 +153,10 @@ def test_no_fault_has_a_sign_that_it_cannot_have(small_ring):
     """A horizontal kick changes the energy as a loss below nothing would, which has one place."""
     kick = Cause("quadrupole_offset_x", "QF::7", -6e-5)
     turns = simulate_turns(small_ring, [kick], shots=4, turns=500, noise=3e-5, seed=8).measured
-    for found in diagnose(small_ring, turns).findings:
+    effects = ["quadrupole_offset_x", "corrector_kick_x", "radiation_loss_bends"]
+    findings = diagnose(small_ring, turns, effects=effects).findings
+    assert findings
+    for found in findings:
         assert "radiation_loss_bends" not in {one.effect for one in found.credible_set}
 
 

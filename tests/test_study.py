@@ -81,16 +81,9 @@ def test_summary_counts_coverage_and_right_magnets():
 
 
 # --- `tmlattice dev reproduce` as a user runs it --------------------------------------------------
-@pytest.mark.parametrize(
-    "system",
-    [
-        "free-fall",
-        "pendulum",
-        "magnets",
-        "lotka-volterra",
-        pytest.param("cavitation", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("system", [
+    "free-fall", "pendulum", "magnets", "lotka-volterra",
+    pytest.param("cavitation", marks=pytest.mark.slow)])  # fmt: skip
 def test_table_json_and_figure(system, tmp_path):
     out = tmp_path / "out"
     done = tmlattice("dev", "reproduce", system, "--small", "--out", out, cwd=tmp_path, check=0)

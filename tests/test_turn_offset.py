@@ -93,8 +93,9 @@ def test_the_derivative_is_that_of_the_model(small_ring):
 @pytest.mark.parametrize("late", [1, -3])
 def test_it_is_named(small_ring, late):
     weak = Cause("quadrupole_gradient", "QD::3", -0.02)
-    measured = simulate_turns(small_ring, [offset(late), weak], shots=3, turns=400, seed=3).measured
-    diagnosis = diagnose(small_ring, measured)
+    measured = simulate_turns(small_ring, [offset(late), weak], shots=2, turns=200, seed=3).measured
+    effects = ["monitor_turn_offset", "monitor_gain_x", "quadrupole_gradient", "quadrupole_roll"]
+    diagnosis = diagnose(small_ring, measured, effects=effects)
     named = {(f.recommended_action.effect, f.element) for f in diagnosis.findings}
     assert named == {("monitor_turn_offset", MONITOR), ("quadrupole_gradient", "QD::3")}
     amount, sigma = diagnosis.error("monitor_turn_offset", MONITOR)

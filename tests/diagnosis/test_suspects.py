@@ -71,7 +71,8 @@ def test_an_outlier_of_a_family_is_a_suspect_everywhere(small_ring):
 def test_small_errors_that_explain_all_leave_suspects(small_ring):
     small = {"quadrupole_gradient": 0.02, "quadrupole_offset_x": 1e-4}
     data = simulate(small_ring, [], background=small, **SHOTS).measurement()
-    result = diagnose(small_ring, data)
+    effects = [*small, "quadrupole_roll", "dipole_field", "monitor_gain_x"]
+    result = diagnose(small_ring, data, effects=effects)
     assert result.verdict == "distributed"
     assert result.suspects
     assert all(one.statistic >= 9 for one in result.suspects)  # three sigma, looked at alone
