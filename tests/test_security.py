@@ -331,7 +331,7 @@ def test_no_module_of_the_working_directory_is_loaded_and_no_port_is_open(beside
                 assert not [s for s in sockets if s.status == psutil.CONN_LISTEN]
                 assert not [s for s in sockets if s.type == socket.SOCK_DGRAM]
                 assert not [s for s in sockets if s.family == socket.AF_UNIX and one != process]
-        time.sleep(0.2)
+        time.sleep(0.05)
     assert not (beside / "MARK").exists(), (beside / "MARK").read_text()
     assert process.returncode == 0
     assert len(workers) >= 3 or "--jobs" not in words
