@@ -202,10 +202,10 @@ def _unneeded(
             continue
         there, left = linear(state, block), set[str]()
         while untested:
-            whole = linear_evidence(there, left)[0]
+            whole = linear_evidence(there, left)
             for own in untested:
                 progress(with_labels(f"is {_title(own)} needed"))
-                evidence[own] = whole - linear_evidence(there, left | _priors(own, state))[0]
+                evidence[own] = whole - linear_evidence(there, left | _priors(own, state))
                 log.info("%s: log evidence %+.1f", _title(own), evidence[own])
             # a trial that is needed given all others is needed without some of them
             untested = [own for own in untested if evidence[own] <= LEAST]

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tmlattice.arrays import REDUNDANT, Array, rms
+from tmlattice.arrays import REDUNDANT, Array, Indices, rms
 from tmlattice.diagnosis.families.dispersion import HorizontalKicks
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.response.linear import linear, rf_fitted
+from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.weights import taken, weight
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import DEFAULT, SIGNIFICANT
 from tmlattice.inference.normal import Normal, solve
@@ -70,7 +71,7 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
         false_alarm: probability of a finding in consistent data.
     """
     single = QuadrupoleGradient()
-    read, weights, left = rf_fitted(state)
+    read, weights, left = _rf_fitted(state)
     if single.variable not in state.values or not read.size:
         return None
     there, column = linear(state, 0), len(state.data.plane) - 1
@@ -105,6 +106,18 @@ def inconsistencies(state: State, false_alarm: float = DEFAULT.false_alarm) -> I
         len(read),
         _pulls(names, *answers[0], *answers[1], len(kinds)),
     )
+
+
+def _rf_fitted(state: State) -> tuple[Indices, Array, Array]:
+    """The BPMs at which the RF's orbit is fitted, the inverse covariance of these readings, 1/m2,
+    and their residuals, m."""
+    own = weight(state, 0)[-1]
+    read = np.flatnonzero(own > 0)
+    weights = np.diag(own[read])
+    shared = taken(state, 0)
+    if shared is not None:
+        weights -= shared[-1, read] @ shared[-1, read].T
+    return read, weights, state.data.pick(state.at.left)[-1, read]
 
 
 def _pulls(

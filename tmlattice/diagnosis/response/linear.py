@@ -242,16 +242,3 @@ def gathered(there: Linear, plane: Indices, weighted: Array) -> Array:
     alone = np.stack([by_monitor[plane == p].sum(axis=0) for p in (0, 1)], axis=1)
     by_column = (there.by_column * weighted).sum(axis=1)
     return np.concatenate([alone.ravel(), by_column, *(r.times(weighted) for r in there.ring)])
-
-
-def rf_fitted(state: State) -> tuple[Indices, Array, Array]:
-    """Return the BPMs at which the RF's orbit is fitted, the inverse covariance of these readings,
-    1/m2, and their residuals, m."""
-    column = len(state.data.plane) - 1
-    own = weight(state, 0)[column]
-    read = np.flatnonzero(own > 0)
-    weights = np.diag(own[read])
-    shared = taken(state, 0)
-    if shared is not None:
-        weights -= shared[column, read] @ shared[column, read].T
-    return read, weights, state.data.pick(state.at.left)[column, read]

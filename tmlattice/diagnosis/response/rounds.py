@@ -195,11 +195,8 @@ def settle(
     return replace(best, kept=state.kept)
 
 
-def linear_evidence(
-    there: Linear, gone: Collection[str] = (), rounds: int = LEARN
-) -> tuple[float, dict[str, Array], Posterior | None]:
-    """Return the log evidence of one block, linearised at the fit, up to a constant; the most
-    probable values; and the solution, if anything is fitted.
+def linear_evidence(there: Linear, gone: Collection[str] = (), rounds: int = LEARN) -> float:
+    """Return the log evidence of one block, linearised at the fit, up to a constant.
 
     Args:
         there: `linear` of the fit.
@@ -208,17 +205,16 @@ def linear_evidence(
     """
     left = [group for group in there.groups if group.name not in gone]
     found = solve(there.normal, left, there.start, rounds=rounds) if left else None
-    nothing = np.zeros_like(there.start)
-    moved = (nothing if found is None else found.values) - there.start
+    moved = (0 * there.start if found is None else found.values) - there.start
     total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
     if found is None:
-        return total, {name: nothing[rows] for name, rows in there.where.items()}, None
+        return total
     total += found.occam
     for rows in there.where.values():
         groups = [g for g in found.groups if g.basis[rows].any()]
         if groups:
             total -= 0.5 * _penalty(groups, rows, found.values[rows])
-    return total, {name: found.values[rows] for name, rows in there.where.items()}, found
+    return total
 
 
 def evidence_of(state: State, good: Flags, shares: Array | None = None) -> float:
@@ -235,5 +231,5 @@ def evidence_of(state: State, good: Flags, shares: Array | None = None) -> float
         state = replace(look(state, block), good=good, independent=shares)
         total += 0.5 * (log_scale(state, block) - _misfit(state, state, block))
         if state.of_block(block):
-            total += linear_evidence(linear(state, block))[0]
+            total += linear_evidence(linear(state, block))
     return total
