@@ -588,7 +588,7 @@ DEFECTS = (
     ),
     defect("the beam moves in y", moved(1, 20), "beam jitter between", fewer=None),
     defect("the beam moves little in x", moved(0, 5), "beam jitter between", fewer=None),
-    defect("the energy drifts", drifting),
+    defect("the energy drifts", drifting, "changes of the beam's energy"),
     *(
         defect(
             f"exchanged correctors {a}, {b}",

@@ -65,8 +65,8 @@ class _OfBeam(Family):
 
 class EnergyOffset(_OfBeam):
     """The beam's energy relative to that of the magnets' settings, by an RF frequency that does not
-    match the circumference. Gradients, kicks and orbits in sextupoles together do nearly the same:
-    while these are far from the ring, it would follow their errors."""
+    match the circumference. It is nearly degenerate with gradients, kicks and orbits in sextupoles
+    together, and would be biased by them while they are far from the ring."""
 
     name, effects = "energy_offset", ("energy_offset",)
     variable, trust, late = "energy", 1e-3, True
@@ -307,8 +307,7 @@ class CorrectorRoll(_Columns):
 
 
 Trial = tuple[Family, ...]
-"""Families that are tried together; the block of the first one determines which readings validate
-them."""
+"""Families that are tried together; the block of the first one determines by which readings."""
 
 STEPS: tuple[Trial, ...] = (
     (CorrectorCalibration(), FamilyGradient()), (MonitorGain(),), (QuadrupoleGradient(),),
@@ -317,8 +316,7 @@ STEPS: tuple[Trial, ...] = (
     (HorizontalOrbit(),), (VerticalOrbit(),), (HorizontalKicks(),), (EnergyOffset(),),
     (VerticalKicks(),),
 )  # fmt: skip
-"""The trials. The first ones determine the optics. Implausible ones are rejected last first: the
-energy offset before the kicks, because both change the dispersion."""
+"""The trials. The first ones determine the optics. Implausible ones are rejected last first."""
 
 CHANGES: tuple[Trial, ...] = (
     (CorrectorCalibration(),), (MonitorGain(),),

@@ -64,8 +64,7 @@ class Guess(NamedTuple):
 
 def elsewhere(data: ResponseData) -> Guess | None:
     """Return the first guess by all readings."""
-    none, all_of_them = (np.full(data.shape, own) for own in (False, True))
-    split = Split(held=none[:, 0], half=all_of_them)
+    split = Split(held=np.zeros(len(data.orbits), dtype=bool), half=np.ones(data.shape, dtype=bool))
     return first_guess(begin(data, split))
 
 

@@ -138,7 +138,11 @@ def fit_families(
     state = rough_fit(begun(design, trials), [own for own in trials if own not in late], progress)
     single, labels = _outliers(state)
     progress("all families without outliers")
-    state, notes = _together(without_readings(state, single | rejected(state, labels)), trials)
+    state = without_readings(state, single | rejected(state, labels))
+    state, notes = _plausible(
+        replace(state, independent=np.ones((2, 2))), trials,
+        lambda start: taken_back(settle(bend(jump(start)))),
+    )  # fmt: skip
     log.info("effective sample size per reading: %s", state.independent)
     more, later = _outliers(state)  # typical residuals are smaller now
     single, labels = single | more, [*labels, *later]
@@ -147,19 +151,16 @@ def fit_families(
     notes = [*told_gross(data, single, "the fit"), *label_messages(labels), *notes]
     state, moving = _with_jitter(state, progress)
     before = score(design, "design")
-    state = allow(state, [family for own in late for family in own])
+    state, doubts = _plausible(allow(state, [f for own in late for f in own]), trials, settle)
+    notes += doubts
     gone, evidence = _unneeded(state, trials, most, progress)
     progress("result")
     try:
-        state = settle(replace(bend(_without(state, gone)), robust=True))
+        state, doubts = _plausible(_without(state, gone), trials, _result)
     except UnstableRingError:  # no beam is stored without them
-        gone, state = [], settle(replace(bend(state), robust=True))
-    state = taken_back(state)
-    kept = [own for own in trials if own not in gone]
-    for trial in [own for own in kept if _doubts(state, own)]:  # it has moved since
-        notes += _doubts(state, trial)
-        state = settle(_without(state, [trial]), FIRST, ROUGH)
-        kept.remove(trial)
+        state, doubts = _plausible(state, trials, _result)
+    notes += doubts
+    kept = [own for own in trials if any(state.allows(family.name) for family in own)]
     then = replace(design, good=state.good)
     if not strange(state) <= max(ASTRAY * strange(then), NEAR):  # in one plane, often
         diverged = (
@@ -291,18 +292,24 @@ def reversed_decisions(
     return replace(fit, decisions={**fit.decisions, **scored})
 
 
-def _together(state: State, trials: Iterable[Trial]) -> tuple[State, list[str]]:
-    """The state with all families fitted, except implausible ones, which would bias others, and
-    messages about these. They are removed one by one, the last first: one may bias another."""
-    state = replace(state, independent=np.ones((2, 2)))
+def _plausible(
+    state: State, trials: Iterable[Trial], fitted: Callable[[State], State]
+) -> tuple[State, list[str]]:
+    """The fitted state without implausible families, which would bias others, and messages about
+    these. They are removed one by one, the last first: one may bias another."""
     doubts: list[str] = []
     while True:
-        settled = taken_back(settle(bend(jump(state))))
+        settled = fitted(state)
         doubted = [trial for trial in trials if _doubts(settled, trial)]
         if not doubted:
             return settled, doubts
         doubts += _doubts(settled, doubted[-1])
         state = forbid(state, doubted[-1])
+
+
+def _result(state: State) -> State:
+    """The last fit, in which outliers have less weight."""
+    return taken_back(settle(replace(bend(state), robust=True)))
 
 
 def taken_back(state: State) -> State:
@@ -383,7 +390,7 @@ def _moved_without(state: State, block: int, there: Linear, names: Collection[st
 
 def _without(state: State, trials: Sequence[Trial]) -> State:
     """The state without the families of some trials, after one step of the others with the
-    derivatives here; unchanged if no beam is stored without them."""
+    derivatives here; the others unchanged if no beam is stored there."""
     families = [f for own in trials for f in own if state.allows(f.name)]
     moved = state
     for block in sorted({family.block for family in families}):

@@ -68,7 +68,7 @@ class Jitter:
         )
         return (
             f"beam jitter between the readings of a step, common to all BPMs: {sizes}; its "
-            "amplitude in each step is integrated out (the source is known up to the phase of the "
+            "amplitude in each step is integrated out (a kick is known up to the phase of the "
             "betatron oscillation)"
         )
 
@@ -112,7 +112,8 @@ def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
     layers = np.arange(len(model.maps.layers))
     kicked = orbits_of_kicks(model, layers, exits, rows, plane).T
     kicked *= at.errors.monitors[:, plane, plane]
-    orbits = np.concatenate([kicked, at.read[-1:, :, plane]])
+    rf = at.read[-1:, :, plane] * (plane == 0)  # in y the BPMs' rolls read it
+    orbits = np.concatenate([kicked, rf])
     orbits *= np.median(_rms(without)) / np.maximum(_rms(orbits), TINY)
     least = (NOISE_LEFT * data.noise_of(1)[read]) ** 2
     count = 1.0  # jitter itself would reduce the effective sample size

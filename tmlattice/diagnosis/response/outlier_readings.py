@@ -165,12 +165,13 @@ def _odd_rf(state: State) -> list[str]:
     pulls = []
     for block in (0, 1):
         left = np.where(state.good, state.data.pick(state.at.left, block), np.nan)
-        pulls.append(_pulls(state, block, left)[-1])
-    odd = np.flatnonzero((np.nan_to_num(np.abs(pulls)) > SIGNIFICANT).any(axis=0))
+        if np.isfinite(left[-1]).sum() >= FEW:
+            pulls.append(np.nan_to_num(np.abs(_pulls(state, block, left)[-1])))
+    odd = np.flatnonzero(np.any(np.array(pulls) > SIGNIFICANT, axis=0))
     if not len(odd):
         return []
     names = first_of([state.data.measured.monitors[i] for i in odd])
     return [
         f"outlier readings of the RF's orbit, by more than {SIGNIFICANT:g} times its typical "
-        f"residual, with almost no weight: {names}."
+        f"residual, with reduced weights where they are fitted: {names}."
     ]

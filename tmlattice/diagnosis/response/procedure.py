@@ -2,8 +2,8 @@
 
 One fifth of the correctors is never fitted. For each of them the kick is estimated from a random
 half of the BPMs, and the prediction is scored on the other half. The RF's orbit is fitted at half
-of the BPMs and scored at the other half. Families are selected on other held-out correctors, so
-that the reported scores select nothing.
+of the BPMs and scored at the other half. Families are selected by the marginal likelihood of the
+fitted readings.
 
 >>> result = diagnose_response(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]

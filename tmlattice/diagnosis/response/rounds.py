@@ -140,8 +140,8 @@ def settle(
     each number. A step that increases the cost of its own block is repeated with smaller bounds. It
     may increase the cost of the other block, which its derivatives omit, because the next step may
     compensate. Weights and bad BPMs are updated at a new lowest cost only, so that costs in between
-    are comparable. The fit ends when a step of each block was no progress, two where they increased
-    the cost.
+    are comparable. The fit ends when a step of each block was no progress, or two of each while the
+    cost is above its lowest value.
 
     Args:
         state: the start.
@@ -195,16 +195,15 @@ def settle(
     return replace(best, kept=state.kept)
 
 
-def linear_evidence(there: Linear, gone: Collection[str] = (), rounds: int = LEARN) -> float:
+def linear_evidence(there: Linear, gone: Collection[str] = ()) -> float:
     """Return the log evidence of one block, linearised at the fit, up to a constant.
 
     Args:
         there: `linear` of the fit.
         gone: names of priors that are omitted.
-        rounds: iterations of EM for the prior scales.
     """
     left = [group for group in there.groups if group.name not in gone]
-    found = solve(there.normal, left, there.start, rounds=rounds) if left else None
+    found = solve(there.normal, left, there.start, rounds=LEARN) if left else None
     moved = (0 * there.start if found is None else found.values) - there.start
     total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
     if found is None:

@@ -272,25 +272,17 @@ def rms_of(values: Array) -> float:
     return rms(values[np.isfinite(values)])
 
 
-def amplitudes(
-    patterns: Array, data: Array, near: Flags, held: Array | None = None
-) -> tuple[Array, Array]:
+def amplitudes(patterns: Array, data: Array, near: Flags) -> tuple[Array, Array]:
     """Return the amplitudes of patterns by near readings, [pattern, ...], and the residuals of all.
 
     Args:
         patterns, data: m, [..., monitor, pattern] and [..., monitor].
         near: [..., monitor].
-        held: ratio of a reading's noise to the prior rms of each amplitude, [..., pattern]; 0: no
-            prior.
     """
     rows, right = np.where(near[..., None], patterns, 0.0), np.where(near, data, 0.0)
     size = np.abs(rows).max(axis=-2)
     size[size == 0] = 1
     rows = rows / size[..., None, :]
-    if held is not None:
-        prior = np.eye(size.shape[-1]) * (held / size)[..., None]
-        rows = np.concatenate([rows, prior], axis=-2)
-        right = np.concatenate([right, np.zeros(size.shape)], axis=-1)
     rounded = np.finfo(float).eps * max(rows.shape[-2:])
     amounts = (np.linalg.pinv(rows, rcond=rounded) @ right[..., None])[..., 0] / size
     return np.moveaxis(amounts, -1, 0), data - (patterns @ amounts[..., None])[..., 0]

@@ -1,8 +1,7 @@
 """The validation of a hierarchical fit of an orbit response, and the size of its residual.
 
 For each held-out corrector the kick is estimated from half of the BPMs, and the prediction is
-scored on the other half. The outer validation set (`score`) selects nothing. The inner one
-(`inner`) selects families, with standard errors, because it may have only four correctors.
+scored on the other half (`score`). No family of errors is selected by these scores.
 
 In the `remainder` fitted readings are compared with their noise; fitted numbers reduce the degrees
 of freedom. Held-out readings are compared with the posterior predictive covariance (Gelman et al.,
