@@ -588,7 +588,12 @@ DEFECTS = (
     ),
     defect("the beam moves in y", moved(1, 20), "beam jitter between", fewer=None),
     defect("the beam moves little in x", moved(0, 5), "beam jitter between", fewer=None),
-    defect("the energy drifts", drifting, "changes of the beam's energy"),
+    defect(
+        "the energy drifts",
+        drifting,
+        "changes of the beam's energy",
+        fewer=(*FITTED, "monitor_roll", "corrector_roll"),
+    ),
     *(
         defect(
             f"exchanged correctors {a}, {b}",
