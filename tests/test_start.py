@@ -37,12 +37,14 @@ def kept(tmp_path, monkeypatch):
     return path
 
 
+HEAVY = (
+    "heavy = {'ocelot', 'torch', 'scipy.stats', 'pandas', 'matplotlib', 'at'}\n"
+    "print('loaded:', *sorted(heavy & set(sys.modules)))\n"
+)
 LOADED = (
     "import sys\n"
     "from tmlattice.cli.command import tmlattice\n"
-    "tmlattice(sys.argv[1:], standalone_mode=False)\n"
-    "heavy = {'ocelot', 'torch', 'scipy.stats', 'pandas', 'matplotlib', 'at'}\n"
-    "print('loaded:', *sorted(heavy & set(sys.modules)))\n"
+    f"tmlattice(sys.argv[1:], standalone_mode=False)\n{HEAVY}"
 )
 
 
@@ -56,6 +58,11 @@ def test_a_second_info_loads_neither_ocelot_nor_torch_and_says_the_same(tmp_path
     assert cold == warm
     assert said_cold == said_warm
     assert loaded.split() == []
+
+
+def test_the_diagnosis_of_a_response_is_loaded_without_what_it_does_not_need(tmp_path):
+    code = f"import sys, tmlattice.diagnosis.response.procedure\n{HEAVY}"
+    assert python(code, tmp_path).split() == ["loaded:"]
 
 
 def test_ocelot_is_whole_for_a_user_who_imports_it_after_the_package(tmp_path):

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2 as chi_square
 
 from tmlattice.arrays import Array
 from tmlattice.beam.model import Model
 from tmlattice.effects import Cause, apply
 from tmlattice.errors import BeamLostError, TmlatticeError, UnstableRingError
 from tmlattice.fitting.adam import FitResult
+from tmlattice.inference import chi2
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
 from tmlattice.inference.priors import AmountPrior, Student
@@ -186,7 +186,7 @@ def warn_of_launches(found: Explanation) -> None:
     readings, numbers = int(data.valid.sum()), int(stated.sum())
     gain = found.fit.chi2 - free.chi2
     explained = free.chi2 <= readings + MAX_MISFIT * np.sqrt(2 * readings)
-    if not explained or gain <= chi_square.isf(1 / FALSE_ALARM_ODDS, numbers):
+    if not explained or gain <= chi2.isf(1 / FALSE_ALARM_ODDS, numbers):
         return
     off = np.abs(free.nuisances - data.launches)[:, :4]
     x, y = 1e6 * off[:, [0, 2]].max(axis=0)

@@ -16,7 +16,6 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
@@ -208,6 +207,8 @@ def names_of_others(
         names: of them.
         read, made: as read and as the design makes it, NaN where missing.
     """
+    from scipy.optimize import linear_sum_assignment  # takes a fifth of a second
+
     for planes, where in (([0, 1], ""), ([0], " in x"), ([1], " in y")):
         a, b = (np.nan_to_num(v[..., planes].reshape(len(v), -1)) for v in (read, made))
         there = np.isfinite(read[..., planes]).reshape(a.shape)

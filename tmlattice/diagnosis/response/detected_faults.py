@@ -23,8 +23,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtr
 
 from tmlattice.arrays import REDUNDANT, Array
 from tmlattice.diagnosis.assessment import MISSING
@@ -557,7 +556,7 @@ class _Search:
         if one.variable in OTHERS:
             members = min((len(state.values[f.variable]) for f in state.of_block(one.block or 0)
                            if isinstance(f, OrbitFamily)), default=MEMBERS)  # fmt: skip
-        own = 2 * float(student.sf(np.sqrt(max(statistic, 0.0)), max(members - 1, 1)))
+        own = 2 * float(stdtr(max(members - 1, 1), -np.sqrt(max(statistic, 0.0))))
         return min(1.0, own * len(self.hypotheses))
 
     def clear(self, seen: Seen, one: Candidate) -> bool:
