@@ -262,7 +262,7 @@ class CaseDraw:
         self.seed = int(random.integers(2**31))
         self.amplitude = float(random.uniform(*AMPLITUDE))
         self.noise = float(np.exp(random.uniform(*np.log(NOISE))))
-        correctors = [e.name for e in self.ring.elements if e.kind in ("hcorrector", "vcorrector")]
+        correctors = [e.name for e in self.ring.elements if e.is_corrector]
         size = min(SET_CORRECTORS, len(correctors))
         self.set = [str(c) for c in random.choice(correctors, size, replace=False)]
         self.shots = self._draw_shots(asked.shots + HELD_OUT, self.seed)

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from tmlattice.arrays import Array
 from tmlattice.challenge.case import Case, Truth, ring_of
 from tmlattice.challenge.kinds import CHANGES, problem_of_case
-from tmlattice.effects import Cause, find, modelled
+from tmlattice.effects import Cause, Hypothesis, find, modelled
 from tmlattice.inference.alternatives import best_start
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import Fit, fit, fit_nuisances
-from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.problem import Problem
 from tmlattice.inference.scan import Scan, scan
 
 CLASS = 9.0

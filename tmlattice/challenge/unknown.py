@@ -59,7 +59,7 @@ class Unknown:
         if kind in ("hysteresis", "octupole"):
             places = [e for e in ring.elements if e.kind == "quadrupole" and e.k1 != 0]
         elif kind == "kick_jitter":
-            places = [e for e in ring.elements if e.kind in ("hcorrector", "vcorrector")]
+            places = [e for e in ring.elements if e.is_corrector]
         else:
             places = ring.monitors[:-1] if kind == "exchanged_cables" else ring.monitors
         self.element = places[int(random.integers(len(places)))]

@@ -15,11 +15,10 @@ from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis import Diagnosis
 from tmlattice.diagnosis.twin import knowledge_file, known_of, read_known
-from tmlattice.effects import Cause, apply, changes_beam
+from tmlattice.effects import Cause, Hypothesis, apply, changes_beam
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors
 from tmlattice.inference.newton import STEP_SHARES
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.observe.calibration import Dispersion, offset_of, read_calibration
 

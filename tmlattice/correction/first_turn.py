@@ -25,9 +25,8 @@ from tmlattice.beam.readouts import APERTURE
 from tmlattice.correction.estimate import Estimate
 from tmlattice.correction.knobs import KINDS
 from tmlattice.correction.targets import TARGETS, THREADING, Weighted
-from tmlattice.effects import Cause, apply, background_rms, find
+from tmlattice.effects import Cause, Hypothesis, apply, background_rms, find
 from tmlattice.inference.distributed import DistributedErrors, families_of, posterior
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.variance_components import prior_covariance
 from tmlattice.lattice import Element, Ring
 from tmlattice.measurement import Measurement

@@ -231,7 +231,7 @@ def default_knobs(ring: Ring, kinds: Iterable[str] | None = None) -> list[Knob]:
         ],
         "correctors": lambda: [
             _knob(e.name, e.kind, (e.name,), e.angle)
-            for e in ring.elements if e.kind in ("hcorrector", "vcorrector")
+            for e in ring.elements if e.is_corrector
         ],
         "sextupoles": lambda: _grouped(
             ring, "sextupole", {e.name: e.family for e in ring.elements if e.kind == "sextupole"}

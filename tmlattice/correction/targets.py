@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from tmlattice.arrays import Array, Indices, rms
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.stored import Moved, StoredBeam
+from tmlattice.effects import Hypothesis
 from tmlattice.errors import TmlatticeError, unknown_choice
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.optics import short_way
 

@@ -13,11 +13,10 @@ from tmlattice.diagnosis.recommended_actions import credible as credible_actions
 from tmlattice.diagnosis.recommended_actions import fewest, recommended_action, recommended_actions
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.result import VERDICTS, Finding, Member, faults_of
-from tmlattice.effects import CATALOGUE, Cause, RingEffect, find
+from tmlattice.effects import CATALOGUE, Cause, Hypothesis, RingEffect, find
 from tmlattice.inference.alternatives import Alternative, Detection
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import ITERATIONS, Outcome, fit
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import FreeScan, Scan, look_elsewhere
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Element, Ring

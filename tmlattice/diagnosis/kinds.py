@@ -16,10 +16,11 @@ from tmlattice.beam.rf import rf_of
 from tmlattice.beam.stored import StoredBeam
 from tmlattice.diagnosis.data_checks import corrected_data, data_checks, raise_if_wrong
 from tmlattice.diagnosis.prepare import batch, noise_of, prepare
+from tmlattice.effects import Hypothesis
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.judgement import Judgement
-from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.problem import Problem
 from tmlattice.lattice import Ring
 from tmlattice.measurement import (
     AnyMeasurement,
@@ -324,7 +325,7 @@ class Kind:
 
     def minutes(self, ring: Ring) -> float:
         """Machine time of one measurement."""
-        correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in ring.elements)
+        correctors = sum(e.is_corrector for e in ring.elements)
         return self.per_measurement + self.per_corrector * correctors
 
 

@@ -11,11 +11,18 @@ import numpy as np
 from tmlattice.arrays import AT_ONCE, Array, Flags, rms
 from tmlattice.beam.model import Model
 from tmlattice.diagnosis import signals
-from tmlattice.effects import LaunchEffect, expected_radiation, find, modelled, names, rare
+from tmlattice.effects import (
+    Hypothesis,
+    LaunchEffect,
+    expected_radiation,
+    find,
+    modelled,
+    names,
+    rare,
+)
 from tmlattice.errors import BeamLostError, EffectError, MeasurementError, first_of
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import ITERATIONS, Fit, fit
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.measurement.assume import in_beam_order

@@ -44,6 +44,7 @@ from tmlattice.diagnosis.views import JointView, TrajectoryView
 from tmlattice.effects import (
     Cause,
     Effect,
+    Hypothesis,
     LaunchEffect,
     apply,
     background_rms,
@@ -56,7 +57,6 @@ from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import DistributedErrors, FittedErrors
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.newton import Outcome
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import NO_SCAN
 from tmlattice.inference.search import Explanation, Search
 from tmlattice.inference.validation import Misfit

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.effects import Cause, LaunchEffect, find
+from tmlattice.effects import Cause, Hypothesis, LaunchEffect, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.distributed import (
@@ -26,7 +26,7 @@ from tmlattice.inference.distributed import (
 )
 from tmlattice.inference.judgement import Judgement
 from tmlattice.inference.newton import Fit, fit
-from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.problem import Problem
 from tmlattice.inference.search import Explanation, Search, explain, revised
 
 STEPS = 4

@@ -13,13 +13,13 @@ from tmlattice.diagnosis.kinds import Part
 from tmlattice.diagnosis.prepare import same_monitors
 from tmlattice.diagnosis.result import Finding
 from tmlattice.diagnosis.views import PartView, numbers_read
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause, Hypothesis, find
 from tmlattice.errors import MeasurementError
 from tmlattice.inference.combined import CombinedProblem
 from tmlattice.inference.distributed import DistributedProblem, FittedErrors, slopes_of
 from tmlattice.inference.judgement import SIGNIFICANT
 from tmlattice.inference.newton import STEP_SHARES, Fit, fit_nuisances
-from tmlattice.inference.problem import Hypothesis, Point, Problem
+from tmlattice.inference.problem import Point, Problem
 from tmlattice.inference.search import Explanation
 from tmlattice.inference.validation import Gap, Misfit, held_out_gap
 from tmlattice.inference.whitening import Blocks

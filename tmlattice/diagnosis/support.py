@@ -11,9 +11,8 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.records import of
-from tmlattice.effects import find
+from tmlattice.effects import Hypothesis, find
 from tmlattice.inference.judgement import ENOUGH
-from tmlattice.inference.problem import Hypothesis
 
 SHOWN = 3
 """Alternatives, suspects of a kind, and elements of a message that are named."""

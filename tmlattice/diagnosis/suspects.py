@@ -18,10 +18,9 @@ from tmlattice.arrays import TINY
 from tmlattice.diagnosis.places import between
 from tmlattice.diagnosis.records import OPTIONAL, of
 from tmlattice.diagnosis.support import SHOWN
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, Hypothesis
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import ENOUGH, SIGNIFICANT, Judgement
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.search import Explanation
 from tmlattice.lattice import Element, Ring
 
@@ -100,7 +99,7 @@ def suspects(ring: Ring, explanation: Explanation, judgement: Judgement) -> tupl
 def _kind(element: Element) -> SuspectKind:
     if element.kind == "monitor":
         return "monitor"
-    return "corrector" if element.kind in ("hcorrector", "vcorrector") else "magnet"
+    return "corrector" if element.is_corrector else "magnet"
 
 
 def outliers(

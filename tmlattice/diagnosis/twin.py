@@ -17,11 +17,10 @@ import numpy as np
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.result import Diagnosis
 from tmlattice.diagnosis.views import JointView, ResponseView, TrajectoryView
-from tmlattice.effects import Cause, LaunchEffect, RingEffect, background_rms, find
+from tmlattice.effects import Cause, Hypothesis, LaunchEffect, RingEffect, background_rms, find
 from tmlattice.errors import MeasurementError, UnstableRingError
 from tmlattice.inference.distributed import DistributedErrors, DistributedProblem, posterior
 from tmlattice.inference.errors import KNOWN_MEMBERS
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement.documents import read_document
 from tmlattice.observe.orbit_response import Errors, Predicted

@@ -13,7 +13,7 @@ class _OnCorrector(RingEffect):
 
     def sits_on(self, element: Element) -> bool:
         """Whether an element is a corrector."""
-        return element.kind in ("hcorrector", "vcorrector")
+        return element.is_corrector
 
 
 class _Kick(_OnCorrector):

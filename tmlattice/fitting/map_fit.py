@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
 from tmlattice.arrays import Array
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, Hypothesis
 from tmlattice.errors import UnstableRingError, choice
 from tmlattice.fitting.adam import FitResult
 from tmlattice.fitting.sparse import FAULT, first_turns, fitted, searched, warn_of_launches
 from tmlattice.inference.distributed import components_of_rows
 from tmlattice.inference.newton import fit_nuisances
-from tmlattice.inference.problem import Hypothesis, Point
+from tmlattice.inference.problem import Point
 from tmlattice.lattice import Ring
 from tmlattice.measurement import Measurement
 from tmlattice.network import TaylorNetwork

@@ -63,7 +63,7 @@ def write_example(folder: Path, lattice: str, ring: Ring, measurement: Measureme
                 file[plane] = readings[:, :, i]
                 file[plane].attrs["unit"] = "mm"
         # one corrector in each plane where there are any
-        found = {e.kind: e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")}
+        found = {e.kind: e.name for e in ring.elements if e.is_corrector}
         columns, response = calibrated_response(ring, [], list(found.values()) or None)
         every = [monitor.name for monitor in ring.monitors]
         _write(

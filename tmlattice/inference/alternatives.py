@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tmlattice.arrays import Array
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause, Hypothesis, find
 from tmlattice.inference import chi2
 from tmlattice.inference.common_factors import MIN_CHI2
 from tmlattice.inference.judgement import BEYOND
 from tmlattice.inference.newton import Fit, Outcome, fit, fit_nuisances
-from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.problem import Problem
 from tmlattice.inference.scan import Scan
 
 MIN_FALL = 1.0

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmlattice.arrays import Array, Flags, Indices
-from tmlattice.effects import Cause
+from tmlattice.effects import Cause, Hypothesis
 from tmlattice.inference.problem import (
     NO_KICKS,
-    Hypothesis,
     Kicks,
     Metric,
     Point,

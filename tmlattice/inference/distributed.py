@@ -21,10 +21,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh
 
 from tmlattice.arrays import AT_ONCE, TINY, Array, Flags, Indices
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause, Hypothesis, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.newton import ROUNDS, STEP_SHARES, Fit, fit, fit_nuisances
-from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Metric, Point, Problem
+from tmlattice.inference.problem import NO_KICKS, Kicks, Metric, Point, Problem
 from tmlattice.inference.variance_components import VarianceComponents, fit_variance_components
 from tmlattice.inference.whitening import Projection, Root, inverse_root
 

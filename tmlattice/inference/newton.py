@@ -11,8 +11,8 @@ from enum import StrEnum
 import numpy as np
 
 from tmlattice.arrays import TINY, Array
-from tmlattice.effects import Cause, find
-from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
+from tmlattice.effects import Cause, Hypothesis, find
+from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.scan import free_scan
 from tmlattice.inference.whitening import Projection
 

@@ -16,13 +16,10 @@ from typing import Any, Self
 import numpy as np
 
 from tmlattice.arrays import AT_ONCE, Array, Flags, Indices
-from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
+from tmlattice.effects import Cause, Hypothesis, ReadingEffect, RingEffect, find
 from tmlattice.inference.judgement import DEFAULT, Judgement
 from tmlattice.inference.priors import LOG_UNIFORM, AmountPrior
 from tmlattice.inference.whitening import Projection, Root
-
-Hypothesis = tuple[str, str | None]
-"""An effect and its place."""
 
 
 def effects_on_ring(hypotheses: Sequence[Hypothesis]) -> Indices:

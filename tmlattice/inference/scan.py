@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from tmlattice.arrays import INVISIBLE, TINY, Array, Indices
-from tmlattice.effects import find
+from tmlattice.effects import Hypothesis, find
 from tmlattice.inference import chi2
-from tmlattice.inference.problem import Hypothesis, Metric
+from tmlattice.inference.problem import Metric
 
 DRAWS = 64
 """Simulations of pure noise for the threshold: the effective number is known to 12 %."""

@@ -16,10 +16,11 @@ from typing import TypeVar
 import numpy as np
 
 from tmlattice.arrays import Flags
+from tmlattice.effects import Hypothesis
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Alternative, Detection, alternatives, linear_evidence
 from tmlattice.inference.newton import AGAIN, Fit, Outcome, fit
-from tmlattice.inference.problem import Hypothesis, Metric, Point, Problem
+from tmlattice.inference.problem import Metric, Point, Problem
 from tmlattice.inference.scan import (
     NO_SCAN,
     FreeScan,

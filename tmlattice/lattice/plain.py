@@ -173,7 +173,7 @@ def _plain(element: Element, held: Collection[str]) -> tuple[Element, list[str]]
     }
     lacks = []
     bare = replace(element, errors=NO_ERRORS, source=element.data or element.source)
-    if element.kind in ("hcorrector", "vcorrector"):
+    if element.is_corrector:
         bare = _corrector(bare, errors)
         for name in ("kick_x", "kick_y", "roll"):
             left.pop(name, None)

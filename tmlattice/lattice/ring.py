@@ -159,6 +159,11 @@ class Element:
         return self.kind not in PASSIVE
 
     @property
+    def is_corrector(self) -> bool:
+        """Whether it kicks the beam, in either plane."""
+        return self.kind in ("hcorrector", "vcorrector")
+
+    @property
     def bending(self) -> float:
         """The angle by which the design orbit turns here, rad; a corrector's kick is no such."""
         return self.angle if self.kind in ("bend", "multipole") else 0.0
@@ -259,7 +264,7 @@ class Ring(Speaks):
     twiss = Method("tmlattice.optics", "twiss", "Return its optical functions: a `Twiss`.")
 
     def _told(self) -> tuple[str, dict[str, str]]:
-        correctors = sum(e.kind in ("hcorrector", "vcorrector") for e in self.elements)
+        correctors = sum(e.is_corrector for e in self.elements)
         return last_part(self.name), {
             "length": f"{self.length:.3f} m",
             "energy": f"{self.energy:g} GeV",

@@ -211,7 +211,7 @@ def curvatures(ring: Ring, stated: Stated) -> list[float]:
 
 def _kicks(element: Element) -> bool:
     """Whether an element may bend the orbit off the design's."""
-    corrector = element.kind in ("hcorrector", "vcorrector") and element.angle != 0
+    corrector = element.is_corrector and element.angle != 0
     own = element.source
     dipole = any(getattr(own, k, 0.0) for k in ("k0", "k0s"))
     return corrector or dipole or element.errors != NO_ERRORS

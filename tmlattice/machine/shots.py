@@ -123,7 +123,7 @@ def _draw_settings(
 ) -> tuple[Settings, ...]:
     own = [{k: dict(v) for k, v in one.items()} for one in each_setting(given, shots)]
     if kicks:
-        correctors = [e.name for e in ring.elements if e.kind in ("hcorrector", "vcorrector")]
+        correctors = [e.name for e in ring.elements if e.is_corrector]
         drawn = kicks * stream(seed, "kicks").standard_normal((shots, len(correctors)))
         for setting, row in zip(own, drawn.tolist(), strict=True):
             for name, kick in zip(correctors, row, strict=True):

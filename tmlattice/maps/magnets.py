@@ -257,7 +257,7 @@ def _both_at_rest(one: Element, other: Element) -> bool:
     """Whether two elements are one corrector at zero setting differing in position or roll alone.
     A fit of a response changes these for all correctors, and no map."""
     return (
-        one.kind in ("hcorrector", "vcorrector")
+        one.is_corrector
         and one.angle == other.angle == 0
         and (one.data or one.source) is (other.data or other.source)
         and all(e == Errors(ds=e.ds, roll=e.roll) for e in (one.errors, other.errors))

@@ -15,10 +15,10 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model
-from tmlattice.effects import Cause, ReadingEffect, RingEffect, find
+from tmlattice.effects import Cause, Hypothesis, ReadingEffect, RingEffect, find
 from tmlattice.inference.judgement import ENOUGH
 from tmlattice.inference.newton import ITERATIONS, fit
-from tmlattice.inference.problem import NO_KICKS, Hypothesis, Kicks, Point, Problem
+from tmlattice.inference.problem import NO_KICKS, Kicks, Point, Problem
 from tmlattice.inference.validation import Half, HeldOut, cross_predicted
 from tmlattice.inference.whitening import Projection, Root
 from tmlattice.observe.data import EXACT, Data, Whitening, each_shot

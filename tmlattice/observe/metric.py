@@ -14,7 +14,8 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags, Indices
 from tmlattice.beam.model import Model, Paths
-from tmlattice.inference.problem import Hypothesis, Metric, Products, effects_on_readings
+from tmlattice.effects import Hypothesis
+from tmlattice.inference.problem import Metric, Products, effects_on_readings
 from tmlattice.inference.whitening import Projection
 from tmlattice.observe.data import Whitening, each_shot
 

@@ -26,10 +26,17 @@ from tmlattice.arrays import Array, Flags
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.beam.kicks import by_energy
 from tmlattice.beam.response_derivatives import ResponseSlopes
-from tmlattice.effects import Cause, ReadingEffect, RingEffect, apply, find, monitors_with
+from tmlattice.effects import (
+    Cause,
+    Hypothesis,
+    ReadingEffect,
+    RingEffect,
+    apply,
+    find,
+    monitors_with,
+)
 from tmlattice.errors import EffectError, MeasurementError, UnstableRingError
 from tmlattice.inference.judgement import FEW
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Ring
 from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.response_data import ResponseData

@@ -23,10 +23,17 @@ from numpy.typing import NDArray
 from tmlattice.arrays import AT_ONCE, Array, Indices
 from tmlattice.beam.response_derivatives import Factors, ResponseSlopes
 from tmlattice.compiled import jit_sums
-from tmlattice.effects import Cause, LaunchEffect, ReadingEffect, RingEffect, find, modelled
+from tmlattice.effects import (
+    Cause,
+    Hypothesis,
+    LaunchEffect,
+    ReadingEffect,
+    RingEffect,
+    find,
+    modelled,
+)
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.problem import (
-    Hypothesis,
     Metric,
     Point,
     Products,

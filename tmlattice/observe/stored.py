@@ -23,6 +23,7 @@ from tmlattice.beam.rf import NO_RF, Cavities, cavities, rf_of
 from tmlattice.beam.stored import Moved, StoredBeam
 from tmlattice.effects import (
     Cause,
+    Hypothesis,
     LaunchEffect,
     Monitors,
     ReadingEffect,
@@ -36,7 +37,6 @@ from tmlattice.effects.effect import MIN_STRENGTH
 from tmlattice.errors import LatticeError, UnstableRingError
 from tmlattice.inference.problem import (
     NO_KICKS,
-    Hypothesis,
     Kicks,
     Metric,
     Point,

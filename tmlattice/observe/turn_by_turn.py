@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 from tmlattice.arrays import TINY, Array, ComplexArray, Flags, Indices
 from tmlattice.beam.readouts import positions
 from tmlattice.beam.stored import Moved, StoredBeam
-from tmlattice.effects import find
+from tmlattice.effects import Hypothesis, find
 from tmlattice.errors import MeasurementError, first_of
-from tmlattice.inference.problem import Hypothesis, Metric, Point, Products, effects_on_ring
+from tmlattice.inference.problem import Metric, Point, Products, effects_on_ring
 from tmlattice.lattice import Ring
 from tmlattice.measurement import TurnByTurn
 from tmlattice.observe.spectra import Lines, lines

@@ -51,7 +51,7 @@ def groups(diagnosis: Diagnosis) -> dict[str, list[int]]:
     """The elements that are drawn, by kind: their places in the ring's order."""
     drawn: dict[str, list[int]] = {}
     for i, element in enumerate(diagnosis.ring.elements):
-        kind = "corrector" if element.kind in ("hcorrector", "vcorrector") else element.kind
+        kind = "corrector" if element.is_corrector else element.kind
         if kind in COLOURS or kind in SMALL:
             drawn.setdefault(kind, []).append(i)
     return drawn

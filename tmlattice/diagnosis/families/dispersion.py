@@ -26,8 +26,7 @@ from tmlattice.beam.kicks import (
     orbits_of_kicks,
 )
 from tmlattice.diagnosis.families.family import Family, RingFamily, StatedCause
-from tmlattice.effects import Cause, background_rms, directions, find
-from tmlattice.inference.problem import Hypothesis
+from tmlattice.effects import Cause, Hypothesis, background_rms, directions, find
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 

@@ -8,9 +8,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from tmlattice.arrays import Array
-from tmlattice.effects import Cause, find
+from tmlattice.effects import Cause, Hypothesis, find
 from tmlattice.inference.priors import Group
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 

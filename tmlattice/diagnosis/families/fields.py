@@ -12,8 +12,8 @@ import numpy as np
 
 from tmlattice.arrays import Array
 from tmlattice.diagnosis.families.family import TAILS, RingFamily
+from tmlattice.effects import Hypothesis
 from tmlattice.inference.priors import Group
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice import Element, Ring
 from tmlattice.lattice.slices import stem
 from tmlattice.lattice.supplies import magnets, supplied_alike
@@ -302,7 +302,7 @@ def straights(ring: Ring, next_to_wigglers: bool = False) -> list[Element]:
 
 def _parts(element: Element) -> bool:
     """Whether an element separates two straights."""
-    return element.is_magnet and element.kind not in ("hcorrector", "vcorrector")
+    return element.is_magnet and not element.is_corrector
 
 
 def _middle(within: Sequence[tuple[Element, float]], middle: float) -> list[Element]:

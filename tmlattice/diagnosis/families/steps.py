@@ -32,9 +32,8 @@ from tmlattice.diagnosis.families.fields import (
     SkewGradient,
     VerticalFocusing,
 )
-from tmlattice.effects import Cause, Monitors, expected_spread, find
+from tmlattice.effects import Cause, Hypothesis, Monitors, expected_spread, find
 from tmlattice.inference.priors import Group
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.lattice.alike import families
 from tmlattice.observe.orbit_response import DELTA, Errors, Predicted
 from tmlattice.observe.response_data import ResponseData

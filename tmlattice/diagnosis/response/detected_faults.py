@@ -52,14 +52,13 @@ from tmlattice.diagnosis.response.stated import doubt
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.response.weights import weighed, weight
 from tmlattice.diagnosis.result import Finding
-from tmlattice.effects import Cause, RingEffect, find, rare
+from tmlattice.effects import Cause, Hypothesis, RingEffect, find, rare
 from tmlattice.errors import TmlatticeError
 from tmlattice.inference.alternatives import Detection, linear_evidence
 from tmlattice.inference.common_factors import MIN_CHI2
 from tmlattice.inference.judgement import BEYOND, SIGNIFICANT, Judgement
 from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import SMALLEST, Group
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.scan import Scan
 from tmlattice.inference.search import Search
 from tmlattice.observe.orbit_response import Errors, Predicted

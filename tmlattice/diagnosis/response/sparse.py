@@ -20,14 +20,14 @@ from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.undetermined import Blur, SingleChange, Undetermined
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.diagnosis.result import Finding
-from tmlattice.effects import LaunchEffect, find, rare
+from tmlattice.effects import Hypothesis, LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference import chi2
 from tmlattice.inference.alternatives import Detection, leading
 from tmlattice.inference.judgement import BEYOND, Judgement
 from tmlattice.inference.newton import AGAIN, ITERATIONS, Fit, fit
-from tmlattice.inference.problem import Hypothesis, Problem
+from tmlattice.inference.problem import Problem
 from tmlattice.inference.scan import scan
 from tmlattice.inference.search import Explanation, Identified, Search, explain
 from tmlattice.observe.orbit_response import Predicted

@@ -12,11 +12,10 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags, rms
 from tmlattice.diagnosis.families.family import Family
-from tmlattice.effects import find
+from tmlattice.effects import Hypothesis, find
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW
 from tmlattice.inference.priors import SCALE_SPREAD, Group
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.observe.orbit_response import Errors, Predicted, bent
 from tmlattice.observe.response_data import ResponseData, Split
 

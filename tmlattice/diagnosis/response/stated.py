@@ -24,10 +24,10 @@ from tmlattice.diagnosis.support import (
     correlations_of,
     share_from_data,
 )
+from tmlattice.effects import Hypothesis
 from tmlattice.inference import errors
 from tmlattice.inference.errors import MAX_MEMBERS, LinearFit, Rows, cluster_robust_errors, moments
 from tmlattice.inference.normal import Posterior
-from tmlattice.inference.problem import Hypothesis
 
 
 class Stated(NamedTuple):

@@ -22,13 +22,12 @@ from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import State
-from tmlattice.effects import Cause, background_rms, find
+from tmlattice.effects import Cause, Hypothesis, background_rms, find
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.alternatives import Alternative
 from tmlattice.inference.distributed import MarginalProblem
 from tmlattice.inference.judgement import DEFAULT
 from tmlattice.inference.newton import AGAIN, Fit, Outcome
-from tmlattice.inference.problem import Hypothesis
 from tmlattice.inference.whitening import directions_of
 from tmlattice.lattice import Ring
 from tmlattice.observe.response_problem import Response
