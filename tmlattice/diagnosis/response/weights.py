@@ -69,9 +69,9 @@ def log_scale(state: State, block: int) -> float:
     return total if state.jitter is None else total - float(_common(state, block)[1].sum())
 
 
-def _without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array]:
-    """The residual given the most probable jitter of each column; and the readings' noise without
-    jitter, which is included in stated and estimated noise; m, [column, monitor]."""
+def without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array]:
+    """Return the residual given the most probable jitter of each fitted column; and the readings'
+    noise without jitter, which is included in stated and estimated noise; m, [column, monitor]."""
     noise = state.data.noise_of(block)
     if state.jitter is None:
         return left, noise
@@ -93,7 +93,7 @@ def look(state: State, block: int) -> State:
     data = state.data
     use = weight(state, block) > 0
     left = np.where(use, data.pick(state.at.left, block), np.nan)
-    left, alone = _without_jitter(state, block, left)
+    left, alone = without_jitter(state, block, left)
     share = shares(state, block, left)
     typical = float(chi2.typical(left[:-1, state.good]))
     noise = float(np.median(data.noise))
