@@ -109,15 +109,12 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
         half[column, np.flatnonzero(half[column])[::2]] = False  # half of the remaining ones
     data, none = replace(data, orbits=orbits), np.zeros_like(split.held)
     split = Split(none, half)
-    design = replace(begin(data, split), good=fitted.good)
     names = [family.name for family in USUAL]
     known = [*USUAL, *(family for family in fitted.families if family.name not in names)]
-    families = [f for f in known if design.reads(f.block) and f.size(data)]
-    at = Predicted(data, Errors.none(data), fitted.at.bent)
-    there = allow(replace(design, at=at, lacking=fitted.lacking, groups=fitted.groups), families)
-    continued = there.moved({
-        name: fitted.values.get(name, values) for name, values in there.values.items()
-    })  # fmt: skip
+    families = [f for f in known if fitted.reads(f.block) and f.size(data)]
+    at = Predicted(data, fitted.at.errors, fitted.at.bent)
+    continued = allow(replace(fitted, data=data, split=split, at=at), families)
+    design = replace(begin(data, split), good=fitted.good)
     found: list[tuple[float, State]] = []
     few = data.orbits.size <= ANEW
     for start in (allow(design, families), continued) if few else (continued,):

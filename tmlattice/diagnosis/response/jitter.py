@@ -34,9 +34,6 @@ log = logging.getLogger(__name__)
 
 MOST = 3
 """Most sources of a plane: two span all betatron phases, a third is for deviations from that."""
-SHARE = 0.25
-"""Least share of the typical column's mean square residual, given its own roll, that jitter must
-explain. Weak patterns are model discrepancy: they have evidence, and worsen held-out readings."""
 ENERGY = "energy"
 """Name of the source that changes the beam's energy."""
 SIZES = np.geomspace(0.01, 3.0, 30)
@@ -123,11 +120,10 @@ def _in_plane(state: State, plane: int) -> tuple[Array, tuple[str, ...]]:
         rest = _rest(weights, left, _patterns(rolls, found))
         count = independent(np.where(weights > 0, rest, np.nan), np.sqrt(least))
     names = [*model.maps.layers, ENERGY]
-    before, after = np.median(_rms(without)), np.median(_rms(rest))
-    log.info("plane %d: jitter from %s, residual %.3g of %.3g m", plane, [names[i] for i in which],
-             after, before)  # fmt: skip
-    enough = after**2 <= (1 - SHARE) * before**2
-    return (found, tuple(names[i] for i in which)) if enough else (none, ())
+    sources = tuple(names[i] for i in which)
+    log.info("plane %d: jitter from %s, residual %.3g of %.3g m", plane, sources,
+             np.median(_rms(rest)), np.median(_rms(without)))  # fmt: skip
+    return found, sources
 
 
 def _weights(seen: Flags, rest: Array, least: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 
 from tmlattice.arrays import Array, Flags
 from tmlattice.diagnosis.response.state import State
+from tmlattice.diagnosis.response.weights import DISPERSION, pulls, without_jitter
 from tmlattice.diagnosis.support import SHOWN
 from tmlattice.errors import first_of
 from tmlattice.inference import chi2
@@ -22,9 +23,6 @@ from tmlattice.measurement import OrbitResponse
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import ResponseData
 
-DISPERSION = "quadrupole_gradient"
-"""The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
-many times all others, and would bias the BPM gains."""
 OFTEN = 2
 """Outliers of one BPM or corrector from which on it is named."""
 
@@ -108,33 +106,6 @@ def _most(*tables: Counter[str]) -> str:
     return f"; most at {', '.join(most)}" if most else ""
 
 
-def shares(state: State, block: int, left: Array) -> Array:
-    """Return factors on the weights of the readings, [block, column, monitor].
-
-    The RF's orbit is read once: a few outliers (zeros where nothing was read, for example) would be
-    fitted by kicks and an energy offset. Those of correctors count only in the last fit.
-
-    Args:
-        state: of the fit.
-        block: 0 in-plane, 1 coupling.
-        left: residuals, m, NaN where nothing is fitted, [column, monitor].
-    """
-    out = state.share.copy()
-    times = SIGNIFICANT / np.maximum(np.abs(_pulls(state, block, left)), SIGNIFICANT)
-    times = np.where(np.isfinite(left), times, 1.0)
-    if state.robust:
-        out[block, :-1] = times[:-1] ** 2
-    if state.has_fitted(DISPERSION) and np.isfinite(left[-1]).sum() >= FEW:
-        out[block, -1] = times[-1] ** 4
-    return out
-
-
-def _pulls(state: State, block: int, left: Array) -> Array:
-    """Residuals in units of the column's typical one, or of the noise if that is larger."""
-    typical = chi2.typical(left, axis=1)
-    return np.asarray(left / np.fmax(state.data.noise_of(block), typical[:, None]))
-
-
 def outlier_readings(state: State) -> list[str]:
     """Return messages about the outliers of a fit; none without any."""
     if not state.robust:
@@ -143,9 +114,8 @@ def outlier_readings(state: State) -> list[str]:
     measured, monitors, correctors = state.data.measured, Counter[str](), Counter[str]()
     count = total = 0
     for block in (0, 1):
-        left = np.where(state.fitted[:, None] & state.good, state.data.pick(state.at.left, block),
-                        np.nan)  # fmt: skip
-        out = np.nan_to_num(np.abs(_pulls(state, block, left))) > SIGNIFICANT
+        left = np.where(state.fitted[:, None], _left(state, block), np.nan)
+        out = np.nan_to_num(np.abs(pulls(state, block, left))) > SIGNIFICANT
         count, total = count + int(out.sum()), total + int(np.isfinite(left).sum())
         monitors.update(measured.monitors[i] for i in np.nonzero(out)[1])
         correctors.update(measured.correctors[i] for i in np.nonzero(out)[0])
@@ -162,12 +132,12 @@ def _odd_rf(state: State) -> list[str]:
     """A message about outliers of the RF's orbit, at fitted and at other BPMs."""
     if not state.has_fitted(DISPERSION):
         return []
-    pulls = []
+    own = []
     for block in (0, 1):
-        left = np.where(state.good, state.data.pick(state.at.left, block), np.nan)
+        left = _left(state, block)
         if np.isfinite(left[-1]).sum() >= FEW:
-            pulls.append(np.nan_to_num(np.abs(_pulls(state, block, left)[-1])))
-    odd = np.flatnonzero(np.any(np.array(pulls) > SIGNIFICANT, axis=0))
+            own.append(np.nan_to_num(np.abs(pulls(state, block, left)[-1])))
+    odd = np.flatnonzero(np.any(np.array(own) > SIGNIFICANT, axis=0))
     if not len(odd):
         return []
     names = first_of([state.data.measured.monitors[i] for i in odd])
@@ -175,3 +145,9 @@ def _odd_rf(state: State) -> list[str]:
         f"outlier readings of the RF's orbit, by more than {SIGNIFICANT:g} times its typical "
         f"residual, with reduced weights where they are fitted: {names}."
     ]
+
+
+def _left(state: State, block: int) -> Array:
+    """The residual of all columns at good BPMs, given the jitter of the fitted ones."""
+    left = without_jitter(state, block, state.data.pick(state.at.left, block))[0]
+    return np.where(state.good, left, np.nan)

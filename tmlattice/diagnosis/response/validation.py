@@ -1,7 +1,8 @@
 """The validation of a hierarchical fit of an orbit response, and the size of its residual.
 
 For each held-out corrector the kick is estimated from half of the BPMs, and the prediction is
-scored on the other half (`score`). No family of errors is selected by these scores.
+scored on the other half (`score`). The RF's orbit is fitted at half of the BPMs, and scored at the
+others, both with the beam jitter in it. No family of errors is selected by these scores.
 
 In the `remainder` fitted readings are compared with their noise; fitted numbers reduce the degrees
 of freedom. Held-out readings are compared with the posterior predictive covariance (Gelman et al.,
@@ -25,6 +26,7 @@ from tmlattice.diagnosis.records import HIDDEN
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.stated import of_sizes
+from tmlattice.diagnosis.response.weights import without_jitter
 from tmlattice.effects import with_labels
 from tmlattice.inference.normal import Posterior
 
@@ -100,7 +102,8 @@ def score(state: State, effect: str, parameters: int = 0) -> Step:
         rolls = picked(at.seen(at.across), 1)
         known = far & np.any(near & (rolls != 0), axis=1, keepdims=True)
         rolled = np.where(known, amplitudes(rolls[..., None], left, near)[1], np.nan)
-    of_rf = np.where(state.good & ~half[-1], orbits[-1] - data.pick(read)[-1], np.nan)
+    of_rf = without_jitter(state, 0, data.pick(at.left))[0][-1]
+    of_rf = np.where(state.good & ~half[-1], of_rf, np.nan)
     noise = [data.noise_of(block) for block in (0, 1)]
     squares = (inside / noise[0][columns]) ** 2
     compared = {"in-plane": squares / spread, "coupling": (outside / noise[1][columns]) ** 2,

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from tmlattice.arrays import REDUNDANT, TINY, Array, Flags
-from tmlattice.diagnosis.response.outlier_readings import DISPERSION, shares
 from tmlattice.diagnosis.response.state import State
 from tmlattice.inference import chi2
 from tmlattice.inference.judgement import FEW, OUTLIERS, SIGNIFICANT
@@ -21,6 +20,9 @@ LEAST = 0.2
 """Least model discrepancy, and least noise given jitter, as a share of the noise."""
 BLIND = 0.2
 """Gain below which a BPM does not read the beam."""
+DISPERSION = "quadrupole_gradient"
+"""The family that determines the dispersion. Before it is fitted, the residual of the RF's orbit is
+many times all others, and would bias the BPM gains."""
 COUPLING = "skew_gradient"
 """The family that determines the readings in the other plane."""
 
@@ -69,9 +71,9 @@ def log_scale(state: State, block: int) -> float:
     return total if state.jitter is None else total - float(_common(state, block)[1].sum())
 
 
-def _without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array]:
-    """The residual given the most probable jitter of each column; and the readings' noise without
-    jitter, which is included in stated and estimated noise; m, [column, monitor]."""
+def without_jitter(state: State, block: int, left: Array) -> tuple[Array, Array]:
+    """Return the residual given the most probable jitter of each fitted column; and the readings'
+    noise without jitter, which is included in stated and estimated noise; m, [column, monitor]."""
     noise = state.data.noise_of(block)
     if state.jitter is None:
         return left, noise
@@ -93,8 +95,8 @@ def look(state: State, block: int) -> State:
     data = state.data
     use = weight(state, block) > 0
     left = np.where(use, data.pick(state.at.left, block), np.nan)
-    left, alone = _without_jitter(state, block, left)
-    share = shares(state, block, left)
+    left, alone = without_jitter(state, block, left)
+    share = _shares(state, block, left)
     typical = float(chi2.typical(left[:-1, state.good]))
     noise = float(np.median(data.noise))
     shared = TYPICAL * typical**2 + np.nansum(share[block] * left**2, axis=1)
@@ -107,6 +109,33 @@ def look(state: State, block: int) -> State:
     if block:
         good &= state.good
     return _independent(replace(state, lacking=lacking, share=share, good=good), block, left, alone)
+
+
+def _shares(state: State, block: int, left: Array) -> Array:
+    """The factors on the weights of the readings, [block, column, monitor].
+
+    The RF's orbit is read once: a few outliers (zeros where nothing was read, for example) would be
+    fitted by kicks and an energy offset. Those of correctors count only in the last fit.
+
+    Args:
+        state: of the fit.
+        block: 0 in-plane, 1 coupling.
+        left: residuals, m, NaN where nothing is fitted, [column, monitor].
+    """
+    out = state.share.copy()
+    times = SIGNIFICANT / np.maximum(np.abs(pulls(state, block, left)), SIGNIFICANT)
+    times = np.where(np.isfinite(left), times, 1.0)
+    if state.robust:
+        out[block, :-1] = times[:-1] ** 2
+    if state.has_fitted(DISPERSION) and np.isfinite(left[-1]).sum() >= FEW:
+        out[block, -1] = times[-1] ** 4
+    return out
+
+
+def pulls(state: State, block: int, left: Array) -> Array:
+    """Return residuals in units of the column's typical one, or of the noise if that is larger."""
+    typical = chi2.typical(left, axis=1)
+    return np.asarray(left / np.fmax(state.data.noise_of(block), typical[:, None]))
 
 
 def _independent(state: State, block: int, left: Array, noise: Array) -> State:
