@@ -347,8 +347,7 @@ def test_madx_files_that_say_too_little(tmp_path):
         load_ring(bad)
 
 
-@pytest.mark.parametrize("dimension", [4, 6])
-@pytest.mark.parametrize("which", ["petra3", "small_ring"])
+@pytest.mark.parametrize(("which", "dimension"), [("petra3", 6), ("small_ring", 4)])
 def test_own_json_keeps_every_map_to_the_bit(tmp_path, request, which, dimension):
     ring = request.getfixturevalue(which)
     quadrupole = next(e for e in ring.elements if e.kind == "quadrupole")
@@ -373,15 +372,10 @@ def test_own_json_keeps_every_map_to_the_bit(tmp_path, request, which, dimension
     ("edit", "message"),
     [
         (lambda c: c.update(version=2), "version 2 of 'tmlattice-lattice'"),
-        (lambda c: c.update(format="tmlattice-info"), "format 'tmlattice-info', which is no"),
         (lambda c: c.pop("sequence"), 'has no "sequence"'),
         (
             lambda c: c["definitions"]["QF"].update(kind="hexapole"),
             'is "hexapole"; it should be one of',
-        ),
-        (
-            lambda c: c["definitions"]["QF"].update({"class": "eval"}),
-            'is "eval"; it should be one of',
         ),
         (lambda c: c["definitions"]["QF"]["parameters"].update(k9=1.0), "'k9'.* lacks"),
         (
@@ -389,7 +383,6 @@ def test_own_json_keeps_every_map_to_the_bit(tmp_path, request, which, dimension
             "QF.parameters.k1 is .* should be a number",
         ),
         (lambda c: c["sequence"].append("q?"), "'q\\?', which has no definition"),
-        (lambda c: c.update(energy_gev=0), "energy_gev"),
         (lambda c: c.update(changes={"qx::0": {"k1": 1.0}}), "'changes' has 'qx::0', which is no"),
     ],
 )
@@ -432,7 +425,7 @@ FOREIGN = {
 }
 
 
-@pytest.mark.parametrize("suffix", [".madx", ".lte", ".lat"])
+@pytest.mark.parametrize("suffix", [".madx", ".lte"])
 @pytest.mark.parametrize("what", FOREIGN)
 def test_formats_that_are_not_read_are_named(tmp_path, what, suffix):
     with pytest.raises(LatticeError, match=what):
