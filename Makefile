@@ -8,6 +8,8 @@ BIN = $(VENV)/bin
 # A process for each processor. The tests of a file share its fixtures and stay in one process;
 # files in their order: the long ones are not the last.
 PARALLEL = --numprocesses logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# What is imported is compiled once, not by each of the many processes that the tests start.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test test-all coverage check bench fuzz docs notebooks clean
 

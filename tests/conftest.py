@@ -19,7 +19,7 @@ else:
     os.environ["TMLATTICE_CACHE"] = _kept.name  # not the user's own
 
 
-LONGEST = "scenarios diagnosis import security turns_amplitude response_diagnosis challenge"
+LONGEST = "scenarios data_checks correction diagnosis cli readme report_page turns_amplitude"
 
 
 def pytest_collection_modifyitems(items):

@@ -442,6 +442,10 @@ LOCATED = frozenset({"localised"})
 BENDS = [f"bend::{k}" for k in range(32)]
 
 
+SLOW: dict[str, Any] = {"lasts": True, "fewer": None}
+"""Of rows that are run with `-m slow` alone: others of their kind are run always."""
+
+
 def row(name: str, *causes: Cause, **more: Any) -> Scenario:
     """What stands in the name before the colon: kinds of measurement, usual errors, a reference."""
     parts = name.split(":", maxsplit=1)[0].split(", ")
@@ -507,22 +511,22 @@ RESPONSES = (
         row(f"response, usual errors: none, {k}", seed=k, verdicts=SOUND, lasts=True, fewer=fewer)
         for k, fewer in ((5, FITTED), (8, None), (11, None))
     ),
-    usual("quadrupole_gradient", "QF::2", 0.03),
+    usual("quadrupole_gradient", "QF::2", 0.03, fewer=None),
     usual("quadrupole_roll", "QD::4", 0.02),
     usual("corrector_calibration", "v3", -2.0),
     usual("corrector_calibration", "v2", -1.0, fewer=None, lasts=False),
     usual("corrector_roll", "v5", np.pi / 2, fewer=None),
     usual("monitor_gain_y", "bpm::6", -2.0),
-    usual("monitor_gain_x", "end_1", -1.33),
+    usual("monitor_gain_x", "end_1", -1.33, fewer=None),
     usual("monitor_swap", "end_6", 1.0),
     usual("family_gradient", "QD", -0.0235),
-    usual("sextupole_offset_y", "sf::2", -3e-3),
+    usual("sextupole_offset_y", "sf::2", -3e-3, fewer=None),
     *(  # a member of a family, one with the scatter of its usual errors, one beside the orbit
-        usual(*fault, seed=1, made={"machine_seed": 5})
-        for fault in (
-            ("quadrupole_gradient", "QD::1", 0.02),
-            ("sextupole_offset_y", "sd::2", 2.5e-3),
-            ("gradient_absolute", "sf::2", 0.02),
+        usual(*fault, seed=1, made={"machine_seed": 5}, fewer=fewer)
+        for *fault, fewer in (
+            ("quadrupole_gradient", "QD::1", 0.02, FITTED),
+            ("sextupole_offset_y", "sd::2", 2.5e-3, FITTED),
+            ("gradient_absolute", "sf::2", 0.02, None),
         )
     ),
     row(
@@ -542,7 +546,7 @@ RESPONSES = (
         verdicts=MANY | ONE,
         others=1,
         says=("d::95",),
-        lasts=True,
+        **SLOW,
     ),
     row(
         "response: kicks in the dispersion",
@@ -574,14 +578,14 @@ RESPONSES = (
 )
 
 DEFECTS = (
-    defect("single readings stick out", single(24, 10)),
+    defect("single readings stick out", single(24, 10), fewer=None),
     defect("single readings are gross", single(12, 250)),
     defect("two steps read too early", readings(lagging), "contradict"),
     defect("another kick in two steps", readings(other_kick), "v2", "v4"),
     defect("two steps are larger", larger_steps),
     defect("a monitor resembles nothing", readings(random_monitor), "end_2"),
     defect("a monitor is noisy", noisy_monitor(40), "end_2"),
-    defect("a monitor is noisy across", readings(noisy_across), "end_2"),
+    defect("a monitor is noisy across", readings(noisy_across), "end_2", fewer=None),
     defect("a monitor is silent", readings(silent), "end_2"),
     defect(
         "a corrector resembles nothing", readings(random_corrector), "v5", others=1, verdicts=ANY
@@ -604,7 +608,7 @@ DEFECTS = (
             fewer=fewer,
         )
         for a, b, fewer in (
-            ("v5", "v7", FITTED),
+            ("v5", "v7", None),
             ("v4", "v10", None),
             ("v4", "v5", FITTED),
             ("v0", "v14", None),
@@ -616,6 +620,7 @@ DEFECTS = (
         verdicts=LOCATED | MANY,
         says=("end_1 and end_14|end_14 and end_1",),
         others=1,
+        fewer=None,
     ),
     *(
         row(
@@ -628,7 +633,12 @@ DEFECTS = (
         )
         for a, b, fewer in (("v5", "v9", None), ("generated_a", "v5", FITTED))
     ),
-    defect("the noise is stated five times too small", noise_times([0.2, 1.0]), "the noise in x"),
+    defect(
+        "the noise is stated five times too small",
+        noise_times([0.2, 1.0]),
+        "the noise in x",
+        fewer=None,
+    ),
     defect("the noise is stated ten times too large", noise_times(10.0), "noise is too large"),
     defect("no noise is stated", no_noise, "noise of the readings is not stated"),
     defect("no step of the RF", no_rf, "there is no RF step"),
@@ -641,6 +651,7 @@ DEFECTS = (
         "half of the correctors",
         lambda data, rng: data,
         made={"correctors": [f"v{k}" for k in range(0, 16, 2)]},
+        fewer=None,
     ),
 )
 
@@ -693,8 +704,8 @@ CHANGES = (
         lasts=True,
         damage=None,
     ),
-    row("first turns, since: a magnet", Cause("quadrupole_gradient", "QD::5", -0.02)),
-    row("first turns, since: nothing", verdicts=NOTHING),
+    row("first turns, since: a magnet", Cause("quadrupole_gradient", "QD::5", -0.02), **SLOW),
+    row("first turns, since: nothing", verdicts=NOTHING, **SLOW),
     row("orbit, since: a kick", Cause("corrector_kick_x", "v6", 3e-5)),
 )
 
@@ -729,18 +740,20 @@ TURNS = (
         found=(Cause("monitor_dead", "bpm::4", np.nan),),
         verdicts=ANY,
     ),
-    row("first turns, data: a wild reading", WEAK, damage=in_turn(wild)),
-    row("first turns, data: lost", WEAK, damage=in_turn(lost), says=("lost",)),
+    row("first turns, data: a wild reading", WEAK, damage=in_turn(wild), **SLOW),
+    row("first turns, data: lost", WEAK, damage=in_turn(lost), says=("lost",), **SLOW),
     row(
         "first turns, data: x reversed",
         damage=in_turn(reversed_x),
         verdicts=frozenset({"refused"}),
         says=("x",),
+        **SLOW,
     ),
     row(
         "first turns, data: millimetres",
         damage=in_turn(millimetres),
         verdicts=frozenset({"refused"}),
+        **SLOW,
     ),
     row("first turns, x alone: nothing", damage=in_turn(no_y), verdicts=NOTHING),
     row(
@@ -753,9 +766,9 @@ TURNS = (
         Cause("quadrupole_gradient", "QD::5", -0.05),
         damage=in_turn(no_x),
     ),
-    row("turns: nothing", verdicts=NOTHING),
+    row("turns: nothing", verdicts=NOTHING, **SLOW),
     row("turns: a magnet", Cause("quadrupole_gradient", "QD::5", -0.01)),
-    row("turns: a roll", Cause("quadrupole_roll", "QF::7", 0.02)),
+    row("turns: a roll", Cause("quadrupole_roll", "QF::7", 0.02), **SLOW),
     row("turns: exchanged planes", Cause("monitor_swap", "end_1", 1.0)),
     row("turns, usual errors: none", verdicts=SOUND),
     row(
@@ -775,7 +788,7 @@ TURNS = (
     row(
         "turns, dispersion, usual errors: a magnet",
         Cause("quadrupole_gradient", "QD::3", -0.05),
-        lasts=True,
+        **SLOW,
     ),
     row("response, dispersion: a magnet", WEAK, lasts=True),
     row(

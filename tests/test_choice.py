@@ -78,24 +78,19 @@ SEVERAL = (
     Cause("quadrupole_gradient", "QF::2", 0.04),
     Cause("sextupole_offset_y", "sf::15", -0.0012),
 )
-ALL_ALONG = (
-    Cause("corrector_kick_x", "v8", -1.2e-4),
-    Cause("corrector_kick_x", "v2", 0.9e-4),
-    Cause("dipole_roll", "bend::0", 0.003),
-    Cause("sextupole_offset_x", "sf::15", 0.0018),
-)
 
 
-@pytest.mark.parametrize(("faults", "seed", "clear"), [(SEVERAL, 13, 3), (ALL_ALONG, 11, 4)])
-def test_more_than_three_faults_are_no_small_errors_everywhere(small_ring, faults, seed, clear):
-    """Three are sought first; chi-square alone would let three stand in the first case."""
-    data = simulate(small_ring, faults, shots=8, seed=seed).measurement()
-    effects = {f.effect for f in SEVERAL + ALL_ALONG} | {"quadrupole_offset_y", "monitor_gain_x"}
-    found = diagnose(small_ring, data, effects=sorted(effects))
+def test_more_than_three_faults_are_no_small_errors_everywhere(small_ring):
+    """Three are sought first; chi-square alone would let three stand."""
+    data = simulate(small_ring, SEVERAL, shots=8, seed=13).measurement()
+    effects = {f.effect for f in SEVERAL} | {"dipole_roll", "corrector_kick_x", "monitor_gain_x"}
+    found = diagnose(
+        small_ring, data, effects=sorted(effects | {"quadrupole_offset_y", "sextupole_offset_x"})
+    )
     named = {(f.effect, f.element): f for f in found.findings}
-    for fault in faults[:clear]:
+    for fault in SEVERAL[:3]:
         told = named[fault.effect, fault.element]
         assert abs(told.amount - fault.amount) < 4 * told.amount_sigma
         assert told.amount_sigma < 0.1 * abs(fault.amount)
-    assert len(named) == len(faults)
+    assert len(named) == len(SEVERAL)
     assert not found.priors

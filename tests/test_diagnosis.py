@@ -26,11 +26,8 @@ def first(diagnosis):
 FAULTS = [
     Cause("quadrupole_gradient", "qd::12", -0.05),
     Cause("skew_gradient", "qskew_nw_1", 2e-3),
-    Cause("quadrupole_offset_y", "qa3::2", 2e-4),
-    Cause("dipole_field", "b::28", 1e-3),
     Cause("sextupole_offset_x", "s1::48", 2e-3),
     Cause("insertion_device_focusing", "wiggler::12", 3e-3),
-    Cause("monitor_roll", "bpm_a4_3", 0.1),
     Cause("energy_offset", None, 2e-4),
     Cause("radiation_loss_bends", None, 1.0),
 ]
@@ -151,15 +148,13 @@ def test_held_out_gap_vs_noise_free_truth(petra3):
 @pytest.mark.parametrize(
     ("cause", "shots"),
     [
-        (None, 2),
         (Cause("quadrupole_gradient", "QD::3", -0.05), 1),
         (Cause("dipole_roll", "bend::4", 5e-3), 2),
     ],
 )
 def test_what_is_in_the_reference_too_is_no_change(small_ring, cause, shots):
-    causes = [] if cause is None else [cause]
     before, after = (
-        simulate(small_ring, causes, shots=shots, seed=seed).measurement() for seed in (50, 0)
+        simulate(small_ring, [cause], shots=shots, seed=seed).measurement() for seed in (50, 0)
     )
     for reference in (after, before):  # the folder itself, and the same machine once more
         found = diagnose(small_ring, after, reference=reference)

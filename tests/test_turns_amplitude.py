@@ -86,7 +86,7 @@ def test_tunes_shift_with_amplitude_as_in_at(small_with_octupole):
     assert_allclose(by_model, by_at, rtol=0.03, atol=2e-7)
 
 
-@pytest.mark.parametrize("amplitude", [2e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("amplitude", [2e-4, 5e-3])
 def test_chi_square_of_a_healthy_ring_is_right_at_every_amplitude(small_ring, amplitude):
     turns = simulate_turns(small_ring, amplitude=amplitude, turns=600, seed=4).measured
     problem = many_turns(small_ring, turns, {})
@@ -102,12 +102,6 @@ def test_chi_square_of_a_healthy_ring_is_right_at_every_amplitude(small_ring, am
         assert without > 100  # what a fault would be made of
 
 
-def test_nothing_is_found_in_a_healthy_ring_at_the_default_amplitude(petra3):
-    turns = simulate_turns(petra3, turns=300, seed=0).measured
-    effects = ["family_gradient", "quadrupole_gradient", "sextupole_offset_x"]
-    assert diagnose(petra3, turns, effects=effects).verdict == "none"
-
-
 def test_shifts_are_of_the_measured_actions_where_a_kick_makes_others():
     """In ThomX at 6 mm the tracked vertical line is a fifth smaller than wanted."""
     ring = load_ring(SHIPPED / "thomx.m")
@@ -120,10 +114,9 @@ def test_shifts_are_of_the_measured_actions_where_a_kick_makes_others():
     assert diagnose(ring, turns).verdict == "none"
 
 
-@pytest.mark.parametrize("amplitude", [2e-4, 1e-3])
-def test_a_healthy_beam_that_decoheres_is_no_fault(small_ring, amplitude):
+def test_a_healthy_beam_that_decoheres_is_no_fault(small_ring):
     """Gone in ten turns: what oscillates last has another energy, and sees other optics."""
-    turns = simulate_turns(small_ring, particles=300, turns=100, amplitude=amplitude).measured
+    turns = simulate_turns(small_ring, particles=300, turns=100, amplitude=1e-3).measured
     assert diagnose(small_ring, turns).verdict == "none"
 
 
