@@ -28,9 +28,12 @@ EACH = 4
 """Iterations of EM for the prior scales in a step."""
 LEARN = 10
 """Iterations of EM for prior scales alone: those of absent errors fall slowly."""
-RETRIES, NARROWER, WIDER, WIDEST = 4, 4.0, 2.0, 8.0
-"""Repetitions of a diverged step, and of one that crosses lower bounds; divisor of the bounds of a
-diverged step; their growth, and its limit."""
+TOGETHER, REPEATED = 2, 2
+"""Steps of each block after which the cost has to be lower, and repetitions with smaller bounds."""
+NARROWER, WIDER, WIDEST = 4.0, 2.0, 8.0
+"""Divisor of the bounds of a step that was no progress; their growth, and its limit."""
+CROSSED = 4
+"""Repetitions of a step that crosses lower bounds."""
 CORRECTED, CORRECTS = 6, 1e-3
 """Corrections of a step by the residuals at its end, with the derivatives at its start; and the
 relative fall of the cost required for another one. Correlated numbers follow a curved valley of the
@@ -96,7 +99,7 @@ def _misfit(state: State, at: State, block: int) -> float:
 def bounded_step(there: Linear, width: float) -> Posterior:
     """The bounded step, with numbers fixed at their lower bounds where it would cross them."""
     groups, trust = there.groups, width * there.trust
-    for _ in range(RETRIES):
+    for _ in range(CROSSED):
         found = solve(there.normal, groups, there.start, trust, rounds=EACH)
         low = found.values < there.lowest
         if not low.any():
@@ -137,11 +140,11 @@ def settle(
     """Return the state of the lowest cost after damped Gauss-Newton steps.
 
     The blocks are stepped in turn, by the method of Levenberg and Marquardt with a step bound for
-    each number. A step that increases the cost of its own block is repeated with smaller bounds. It
-    may increase the cost of the other block, which its derivatives omit, because the next step may
-    compensate. Weights and bad BPMs are updated at a new lowest cost only, so that costs in between
-    are comparable. The fit ends when a step of each block was no progress, or two of each while the
-    cost is above its lowest value.
+    each number. A step may increase the cost of the other block, which its derivatives omit,
+    because the next steps may compensate. Where they do not, the fit returns to the lowest cost,
+    and goes on from there with smaller bounds. Weights and bad BPMs are updated at a new lowest
+    cost only, so that costs in between are comparable. The fit ends when a step of each block was
+    no progress.
 
     Args:
         state: the start.
@@ -161,38 +164,38 @@ def settle(
     best, start = state, state
     blocks = [block for block in (0, 1) if state.of_block(block)]
     width = dict.fromkeys(blocks, 1.0)
-    gained, idle = 0.0, 0  # since the lowest cost
+    gained, away = 0.0, 0  # since the lowest cost
+    idle = failed = 0  # steps and repetitions without progress
     for turn, block in enumerate(blocks * most):
         there = linear(state, block)
         state = replace(state, kept={**state.kept, **there.kept})
-        for _ in range(RETRIES):
-            moved, before, after = one_step(state, block, there, width[block])
-            if after <= before:
-                break
+        moved, before, after = one_step(state, block, there, width[block])
+        away, idle = away + 1, idle + 1
+        if after > before:
             width[block] /= NARROWER
-        idle += 1
-        if after <= before:
-            width[block] = min(WIDER * width[block], WIDEST)
+        else:
             then, now = (
                 sum(_misfit(state, at, own) for own in blocks if own != block)
                 for at in (state, moved)
             )
-            leaves = gained == 0
-            gained += before + then - after - now
+            gained, cost = gained + before + then - after - now, max(after + now, TINY)
             state = moved
             log.info("step %d, block %d: cost %.3g less, model discrepancy %s m", turn, block,
-                     gained / max(after + now, TINY), np.median(state.lacking, axis=1))  # fmt: skip
-            if gained > gain * (after + now):
-                idle = 0
-            elif leaves and gained < 0:
-                idle = 1  # the other block may compensate
+                     gained / cost, np.median(best.lacking, axis=1))  # fmt: skip
+            if gained > gain * cost:
+                idle = failed = 0
             if gained >= 0:
-                best, gained = looked(state), 0.0
-                state = best
-        if idle >= len(blocks) * (1 if gained >= 0 else 2):
+                best = state = looked(state)
+                gained, away = 0.0, 0
+                width[block] = min(WIDER * width[block], WIDEST)
+        if away == TOGETHER * len(blocks):
+            state, gained, away = replace(best, kept=state.kept), 0.0, 0
+            idle, failed = 0, failed + 1
+            width = {own: bound / NARROWER for own, bound in width.items()}
+        if failed > REPEATED or (away == 0 and idle >= len(blocks)):
             break
-    best = looked(start) if best is start else best
-    return replace(best, kept=state.kept)
+    best = replace(best, kept=state.kept)
+    return looked(best) if best.values is start.values else best
 
 
 def linear_evidence(there: Linear, gone: Collection[str] = ()) -> float:
