@@ -171,14 +171,19 @@ def test_reference_and_single_shot(folders, tmp_path):
     [
         ([SMALL], "MEASUREMENT"),
         ([SMALL, "nowhere"], "no measurement folder"),
+        (["petra4", "weak"], "no lattice 'petra4'; did you mean 'petra3'"),
+        (["nowhere/ring.py", "weak"], "no lattice file"),
         ([SMALL, "response"], "the noise of the readings is not stated"),
         ([SMALL, "weak", "--reference", "response"], "give a reference of the same kind"),
+        ([SMALL, "weak", "--reference", "nowhere"], "no measurement folder"),
         ([SMALL, "weak", "--reference", "weak"], "is the measurement and its --reference"),
         ([SMALL, "strange"], "no BPM 'v1'; "),
         ([SMALL, "weak", "--effects", "quadrupole_gradiant"], "did you mean 'quadrupole_gradient'"),
         ([SMALL, "weak", "--effects", ","], "--effects"),
         ([SMALL, "weak", "--background", "quadrupole_roll=a"], "is no rms"),
         ([SMALL, "weak", "--background", "gradient_absolute"], "has no usual size"),
+        ([SMALL, "weak", "--background", "nothing=1"], "no effect 'nothing'"),
+        ([SMALL, "weak", "--max-effects", "0"], "--max-effects"),
         ([SMALL, "weak", "--json", "/no/such/folder/a.json"], "cannot write"),
     ],
 )
@@ -380,7 +385,7 @@ def test_a_fine_tuned_network_is_read_as_physics(folders, tmp_path):
     ):
         done = tmlattice(
             "diagnose", SMALL, folders / "weak", "--network", network, "--out", f"out-{code}",
-            "--effects", "quadrupole_gradient", cwd=tmp_path, check=code,
+            cwd=tmp_path, check=code,
         )  # fmt: skip
         assert words in done.stdout + done.stderr
     reading = json.loads((tmp_path / "out-0" / "weights.json").read_text())

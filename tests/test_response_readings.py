@@ -59,7 +59,7 @@ def test_neighbours_that_were_set_aside_are_taken_back_where_they_are_sound(smal
         assert taken_back(noisy) is noisy
 
 
-@pytest.mark.parametrize(("plane", "times"), [("x", 200), ("y", 20)])
+@pytest.mark.parametrize(("plane", "times"), [("x", 5), ("x", 200), ("y", 20)])
 def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     small_ring, ring_kicking_x, monkeypatch, plane, times
 ):
@@ -143,7 +143,8 @@ def test_what_is_exchanged_is_the_finding(small_ring, case):
     assert repr(one).startswith(f"<Finding {one.words}")
 
 
-def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring, clean):
+@pytest.mark.parametrize("waves", [0.0, 3.0])
+def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring, clean, waves):
     """Real rings: gradients scattered by two of their stated errors between seeds."""
     rng = np.random.default_rng(5)
     response, planes = clean.response.copy(), np.array(clean.planes)
@@ -151,7 +152,7 @@ def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring,
         own = int(plane == "y")
         alike = clean.response[planes == plane, :, own]
         wave = rng.standard_normal(len(alike)) @ alike
-        response[c, :, own] += 6e-8 * wave / wave.std()
+        response[c, :, own] += waves * 2e-8 * wave / wave.std()
     state = fitted(small_ring, replace(clean, response=response))
     truth = {name.casefold(): amount for name, amount in GRADIENTS.items()}
     found = [(own.amount - truth.get(own.element.casefold(), 0.0), sigma)
@@ -162,4 +163,4 @@ def test_stated_errors_hold_where_every_column_has_a_wave_of_its_own(small_ring,
     plain = solve(there.normal, there.groups, there.start, rounds=0).sigma[there.where["gradient"]]
     size, without = (np.sqrt(np.mean((off / own) ** 2)) for own in (sigma, plain))
     assert 0.6 < size < 1.4  # 32 gradients, which pull against one another
-    assert without > 1.5
+    assert without > 1.5 or not waves

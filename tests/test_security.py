@@ -93,6 +93,14 @@ def test_the_cache_is_this_user_s_alone(kept):
     assert same(kept)
 
 
+def test_a_lattice_is_kept_by_a_fresh_installation(open_folder):
+    """Modules that are compiled while it is read may warn."""
+    words = [sys.executable, "-X", f"pycache_prefix={open_folder}/compiled", "-m", "tmlattice"]
+    own = os.environ | {"TMLATTICE_CACHE": str(open_folder)}
+    subprocess.run([*words, "info", SMALL], env=own, check=True, capture_output=True)
+    assert list((open_folder / "tmlattice").iterdir())
+
+
 @pytest.mark.parametrize("mode", [0o770, 0o702])
 def test_a_cache_that_others_can_write_to_is_not_used(kept, mode):
     folder, _, _ = kept
@@ -307,7 +315,7 @@ def slow(*names):
 
 
 @pytest.mark.parametrize(
-    "name", ["diagnose", "simulate", *slow("study", "challenge run", "challenge score")]
+    "name", ["diagnose", "simulate", "study", *slow("challenge run", "challenge score")]
 )
 def test_no_module_of_the_working_directory_is_loaded_and_no_port_is_open(beside, name):
     """By no process of a command; nothing listens, on no address and no Unix socket."""

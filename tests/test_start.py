@@ -38,7 +38,7 @@ def kept(tmp_path, monkeypatch):
 
 
 HEAVY = (
-    "heavy = {'ocelot', 'torch', 'scipy.stats', 'pandas', 'matplotlib', 'at'}\n"
+    "heavy = {'ocelot', 'torch', 'scipy.stats', 'scipy.optimize', 'pandas', 'matplotlib', 'at'}\n"
     "print('loaded:', *sorted(heavy & set(sys.modules)))\n"
 )
 LOADED = (

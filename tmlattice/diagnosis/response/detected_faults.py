@@ -114,16 +114,20 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     families = [f for f in known if fitted.reads(f.block) and f.size(data)]
     at = Predicted(data, fitted.at.errors, fitted.at.bent)
     continued = allow(replace(fitted, data=data, split=split, at=at), families)
-    design = replace(begin(data, split), good=fitted.good)
+    starts = [continued]
+    if data.orbits.size <= ANEW:
+        equal = None if fitted.independent is None else np.ones_like(fitted.independent)
+        design = replace(begin(data, split), good=fitted.good, jitter=fitted.jitter,
+                         independent=equal)  # fmt: skip
+        starts.append(allow(design, families))
     found: list[tuple[float, State]] = []
-    few = data.orbits.size <= ANEW
-    for start in (allow(design, families), continued) if few else (continued,):
+    for start in starts:
         try:
             state = settle(jump(start, beyond=1.0), gain=ROUGH)
             state = settle(bend(state))
         except (TmlatticeError, np.linalg.LinAlgError):  # diverged
             continue
-        found.append((evidence_of(state, state.good), state))
+        found.append((evidence_of(state, state.good, fitted.independent), state))
         log.info("distributed errors: evidence %.1f", found[-1][0])
         if all(own.ratio**2 < MISSING for own in fit_chi2(state)[:2]):
             break
@@ -476,10 +480,11 @@ class _Search:
             return None
         # the distributed errors have outliers already, so the evidence need not grow with a fault;
         # a second optimum, where all readings are far less probable, is none
-        least = evidence_of(self.state, self.state.good) - self.judgement.log_odds
+        sizes = self.state.independent
+        least = evidence_of(self.state, self.state.good, sizes) - self.judgement.log_odds
         tried: list[tuple[float, State]] = []
         for state in filter(None, map(_settled, clear)):
-            found = evidence_of(state, state.good)
+            found = evidence_of(state, state.good, sizes)
             if found > least:
                 tried.append((found + self.problem.prior(state.apart[-1].cause), state))
         for _, state in sorted(tried, key=lambda one: -one[0]):
@@ -525,7 +530,8 @@ class _Search:
         if other is None:
             return state
         prior = self.problem.prior
-        gained = evidence_of(other, state.good) - evidence_of(state, state.good)
+        before, after = (evidence_of(one, state.good, state.independent) for one in (state, other))
+        gained = after - before
         gained += prior(other.apart[-1].cause) - prior(one.cause)
         return other if gained > 0 else state
 

@@ -44,7 +44,7 @@ from tmlattice.diagnosis.response.state import (
     jump,
 )
 from tmlattice.diagnosis.response.validation import Step, remainder, score
-from tmlattice.diagnosis.response.weights import COUPLING, good_monitors
+from tmlattice.diagnosis.response.weights import COUPLING, good_monitors, without_jitter
 from tmlattice.effects import with_labels
 from tmlattice.errors import UnstableRingError
 from tmlattice.inference.judgement import GROSS
@@ -67,9 +67,10 @@ DIVERGED = 2.0
 
 
 def fit_chi2(state: State) -> tuple[Block, ...]:
-    """Return the fitted readings by their noise alone: in-plane, coupling, RF."""
+    """Return the fitted readings by their noise, given beam jitter: in-plane, coupling, RF."""
     data, fitted = state.data, ~state.split.held[:-1]
-    pulls = [data.pick(state.at.left, block) / data.noise_of(block) for block in (0, 1)]
+    left = [without_jitter(state, block, data.pick(state.at.left, block))[0] for block in (0, 1)]
+    pulls = [own / data.noise_of(block) for block, own in enumerate(left)]
     own = [pull[:-1][fitted][:, state.good] for pull in pulls]
     own.append(pulls[0][-1][state.split.half[-1] & state.good])
     return tuple(
@@ -340,14 +341,14 @@ def taken_back(state: State) -> State:
 
 def _with_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
     """The state with detected beam jitter. It is sought again given the first result, because
-    errors of the ring had taken a part of it."""
+    errors of the ring had taken a part of it, or it of them."""
     moving = sought(state)
     if moving is None:
         return state, None
     progress("beam jitter")
     state = settle(replace(state, jitter=moving.orbits))
-    moving = sought(state) or moving
-    return replace(state, jitter=moving.orbits), moving
+    moving = sought(state)
+    return replace(state, jitter=None if moving is None else moving.orbits), moving
 
 
 def _title(trial: Trial) -> str:

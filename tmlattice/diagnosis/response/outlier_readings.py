@@ -110,7 +110,7 @@ def outlier_readings(state: State) -> list[str]:
     """Return messages about the outliers of a fit; none without any."""
     if not state.robust:
         return []
-    messages = _odd_rf(state)
+    messages = _rf_outliers(state)
     measured, monitors, correctors = state.data.measured, Counter[str](), Counter[str]()
     count = total = 0
     for block in (0, 1):
@@ -128,7 +128,7 @@ def outlier_readings(state: State) -> list[str]:
     ]
 
 
-def _odd_rf(state: State) -> list[str]:
+def _rf_outliers(state: State) -> list[str]:
     """A message about outliers of the RF's orbit, at fitted and at other BPMs."""
     if not state.has_fitted(DISPERSION):
         return []

@@ -29,9 +29,10 @@ EACH = 4
 LEARN = 10
 """Iterations of EM for prior scales alone: those of absent errors fall slowly."""
 TOGETHER, REPEATED = 2, 2
-"""Steps of each block after which the cost has to be lower, and repetitions with smaller bounds."""
+"""Steps of each block after which the cost has to be lower, and returns without progress."""
 NARROWER, WIDER, WIDEST = 4.0, 2.0, 8.0
-"""Divisor of the bounds of a step that was no progress; their growth, and its limit."""
+"""Divisor of the bounds of a step that raised the cost of its block, and of all at a return; their
+growth, and its limit."""
 CROSSED = 4
 """Repetitions of a step that crosses lower bounds."""
 CORRECTED, CORRECTS = 6, 1e-3
@@ -143,8 +144,8 @@ def settle(
     each number. A step may increase the cost of the other block, which its derivatives omit,
     because the next steps may compensate. Where they do not, the fit returns to the lowest cost,
     and goes on from there with smaller bounds. Weights and bad BPMs are updated at a new lowest
-    cost only, so that costs in between are comparable. The fit ends when a step of each block was
-    no progress.
+    cost only, so that costs in between are comparable. The fit ends when a step of each block from
+    there was no progress, or after `REPEATED` further returns.
 
     Args:
         state: the start.

@@ -2,7 +2,8 @@
 
 For each held-out corrector the kick is estimated from half of the BPMs, and the prediction is
 scored on the other half (`score`). The RF's orbit is fitted at half of the BPMs, and scored at the
-others, both with the beam jitter in it. No family of errors is selected by these scores.
+others, less the beam jitter whose amplitude in it the fitted ones determine. No family of errors is
+selected by these scores.
 
 In the `remainder` fitted readings are compared with their noise; fitted numbers reduce the degrees
 of freedom. Held-out readings are compared with the posterior predictive covariance (Gelman et al.,
@@ -43,7 +44,7 @@ class Step:
         heldout_rms_roll: coupling, with a roll of each held-out corrector, by the BPMs that
             determine its kick, m; NaN before rolls are fitted.
         heldout_chi2_per_dof: in-plane, by the readings' noise.
-        dispersion_rms: residual of the RF's orbit in x at BPMs that are not fitted, m.
+        dispersion_rms: residual of the RF's orbit in x at BPMs that are not fitted, less jitter, m.
         kept: whether a family is in the result.
         log_evidence: for a family, when it was tested; NaN for a step and for an implausible
             family.
