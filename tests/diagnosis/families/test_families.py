@@ -1,7 +1,5 @@
 """What a family of errors is told as does to the readings what the family itself does."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from shared import small_steps
@@ -25,6 +23,7 @@ from tmlattice.diagnosis.families.steps import (
 from tmlattice.diagnosis.response.rounds import settle
 from tmlattice.diagnosis.response.state import allow, begin, jump
 from tmlattice.effects import Cause
+from tmlattice.lattice.ring import Element, Ring
 from tmlattice.machine.response import simulate_response
 from tmlattice.observe.orbit_response import Errors, Predicted
 from tmlattice.observe.response_data import response_data, split_columns
@@ -83,14 +82,10 @@ def ring_of(*elements):
     """Of (name, kind, length) and, of bends, the angle, one behind the other."""
     placed, end = [], 0.0
     for name, kind, length, *angle in elements:
-        placed.append(
-            SimpleNamespace(
-                name=name, kind=kind, length=length, s=end + length / 2,
-                angle=angle[0] if angle else 0.0, is_magnet=kind not in ("drift", "marker"),
-            )
-        )  # fmt: skip
+        numbers = (end + length / 2, length, 0.0, 0.0, sum(angle), 0.0)
+        placed.append(Element(name, name, kind, *numbers, source=None))
         end += length
-    return SimpleNamespace(elements=placed, length=end)
+    return Ring("line", tuple(placed), 1.0)
 
 
 def wiggler(second):
