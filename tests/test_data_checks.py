@@ -635,6 +635,13 @@ def test_the_sign_of_a_plane_with_one_corrector(small_ring, steps):
     assert re.search(r"are -(0.9|1)\S* times the design's in x: ", check.sentence)
 
 
+def test_correctors_of_both_planes_in_another_order():
+    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
+    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
+    (check,) = reported(check_data(ring, replace(steps, response=steps.response[::-1])))
+    assert f"{len(steps.correctors)} correctors have the names of others" in check.sentence
+
+
 def test_one_corrector_of_a_plane_shows_no_order_of_bpms(small_ring):
     """The design is far off: by 8 % in one family."""
     causes = [Cause("family_gradient", "QF", 0.08)]
@@ -678,6 +685,14 @@ def test_rounded_readings_have_a_larger_noise(small_ring, machine):
     assert "no beam reads" not in str(found.checks)
 
 
+def test_bpms_in_no_order_are_no_known_order(small_ring, healthy):
+    """By chance another order explains the readings somewhat better."""
+    for seed in (1, 2):
+        order = np.random.default_rng(seed).permutation(len(healthy.monitors))
+        data = replace(healthy, readings=healthy.readings[:, :, order])
+        assert all(check.assume == () for check in reported(check_data(small_ring, data)))
+
+
 @pytest.mark.parametrize("factor", [1.01, 1e-6])
 def test_an_rf_that_is_not_this_rings(small_ring, steps, factor):
     rf = replace(steps.rf, frequency=factor * steps.rf.frequency, step=factor * steps.rf.step)
@@ -709,18 +724,3 @@ def test_turns_of_a_healthy_ring_next_to_an_integer_are_its_own():
     names = np.random.default_rng(0).permutation(own.monitors)
     (check,) = reported(check_data(ring, replace(own, monitors=tuple(names))))
     assert check.sentence.startswith("the data are not those of")
-
-
-def test_correctors_of_both_planes_in_another_order():
-    ring = load_ring(Path(machine_data.__file__).parent / "thomx.m")
-    steps = simulate_response(ring, background={"all": None}, progress=False, seed=1).measured
-    (check,) = reported(check_data(ring, replace(steps, response=steps.response[::-1])))
-    assert f"{len(steps.correctors)} correctors have the names of others" in check.sentence
-
-
-def test_bpms_in_no_order_are_no_known_order(small_ring, healthy):
-    """By chance another order explains the readings somewhat better."""
-    for seed in (1, 2):
-        order = np.random.default_rng(seed).permutation(len(healthy.monitors))
-        data = replace(healthy, readings=healthy.readings[:, :, order])
-        assert all(check.assume == () for check in reported(check_data(small_ring, data)))

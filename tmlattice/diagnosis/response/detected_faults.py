@@ -61,7 +61,7 @@ from tmlattice.inference.normal import solve
 from tmlattice.inference.priors import SMALLEST, Group
 from tmlattice.inference.scan import Scan
 from tmlattice.inference.search import Search
-from tmlattice.observe.orbit_response import Errors, Predicted
+from tmlattice.observe.orbit_response import Errors
 from tmlattice.observe.response_data import ResponseData, Split
 from tmlattice.observe.response_problem import Response
 
@@ -112,7 +112,7 @@ def small_errors(data: ResponseData, split: Split, fitted: State) -> State:
     names = [family.name for family in USUAL]
     known = [*USUAL, *(family for family in fitted.families if family.name not in names)]
     families = [f for f in known if fitted.reads(f.block) and f.size(data)]
-    at = Predicted(data, fitted.at.errors, fitted.at.bent)
+    at = replace(fitted.at, data=data)
     continued = allow(replace(fitted, data=data, split=split, at=at), families)
     starts = [continued]
     if data.orbits.size <= ANEW:

@@ -107,47 +107,33 @@ def _most(*tables: Counter[str]) -> str:
 
 
 def outlier_readings(state: State) -> list[str]:
-    """Return messages about the outliers of a fit; none without any."""
+    """Return messages about the outliers of a fit, given its jitter: of the RF's orbit, at fitted
+    and at other BPMs, and of the correctors' readings; none without any."""
     if not state.robust:
         return []
-    messages = _rf_outliers(state)
     measured, monitors, correctors = state.data.measured, Counter[str](), Counter[str]()
-    count = total = 0
+    of_rf, total = np.zeros_like(state.good), 0
     for block in (0, 1):
-        left = np.where(state.fitted[:, None], _left(state, block), np.nan)
+        left = without_jitter(state, block, state.data.pick(state.at.left, block))[0]
+        left = np.where(state.good, left, np.nan)
         out = np.nan_to_num(np.abs(pulls(state, block, left))) > SIGNIFICANT
-        count, total = count + int(out.sum()), total + int(np.isfinite(left).sum())
-        monitors.update(measured.monitors[i] for i in np.nonzero(out)[1])
-        correctors.update(measured.correctors[i] for i in np.nonzero(out)[0])
-    if not count:
-        return messages
-    return [
-        *messages,
-        f"{count} of {total} readings are outliers, by more than {SIGNIFICANT:g} times the typical "
-        f"residual of their corrector, and have reduced weights{_most(monitors, correctors)}.",
-    ]
-
-
-def _rf_outliers(state: State) -> list[str]:
-    """A message about outliers of the RF's orbit, at fitted and at other BPMs."""
-    if not state.has_fitted(DISPERSION):
-        return []
-    own = []
-    for block in (0, 1):
-        left = _left(state, block)
-        if np.isfinite(left[-1]).sum() >= FEW:
-            own.append(np.nan_to_num(np.abs(pulls(state, block, left)[-1])))
-    odd = np.flatnonzero(np.any(np.array(own) > SIGNIFICANT, axis=0))
-    if not len(odd):
-        return []
-    names = first_of([state.data.measured.monitors[i] for i in odd])
-    return [
-        f"outlier readings of the RF's orbit, by more than {SIGNIFICANT:g} times its typical "
-        f"residual, with reduced weights where they are fitted: {names}."
-    ]
-
-
-def _left(state: State, block: int) -> Array:
-    """The residual of all columns at good BPMs, given the jitter of the fitted ones."""
-    left = without_jitter(state, block, state.data.pick(state.at.left, block))[0]
-    return np.where(state.good, left, np.nan)
+        if state.has_fitted(DISPERSION) and np.isfinite(left[-1]).sum() >= FEW:
+            of_rf |= out[-1]
+        rows, at = np.nonzero(out & state.fitted[:, None])
+        total += int(np.isfinite(left[state.fitted]).sum())
+        monitors.update(measured.monitors[i] for i in at)
+        correctors.update(measured.correctors[i] for i in rows)
+    messages = []
+    if of_rf.any():
+        names = first_of([measured.monitors[i] for i in np.flatnonzero(of_rf)])
+        messages.append(
+            f"outlier readings of the RF's orbit, by more than {SIGNIFICANT:g} times its typical "
+            f"residual, with reduced weights where they are fitted: {names}."
+        )
+    if monitors:
+        messages.append(
+            f"{monitors.total()} of {total} readings are outliers, by more than {SIGNIFICANT:g} "
+            "times the typical residual of their corrector, and have reduced "
+            f"weights{_most(monitors, correctors)}."
+        )
+    return messages
