@@ -95,6 +95,8 @@ def test_a_jitter_of_the_beam_is_told_and_teaches_nothing(
     size = np.sqrt(np.mean((patterns**2).sum(axis=0)))
     assert size == pytest.approx(np.sqrt(np.mean(amounts**2)) * times * noise, rel=0.4)
     assert error(told.state) < 1.3 * error(still.state)
+    # the RF's other BPMs are predicted with the jitter that its fitted ones show
+    assert told.steps[-1].dispersion_rms < 3 * still.steps[-1].dispersion_rms
     if times > 100:
         monkeypatch.setattr("tmlattice.diagnosis.response.hierarchical.sought", lambda state: None)
         assert error(found(moved).state) > 10 * error(told.state)
