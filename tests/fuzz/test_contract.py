@@ -49,7 +49,7 @@ def test_one_wrong_reading_does_not_spoil_the_others(inputs):
     ring = load_ring(inputs.folder / "ring.json")
     measured = read_measurement(inputs.folder / "response")
     orbit = measured.rf.orbit.copy()
-    orbit[2, 0] += 0.02
+    orbit[3, 0] += 0.02
     wrong = replace(measured, rf=replace(measured.rf, orbit=orbit))
     found = diagnose(ring, wrong, effects=["quadrupole_gradient", "monitor_gain_x"])
     assert found.fit_after.rms < 1.01 * found.fit_before.rms

@@ -218,6 +218,6 @@ def split_columns(data: ResponseData, holdout: float, rng: np.random.Generator) 
     drawn = np.append(np.delete(drawn, alone), drawn[alone])  # each plane has one in the fit
     held[drawn[:count]] = True
     half = np.zeros((columns, monitors), dtype=bool)
-    for own in half:
-        own[rng.choice(monitors, monitors // 2, replace=False)] = True
+    for own in half:  # one of each two neighbours: either half covers the whole ring
+        own[np.arange(0, monitors - 1, 2) + rng.integers(2, size=monitors // 2)] = True
     return Split(held, half)
