@@ -269,27 +269,17 @@ def table(rings):
 
 def table_of_missing(rings):
     """What the first seed of each ring still lacks: those that help, or would."""
-    yield ("| ring | hypothesis | numbers | amount | sensible | in plane: alone | on top "
-           "| random | log evidence | so |")  # fmt: skip
-    yield "|" + "---|" * 10
+    yield "| ring | hypothesis | numbers | amount | sensible | in plane | evidence | on top | so |"
+    yield "|" + "---|" * 9
     for found in rings:
-        none, *rows = found[0].get("hypotheses") or [None]
-        if none is None:
-            continue
-        yield (f"| {found[0]['ring']} | none | | | | {MICRO * none['heldout_rms_in_plane']:.2f} | "
-               f"{MICRO * none['on_top_in_plane']:.2f} with all that help | | | |")  # fmt: skip
-        for row in rows:
-            if row["judgement"] == "excluded":
-                continue
-            keys = "heldout_rms_in_plane", "on_top_in_plane", "control_in_plane"
-            alone, on_top, random = (
-                "" if row[key] is None else f"{MICRO * row[key]:.2f}" for key in keys
-            )
-            yield (
-                f"| | {row['effect']} | {row['parameters']} | {row['amount']:.2g} ± "
-                f"{row['amount_sigma']:.1g} | {row['expected']} | {alone} | {on_top} | {random} | "
-                f"{row['evidence']:.0f} | {row['judgement']} |"
-            )
+        for row in found[0].get("hypotheses") or ():
+            if row["judgement"] != "excluded":
+                yield (
+                    f"| {found[0]['ring']} | {row['effect']} | {row['parameters']} | "
+                    f"{row['amount']:.2g} ± {row['amount_sigma']:.1g} | {row['expected']} | "
+                    f"{MICRO * row['heldout_rms_in_plane']:.2f} | {row['evidence']:.0f} | "
+                    f"{row['evidence_on_top']:.0f} | {row['judgement']} |"
+                )
 
 
 def table_of_seeds(rings):

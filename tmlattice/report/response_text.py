@@ -61,16 +61,23 @@ def known(value: float) -> str:
 
 
 OUT = "excluded"
-"""Of a hypothesis that does not improve held-out readings."""
+"""Of a hypothesis that the readings do not demand."""
 HYPOTHESIS = (
-    "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "jump", "on top", "random",
+    "hypothesis",
+    "amounts",
+    "amount",
+    "unit",
+    "sensible",
+    "in-plane",
+    "evidence",
+    "on top",
     "so",
-)  # fmt: skip
+)
 
 
 def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
     """Head and rows of the table of hypotheses: amount and error (of several: rms, typical error),
-    held-out rms."""
+    held-out rms, log evidence."""
     rows: list[tuple[str, ...]] = [
         (
             row.effect,
@@ -79,9 +86,8 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
             row.unit,
             row.expected,
             f"{1e6 * row.heldout_rms_in_plane:.3g}",
-            f"{1e6 * row.heldout_rms_position:.3g}",
-            f"{1e6 * row.on_top_in_plane:.3g}",
-            "" if row.control_in_plane is None else three_digits(row.control_in_plane),
+            f"{row.evidence:.1f}",
+            f"{row.evidence_on_top:.1f}",
             row.judgement,
         )
         for row in result.hypotheses or ()
@@ -176,7 +182,10 @@ def common_factors_sentence(result: Diagnosis) -> str:
 
 
 INSTEAD = "Alternative common factors of the same gradients:"
-MISSING = "Missing effects: held-out rms in µm, each alone, and on top of those that improve:"
+MISSING = (
+    "Missing effects: held-out rms in µm and log evidence (natural) of each alone, and evidence on "
+    "top of those that help:"
+)
 FAMILIES = (
     "The same with the decision on one family of errors reversed, after one further round of the "
     "fit (empty: it diverges). A family is rejected if its log evidence (natural) is below 5, if "

@@ -45,11 +45,10 @@ from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
 from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, fit_chi2
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
-from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.rounds import LEARN, evidence_of, settle
 from tmlattice.diagnosis.response.state import Candidate, State, allow, begin, bend, jump
 from tmlattice.diagnosis.response.stated import doubt
-from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.response.validation import HELPS, score
 from tmlattice.diagnosis.response.weights import weighed, weight
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Cause, Hypothesis, RingEffect, find, rare

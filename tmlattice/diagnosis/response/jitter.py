@@ -22,7 +22,6 @@ import numpy as np
 
 from tmlattice.arrays import TINY, Array, Flags
 from tmlattice.beam.kicks import orbits_of_kicks
-from tmlattice.diagnosis.response.missing_effects import FREE
 from tmlattice.diagnosis.response.state import State
 from tmlattice.diagnosis.response.weights import LEAST as NOISE_LEFT
 from tmlattice.diagnosis.response.weights import independent, weight
@@ -38,6 +37,8 @@ ENERGY = "energy"
 """Name of the source that changes the beam's energy."""
 SIZES = np.geomspace(0.01, 3.0, 30)
 """Prior rms of the amplitudes that are tried, in units of the typical column's rms residual."""
+FREE = 30.0
+"""Prior rms of a corrector's roll, in units of the roll that makes the typical residual: flat."""
 ROUNDS = 30
 """Iterations of EM for the prior rms of all sources together."""
 

@@ -166,7 +166,9 @@ def linear(state: State, block: int) -> Linear:
     )  # fmt: skip
 
 
-def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array) -> Linear:
+def with_numbers(
+    there: Linear, state: State, block: int, name: str, rows: Array, learnt: bool = False
+) -> Linear:
     """Return the linearisation with more numbers of the ring, each of prior rms 1.
 
     Args:
@@ -174,6 +176,7 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
         state, block: as there.
         name: of their variable.
         rows: their derivatives, m, [number, column, monitor].
+        learnt: whether the prior rms is learnt; 1 is the largest then.
     """
     if not len(rows):
         return there
@@ -199,7 +202,7 @@ def with_numbers(there: Linear, state: State, block: int, name: str, rows: Array
         trust=np.pad(there.trust, (0, len(rows)), constant_values=1.0),
         ring=(*there.ring, more),
         where={**there.where, name: slice(before, end)},
-        groups=(*groups, Group(name, basis, 1.0, fixed=True)),
+        groups=(*groups, Group(name, basis, 1.0, fixed=not learnt, most=1.0)),
         lowest=np.pad(there.lowest, (0, len(rows)), constant_values=-np.inf),
     )
 

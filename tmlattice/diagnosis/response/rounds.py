@@ -206,18 +206,22 @@ def linear_evidence(there: Linear, gone: Collection[str] = ()) -> float:
         there: `linear` of the fit.
         gone: names of priors that are omitted.
     """
-    left = [group for group in there.groups if group.name not in gone]
-    found = solve(there.normal, left, there.start, rounds=LEARN) if left else None
-    moved = (0 * there.start if found is None else found.values) - there.start
+    return relearnt(there, gone)[0]
+
+
+def relearnt(there: Linear, gone: Collection[str] = ()) -> tuple[float, Posterior]:
+    """Return that log evidence, and the posterior with prior scales learnt without those priors."""
+    none = Group("none", np.zeros((len(there.start), 1)), 1.0, fixed=True)  # without any prior
+    left = [group for group in there.groups if group.name not in gone] or [none]
+    found = solve(there.normal, left, there.start, rounds=LEARN)
+    moved = found.values - there.start
     total = float(there.normal.vector @ moved - 0.5 * moved @ there.normal.matrix @ moved)
-    if found is None:
-        return total
     total += found.occam
     for rows in there.where.values():
         groups = [g for g in found.groups if g.basis[rows].any()]
         if groups:
             total -= 0.5 * _penalty(groups, rows, found.values[rows])
-    return total
+    return total, found
 
 
 def evidence_of(state: State, good: Flags, shares: Array | None = None) -> float:

@@ -15,10 +15,9 @@ from tmlattice.diagnosis.assessment import MISSING
 from tmlattice.diagnosis.families.family import StatedCause
 from tmlattice.diagnosis.findings import findings_of, finished, verdict_of
 from tmlattice.diagnosis.response.hierarchical import HierarchicalFit
-from tmlattice.diagnosis.response.missing_effects import HELPS
 from tmlattice.diagnosis.response.state import State, begin
 from tmlattice.diagnosis.response.undetermined import Blur, SingleChange, Undetermined
-from tmlattice.diagnosis.response.validation import score
+from tmlattice.diagnosis.response.validation import HELPS, score
 from tmlattice.diagnosis.result import Finding
 from tmlattice.effects import Hypothesis, LaunchEffect, find, rare
 from tmlattice.effects.effect import FamilyEffect

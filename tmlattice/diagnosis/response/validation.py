@@ -31,6 +31,9 @@ from tmlattice.diagnosis.response.weights import without_jitter
 from tmlattice.effects import with_labels
 from tmlattice.inference.normal import Posterior
 
+HELPS = 0.98
+"""Ratio of held-out rms, with and without causes, below which they improve the prediction."""
+
 
 @dataclass(frozen=True)
 class Step:
