@@ -292,7 +292,8 @@ def main():
     data = os.environ.get("TMLATTICE_DATA")
     if not data:
         sys.exit("set TMLATTICE_DATA to the folder that holds real_rings")
-    procedure.LARGE = 0  # the ring alone is wanted of the first day
+    # the ring alone is wanted of the first day
+    procedure.detected_faults = lambda *args: ((), [], [])
     known = sources(Path(data))
     with tempfile.TemporaryDirectory() as place:
         rows = [

@@ -357,7 +357,7 @@ def main():
         print(*table_of_seeds(rings), sep="\n")
         return
     if options.families:
-        procedure.LARGE = 0
+        procedure.detected_faults = lambda *args: ((), [], [])
     if not os.environ.get("TMLATTICE_DATA"):
         sys.exit("TMLATTICE_DATA names no folder of measured data")
     if options.into:

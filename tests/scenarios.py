@@ -164,7 +164,8 @@ def run(own: Scenario) -> dict[str, Any]:
         if one is None:
             faults.append(f"not found: {cause.effect} {cause.element}")
         elif one.effect == cause.effect and one.amount_sigma and np.isfinite(cause.amount):
-            pulls.append(_number((one.amount - cause.amount) / one.amount_sigma))
+            amount = _amounts(one).get(_key(cause), one.amount)
+            pulls.append(_number((amount - cause.amount) / one.amount_sigma))
             if abs(pulls[-1]) > ERRORS:
                 faults.append(f"{cause.effect} {cause.element}: {pulls[-1]:.1f} errors from it")
     if len(result.findings) > len(wanted) + own.others:
@@ -195,12 +196,19 @@ def _unsaid(own: Scenario, text: str) -> list[str]:
 
 
 def _holds(finding: Any, cause: Cause) -> bool:
-    members = [(one.effect, one.element) for one in finding.credible_set]
     if cause.effect.startswith("exchanged"):
         return set(finding.elements) == set((cause.element or "").split(","))
-    named = [*members, (finding.effect, finding.element)]
-    wanted = (cause.effect, (cause.element or "").casefold())  # a family has no case
-    return wanted in [(effect, (element or "").casefold()) for effect, element in named]
+    return _key(cause) in _amounts(finding)
+
+
+def _key(cause: Any) -> tuple[str, str]:
+    return cause.effect, (cause.element or "").casefold()  # a family has no case
+
+
+def _amounts(finding: Any) -> dict[tuple[str, str], float]:
+    """The finding's amount, and those of its alternatives: that of the opposite side of a symmetric
+    ring may have the other sign."""
+    return {_key(one): one.amount for one in (finding, *finding.credible_set)}
 
 
 def _number(value: float | None) -> float | None:

@@ -1,6 +1,6 @@
 """Single faults of an orbit response among distributed errors.
 
->>> apart, findings = detected_faults(data, split, fit.state, hypotheses, most, judgement)
+>>> apart, findings, messages = detected_faults(data, split, fit.state, hypotheses, most, judgement)
 
 All usual distributed errors of a ring are the background model of a fault (`small_errors`): the
 families of a hierarchical fit, and the closed orbit in sextupoles. All readings are fitted; of
@@ -396,8 +396,9 @@ def detected_faults(
     most: int,
     judgement: Judgement,
     progress: Callable[[str], Any] = lambda stage: None,
-) -> tuple[tuple[Candidate, ...], list[Finding]]:
-    """Return the detected faults, one after another, each given those before it; and the findings.
+) -> tuple[tuple[Candidate, ...], list[Finding], list[str]]:
+    """Return the detected faults, one after another, each given those before it; the findings; and
+    a message if the residual is too large for a search.
 
     Args:
         data, split: the data, and the validation split.
@@ -410,8 +411,11 @@ def detected_faults(
     progress("distributed errors")
     search = _Search(small_errors(data, split, fitted), hypotheses, judgement)
     progress("detected faults")
+    lost = search.drowned()
+    if lost is not None:
+        return (), [], [lost]
     seen_before: list[set[Hypothesis]] = []
-    while not search.drowned() and len(search.state.apart) < min(most, Search.most):
+    while len(search.state.apart) < min(most, Search.most):
         state = search.next()
         if state is None:
             break
@@ -422,7 +426,7 @@ def detected_faults(
             break
         seen_before.append(chosen)
     apart = search.state.apart
-    return apart, [search.finding(search.seen(search.state), one) for one in apart]
+    return apart, [search.finding(search.seen(search.state), one) for one in apart], []
 
 
 class _Search:
@@ -445,17 +449,23 @@ class _Search:
             self.latest = Seen(state, self.hypotheses, self.problem)
         return self.latest
 
-    def drowned(self) -> bool:
-        """Whether the residual far exceeds the noise, and no single cause explains most of it:
-        model discrepancy could be detected as a fault."""
+    def drowned(self) -> str | None:
+        """The message that the residual far exceeds the noise, and no single cause explains most of
+        it: model discrepancy could be detected as a fault. None otherwise."""
         planes = fit_chi2(self.state)[:2]
         worst = max((0, 1), key=lambda plane: planes[plane].ratio)
         own = planes[worst]
-        if own.ratio**2 <= LACKS or self.state.apart:
-            return False
+        if own.ratio**2 <= LACKS:
+            return None
         # by the noise alone: a large residual of a column reduces its weight
         left = [self.left_beside(*leader)[worst] for leader in self.leaders()]
-        return min(left, default=np.inf) > (own.chi2 + own.freedom) / 2
+        if min(left, default=np.inf) <= (own.chi2 + own.freedom) / 2:
+            return None
+        return (
+            "single faults among the distributed errors were not sought: chi-square per reading is "
+            f"{own.ratio**2:.2g} {('in plane', 'across')[worst]} given all of them, and no single "
+            "cause explains half of that"
+        )
 
     def left_beside(self, cause: Hypothesis, amount: float, information: Array) -> list[float]:
         """Chi-square of each plane with one more cause, all else unchanged; infinite without a

@@ -78,11 +78,6 @@ from tmlattice.optics import ring_tunes
 
 PATTERNS = 8
 """Number of the strongest patterns of the residual."""
-LARGE = 60_000
-"""Most readings for the search for single faults among distributed errors, which refits all."""
-TOO_LARGE = (
-    "single faults among the distributed errors were not sought: there are too many readings"
-)
 
 
 def diagnose_response(
@@ -137,10 +132,9 @@ def diagnose_response(
     if sparse is None:
         fit, measured, labels = whole
         fit = reversed_decisions(fit, progress)
-        notes += [*label_messages(own for own in labels if own not in fit.labels), *fit.messages]
-        notes += [] if measured.response.size <= LARGE else [TOO_LARGE]
         rejected = tuple((own.elements[0], own.plane) for own in labels if "rejected" in own.kind)
         fit, findings = _faults(fit, labels, effects, max_effects, judgement, progress)
+        notes += [*label_messages(own for own in labels if own not in fit.labels), *fit.messages]
         found, supports, degenerate, correlated, covariance = fitted_causes(fit.state)
         verdict = least_certain(findings, _verdict(fit, false_alarm))
     else:
@@ -230,11 +224,12 @@ def _faults(
     found = [swap_of(state, own.elements[0], judgement) for own in planes
              if own.kind == "swapped planes"]  # fmt: skip
     hypotheses = single_causes(state.data, effects)
-    if hypotheses and state.data.measured.response.size <= LARGE:
-        apart, alone = detected_faults(
+    if hypotheses:
+        apart, alone, messages = detected_faults(
             state.data, state.split, state, hypotheses, most, judgement, progress
         )
         fit = given_faults(fit, apart) if apart else fit
+        fit = replace(fit, messages=(*fit.messages, *messages))
         found += alone
     of_labels = (own.finding(ring) for own in labels)
     found = [*strongest_first(found)[:most], *(own for own in of_labels if own is not None)]
