@@ -30,6 +30,7 @@ from tmlattice.diagnosis.response.labels import (
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.rounds import (
+    REQUIRED,
     evidence_of,
     linear_evidence,
     one_step,
@@ -52,8 +53,6 @@ from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
 
-LEAST = 5.0
-"""Log evidence required for a family."""
 ASTRAY, NEAR = 1.2, 1e-3
 """Largest unexplained share of the typical column's mean square: as a ratio to the design's, or
 itself if that is more. Above it the fit has diverged."""
@@ -210,7 +209,7 @@ def _unneeded(
                 evidence[own] = whole - linear_evidence(there, left | _priors(own, state))
                 log.info("%s: log evidence %+.1f", _title(own), evidence[own])
             # a trial that is needed given all others is needed without some of them
-            untested = [own for own in untested if evidence[own] <= LEAST]
+            untested = [own for own in untested if evidence[own] <= REQUIRED]
             if untested:
                 least = min(untested, key=evidence.__getitem__)
                 untested.remove(least)

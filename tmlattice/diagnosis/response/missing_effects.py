@@ -20,9 +20,8 @@ from numpy.polynomial.legendre import legvander
 
 from tmlattice.arrays import Array, rms
 from tmlattice.diagnosis.families.fields import QuadrupoleGradient
-from tmlattice.diagnosis.response.hierarchical import LEAST
 from tmlattice.diagnosis.response.linear import Linear, linear, with_numbers
-from tmlattice.diagnosis.response.rounds import relearnt
+from tmlattice.diagnosis.response.rounds import REQUIRED, relearnt
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import apply
@@ -311,7 +310,7 @@ class Weighed:
         amount_sigma: its posterior rms; of several, the median one.
         heldout_rms_in_plane: with it alone, m; see `Step`.
         evidence: gain of log evidence with it alone.
-        evidence_on_top: and beside the others that help.
+        evidence_on_top: and given the others that help.
         judgement: "helps"; "helps, not on top" (of others that help); "unphysical" (demanded by the
             readings with an implausible amount); "excluded".
     """
@@ -333,11 +332,11 @@ def weigh(
     wanted: Iterable[str] | None = None,
     progress: Callable[[str], Any] = lambda stage: None,
 ) -> list[Weighed]:
-    """Return the scores of every hypothesis alone and beside the others. The first row is the fit;
+    """Return the scores of every hypothesis alone and given the others. The first row is the fit;
     its `evidence_on_top` is of all that help, together.
 
     Plausible ones are accepted one by one, that with the most evidence first, as long as each gains
-    enough beside those before.
+    enough given those before.
 
     Args:
         state: of the fit.
@@ -379,7 +378,7 @@ def weigh(
     on_top = {name: row.evidence for name, row in alone.items()}
     while True:
         best = max((on_top.keys() & plausible) - {*chosen}, key=on_top.__getitem__, default=None)
-        if best is None or not on_top[best] > LEAST:
+        if best is None or not on_top[best] > REQUIRED:
             break
         chosen, together = [*chosen, best], together + on_top[best]
         on_top |= {n: with_these(*chosen, n)[0] - together for n in found.keys() - chosen}
@@ -388,7 +387,7 @@ def weigh(
     out = [replace(first, evidence_on_top=together - without)]
     for name, row in alone.items():
         judgement = "excluded"
-        if max(row.evidence, on_top[name]) > LEAST:
+        if max(row.evidence, on_top[name]) > REQUIRED:
             judgement = "helps, not on top" if name in plausible else "unphysical"
         judgement = "helps" if name in chosen else judgement
         out.append(replace(row, evidence_on_top=on_top[name], judgement=judgement))

@@ -33,6 +33,8 @@ TOGETHER, REPEATED = 2, 2
 NARROWER, WIDER, WIDEST = 4.0, 2.0, 8.0
 """Divisor of the bounds of a step that raised the cost of its block, and of all at a return; their
 growth, and its limit."""
+REQUIRED = 5.0
+"""Log evidence required for a family of errors, or for another effect."""
 CROSSED = 4
 """Repetitions of a step that crosses lower bounds."""
 CORRECTED, CORRECTS = 6, 1e-3
