@@ -260,7 +260,28 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
     if effect in expected:
         amount, share = expected[effect]
         assert rows[effect].amount == pytest.approx(amount, rel=share)
-    assert rows["none"].evidence_on_top >= rows[effect].evidence
+    if effect in expected:  # the same number in all columns
+        assert rows[effect].heldout_rms_in_plane < 0.98 * rows["none"].heldout_rms_in_plane
+
+
+def test_two_effects_are_named_and_families_are_none_of_them(small_ring):
+    """Fields of all correctors 2 cm downstream are a family of the fit: no hypothesis then."""
+    places = [Cause("corrector_position", f"v{i}", 0.02) for i in range(16)]
+    measured = simulate_response(
+        small_ring, places, kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4
+    ).measured
+    response = measured.response + 8e2 / 4 * measured.response**3
+    response[1:] += 4e-3 * response[:-1].copy()
+    steps = [*STEPS[:3], *(own for own in STEPS if own[0].name == "corrector_position")]
+    state = fitted(small_ring, replace(measured, response=response), steps=steps)
+    assert state.allows("corrector_position")
+    wanted = ["hysteresis", "corrector_position", "monitor_nonlinearity"]
+    none, *rows = weigh(state, wanted)
+    assert [row.judgement for row in rows] == ["helps", "excluded", "helps"]
+    assert none.evidence_on_top > max(row.evidence for row in rows)
+    assert weigh(state, wanted[1:2])[0].heldout_rms_in_plane == pytest.approx(
+        none.heldout_rms_in_plane, rel=1e-6
+    )
 
 
 def test_tunes_go_with_the_energy_as_ats(small_ring):

@@ -191,7 +191,7 @@ def test_a_reversed_decision_is_felt_in_its_own_plane(small_ring, rng):
     assert min(rows[name].log_evidence for name in ("quadrupole_gradient", "monitor_roll")) > 100
     idle = rows["corrector_position"]
     assert not idle.kept
-    assert idle.log_evidence < hierarchical.LEAST
+    assert idle.log_evidence < rounds.REQUIRED
     assert ratio["corrector_position"] == pytest.approx((1, 1), abs=0.1)
 
 

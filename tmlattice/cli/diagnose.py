@@ -81,7 +81,7 @@ log = logging.getLogger(__name__)
 @click.option(
     "--missing",
     is_flag=True,
-    help="Of an orbit response: weigh on held-out readings which effect the result still lacks.",
+    help="Of an orbit response: test by log evidence which effect the result still lacks.",
 )
 @radiation_option
 @seed_option("Of the split, the threshold's simulation and the bootstrap.")

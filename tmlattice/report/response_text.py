@@ -61,7 +61,7 @@ def known(value: float) -> str:
 
 
 OUT = "excluded"
-"""Of a hypothesis that the readings do not demand."""
+"""Of a hypothesis without evidence."""
 HYPOTHESIS = (
     "hypothesis",
     "amounts",

@@ -411,9 +411,9 @@ def detected_faults(
     progress("distributed errors")
     search = _Search(small_errors(data, split, fitted), hypotheses, judgement)
     progress("detected faults")
-    lost = search.drowned()
-    if lost is not None:
-        return (), [], [lost]
+    message = search.discrepancy_message()
+    if message is not None:
+        return (), [], [message]
     seen_before: list[set[Hypothesis]] = []
     while len(search.state.apart) < min(most, Search.most):
         state = search.next()
@@ -449,7 +449,7 @@ class _Search:
             self.latest = Seen(state, self.hypotheses, self.problem)
         return self.latest
 
-    def drowned(self) -> str | None:
+    def discrepancy_message(self) -> str | None:
         """The message that the residual far exceeds the noise, and no single cause explains most of
         it: model discrepancy could be detected as a fault. None otherwise."""
         planes = fit_chi2(self.state)[:2]
@@ -464,7 +464,7 @@ class _Search:
         return (
             "single faults among the distributed errors were not sought: chi-square per reading is "
             f"{own.ratio**2:.2g} {('in plane', 'across')[worst]} given all of them, and no single "
-            "cause explains half of that"
+            "cause explains half of the excess: run with --missing"
         )
 
     def left_beside(self, cause: Hypothesis, amount: float, information: Array) -> list[float]:

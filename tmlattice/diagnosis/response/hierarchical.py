@@ -87,7 +87,7 @@ class HierarchicalFit:
         design, state: before and after.
         steps: the design's scores, and the result's; then those given faults.
         decisions: on each trial, with its log evidence; scores: see `reversed_decisions`.
-        messages: about rejected readings, implausible families and beam jitter.
+        messages: about rejected readings, implausible families, beam jitter, and single faults.
         labels: of rejected steps.
     """
 

@@ -1,11 +1,12 @@
-"""Effects missing from a fitted orbit response: which of them do its readings demand?
+"""Effects missing from a fitted orbit response, by its log evidence.
 
 >>> fit = fit_families(data, split)
 >>> for row in weigh(fit.state): print(row.effect, row.amount, row.amount_sigma, row.judgement)
 
 A hypothesis is a set of patterns, the derivatives of the readings by its numbers. They join the
 numbers of the fit, linearised, and the marginal likelihood of the fitted readings decides, as on
-families of errors; held-out readings validate the result.
+families of errors. Held-out readings are predicted with each; numbers of their own columns, which
+no fitted reading determines, are zero.
 
 To add a hypothesis, write a function that returns its patterns at the fit, and add it to
 `HYPOTHESES`. What is a family of the fit, or beam jitter, is none: every fit tests it.
@@ -34,6 +35,8 @@ BEND_GRADIENT = 1e-4
 MILLIMETRE = 1e-3
 ORDERS = 3
 """Order of the polynomial of a drift over all columns."""
+PRIOR = "missing: "
+"""Beginning of the names of their priors: families have such names, too."""
 WAVES = 4
 """Number of leading closed orbits of random kicks in a plane."""
 
@@ -169,7 +172,7 @@ def _orbit_in_time(state: State) -> MissingEffect:
     )  # fmt: skip
 
 
-def _tunes(state: State) -> Array:
+def _gradients(state: State) -> Array:
     """Derivatives by all focusing, and by all defocusing, gradients, without the RF's."""
     total = np.zeros((2, len(state.data.plane), len(state.data.at)))
     single = QuadrupoleGradient()
@@ -182,14 +185,14 @@ def _tunes(state: State) -> Array:
 def _gradient_drift(state: State) -> MissingEffect:
     return MissingEffect(
         "drift of the gradients (focusing, defocusing)", "relative", "< 1e-4",
-        _each(_tunes(state)), most=1e-4,
+        _each(_gradients(state)), most=1e-4,
     )  # fmt: skip
 
 
 def _gradients_in_time(state: State) -> MissingEffect:
     return MissingEffect(
         "drift of the gradients in order of time", "relative", "< 1e-4",
-        _in_time(state, _tunes(state), constant=False), most=1e-4,
+        _in_time(state, _gradients(state), constant=False), most=1e-4,
     )  # fmt: skip
 
 
@@ -308,11 +311,12 @@ class Weighed:
         parameters: the number of its numbers that fitted readings depend on.
         amount: with it alone; of several, their rms.
         amount_sigma: its posterior rms; of several, the median one.
-        heldout_rms_in_plane: with it alone, m; see `Step`.
+        heldout_rms_in_plane: with it alone, m; see `Step`. Numbers of single held-out columns are
+            zero.
         evidence: gain of log evidence with it alone.
         evidence_on_top: and given the others that help.
-        judgement: "helps"; "helps, not on top" (of others that help); "unphysical" (demanded by the
-            readings with an implausible amount); "excluded".
+        judgement: "helps": gains log evidence given the others that help, with a plausible amount;
+            "helps, not on top": alone; "unphysical": with an implausible amount; "excluded".
     """
 
     effect: str
@@ -336,7 +340,7 @@ def weigh(
     its `evidence_on_top` is of all that help, together.
 
     Plausible ones are accepted one by one, that with the most evidence first, as long as each gains
-    enough given those before.
+    enough given those before; those that no longer do are left out again.
 
     Args:
         state: of the fit.
@@ -350,46 +354,65 @@ def weigh(
         own = HYPOTHESES[name](state)
         if own is None:
             continue
-        rows = own.patterns[np.any(own.patterns * used, axis=(1, 2))]
-        if not len(rows):  # no such places, or no sensitive fitted readings
+        sensitive = [bool(np.any(row * used)) for row in own.patterns]
+        if not any(sensitive):  # no such places, or no sensitive fitted readings
             continue
-        many = len(rows) > ENOUGH
-        there = with_numbers(there, state, 0, name, own.most * rows, learnt=many)
-        found[name] = own
-    progress("hypotheses together")
+        rows, many = own.most * own.patterns[sensitive], sum(sensitive) > ENOUGH
+        there = with_numbers(there, state, 0, PRIOR + name, rows, learnt=many)
+        found[name] = replace(own, patterns=own.patterns[:0])  # large
 
     def with_these(*names: str) -> tuple[float, Posterior]:
-        return relearnt(there, found.keys() - names)
+        return relearnt(there, {PRIOR + name for name in found.keys() - names})
+
+    def amount(fit: Posterior, name: str) -> float:
+        own = found[name].most * fit.values[there.where[PRIOR + name]]
+        return float(own[0]) if len(own) == 1 else rms(own)
+
+    def sensible(fit: Posterior, name: str) -> bool:
+        return abs(amount(fit, name)) < found[name].most
 
     without, fit = with_these()
     first = Weighed("none", "", "", 0, 0.0, 0.0, _heldout(state, there, fit), 0.0, 0.0, "")
-    alone = {}
+    alone, on_top, plausible = dict[str, Weighed](), dict[str, float](), set[str]()
     for name, own in found.items():
+        progress(own.effect)
         evidence, fit = with_these(name)
-        at = there.where[name]
-        amounts, sigma = own.most * fit.values[at], own.most * fit.sigma[at]
-        size = float(amounts[0]) if len(amounts) == 1 else rms(amounts)
+        sigma = own.most * fit.sigma[there.where[PRIOR + name]]
+        on_top[name] = evidence - without
         alone[name] = Weighed(
-            own.effect, own.unit, own.expected, len(amounts), size, float(np.median(sigma)),
-            _heldout(state, there, fit), evidence - without, evidence - without, "excluded",
+            own.effect, own.unit, own.expected, len(sigma), amount(fit, name),
+            float(np.median(sigma)), _heldout(state, there, fit), on_top[name], on_top[name], "",
         )  # fmt: skip
-    plausible = {name for name, row in alone.items() if abs(row.amount) < found[name].most}
-    chosen, together = list[str](), without
-    on_top = {name: row.evidence for name, row in alone.items()}
+        plausible |= {name} if sensible(fit, name) else set()
+    physical, chosen, together = frozenset(plausible), list[str](), without
     while True:
-        best = max((on_top.keys() & plausible) - {*chosen}, key=on_top.__getitem__, default=None)
-        if best is None or not on_top[best] > REQUIRED:
+        best = max(plausible - {*chosen}, key=on_top.__getitem__, default=None)
+        if best is None or on_top[best] <= REQUIRED:
             break
-        chosen, together = [*chosen, best], together + on_top[best]
-        on_top |= {n: with_these(*chosen, n)[0] - together for n in found.keys() - chosen}
-    for name in chosen:
-        on_top[name] = together - with_these(*(other for other in chosen if other != name))[0]
+        chosen.append(best)
+        while True:  # without those that it replaces
+            together = with_these(*chosen)[0]
+            for name in chosen:
+                on_top[name] = together - with_these(*{*chosen} - {name})[0]
+            least = min(chosen, key=on_top.__getitem__)
+            if on_top[least] > REQUIRED:
+                break
+            chosen.remove(least)
+        plausible = set()
+        for name in found.keys() - chosen:
+            progress(found[name].effect)
+            evidence, fit = with_these(*chosen, name)
+            on_top[name] = evidence - together
+            plausible |= {name} if sensible(fit, name) else set()
     out = [replace(first, evidence_on_top=together - without)]
     for name, row in alone.items():
         judgement = "excluded"
-        if max(row.evidence, on_top[name]) > REQUIRED:
-            judgement = "helps, not on top" if name in plausible else "unphysical"
-        judgement = "helps" if name in chosen else judgement
+        if name in chosen:
+            judgement = "helps"
+        elif on_top[name] > REQUIRED:
+            judgement = "unphysical"
+        elif row.evidence > REQUIRED:
+            judgement = "helps, not on top" if name in physical else "unphysical"
         out.append(replace(row, evidence_on_top=on_top[name], judgement=judgement))
     return out
 
@@ -401,5 +424,6 @@ def _heldout(state: State, there: Linear, fit: Posterior) -> float:
     orbits = data.pick(data.orbits)[columns]
     seen = np.isfinite(orbits) & state.good
     near, far = seen & split.half[columns], seen & ~split.half[columns]
+    far &= near.any(axis=1, keepdims=True)
     read = data.pick(state.at.read) + there.readings(data.plane, fit.values - there.start)
     return rms_of(amplitudes(read[columns, :, None], orbits, near)[1][far])

@@ -1,9 +1,9 @@
 """Diagnosis of an orbit response by families of errors, validated on held-out readings.
 
-One fifth of the correctors is never fitted. For each of them the kick is estimated from a random
-half of the BPMs, and the prediction is scored on the other half. The RF's orbit is fitted at half
-of the BPMs and scored at the other half. Families are selected by the marginal likelihood of the
-fitted readings.
+One fifth of the correctors is never fitted. For each of them the kick is estimated from half of
+the BPMs, one of each two neighbours, and the prediction is scored on the other half. The RF's orbit
+is fitted at half of the BPMs and scored at the other half. Families are selected by the marginal
+likelihood of the fitted readings.
 
 >>> result = diagnose_response(ring, measured)
 >>> [(step.effect, step.heldout_rms_in_plane) for step in result.steps]
