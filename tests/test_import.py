@@ -859,7 +859,8 @@ def test_turns_of_the_sps():
 
 def test_a_reader_that_does_not_come_back_is_one_sentence(tmp_path, monkeypatch):
     """A quarter of a million references to one number: 2 MB, and many seconds."""
-    monkeypatch.setattr("tmlattice.lattice.mat_file.SECONDS", 0)
+    monkeypatch.setattr("tmlattice.lattice.mat_file.SECONDS", 1)
+    monkeypatch.setattr("tmlattice.lattice.mat_file.RATE", np.inf)
     monkeypatch.setattr("tmlattice.lattice.mat_file.BUSY", 100)  # the processor's seconds end it
     path = tmp_path / "cells.mat"
     save_as_hdf5(path, {"one": 1.0})

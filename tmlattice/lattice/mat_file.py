@@ -13,11 +13,11 @@ from tmlattice.input_files import check_regular
 from tmlattice.lattice import binary_files
 
 SECONDS = 3
-"""Of the processor; longer than any file of a ring takes to open."""
+"""Of the processor, for the libraries and any small file."""
 BUSY = 30
 """Times as long by the clock, where others use the machine or the disk is slow."""
-RATE = 2e6
-"""Bytes that are read in a second at least, beyond that."""
+RATE = 2e5
+"""Bytes that are read in a second at least, beyond that: structures of MATLAB at 3e5."""
 
 
 def read_apart(
