@@ -385,12 +385,12 @@ def weigh(
         )  # fmt: skip
         plausible |= {name} if sensible(fit, name) else set()
     physical, chosen, together = frozenset(plausible), list[str](), without
-    while True:
+    for _ in found:
         best = max(plausible - {*chosen}, key=on_top.__getitem__, default=None)
         if best is None or on_top[best] <= REQUIRED:
             break
         chosen.append(best)
-        while True:  # without those that it replaces
+        while chosen:  # without those that it replaces
             together = with_these(*chosen)[0]
             for name in chosen:
                 on_top[name] = together - with_these(*{*chosen} - {name})[0]
@@ -398,6 +398,8 @@ def weigh(
             if on_top[least] > REQUIRED:
                 break
             chosen.remove(least)
+        else:
+            together = without
         plausible = set()
         for name in found.keys() - chosen:
             progress(found[name].effect)
