@@ -165,9 +165,7 @@ def run(own: Scenario) -> dict[str, Any]:
             faults.append(f"not found: {cause.effect} {cause.element}")
         elif one.effect == cause.effect and one.amount_sigma and np.isfinite(cause.amount):
             amount = _amounts(one).get(_key(cause), one.amount)
-            sigma = one.amount_sigma * abs(
-                amount / one.amount
-            )  # of an alternative: as large a share
+            sigma = one.amount_sigma * abs(amount / one.amount)  # an alternative's: alike
             pulls.append(_number((amount - cause.amount) / sigma))
             if abs(pulls[-1]) > ERRORS:
                 faults.append(f"{cause.effect} {cause.element}: {pulls[-1]:.1f} errors from it")

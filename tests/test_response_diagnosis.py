@@ -15,7 +15,7 @@ from tmlattice import diagnose
 from tmlattice.beam.closed_orbit import ResponseModel
 from tmlattice.diagnosis.families.steps import STEPS
 from tmlattice.diagnosis.response.hierarchical import fit_families
-from tmlattice.diagnosis.response.missing_effects import weigh
+from tmlattice.diagnosis.response.missing_effects import HYPOTHESES, weigh
 from tmlattice.diagnosis.response.validation import score
 from tmlattice.effects import Cause, apply, with_labels
 from tmlattice.errors import MeasurementError
@@ -59,6 +59,7 @@ def test_the_only_corrector_of_a_plane_is_fitted(small_ring, measured):
     for seed in range(20):
         split = split_columns(data, 0.3, np.random.default_rng(seed))
         assert not split.held[:-1][alone].any()
+        assert (split.half[:, :34:2] ^ split.half[:, 1:34:2]).all()  # one of each two neighbours
 
 
 @pytest.fixture(scope="module")
@@ -262,6 +263,28 @@ def test_a_withheld_effect_is_named(small_ring, rng, made, effect):
         assert rows[effect].amount == pytest.approx(amount, rel=share)
     if effect in expected:  # the same number in all columns
         assert rows[effect].heldout_rms_in_plane < 0.98 * rows["none"].heldout_rms_in_plane
+
+
+def test_orbits_of_other_columns_explain_no_drift(small_ring, rng, monkeypatch):
+    """They are as smooth and as many as those of a drift that is there."""
+    measured = simulate_response(
+        small_ring, [], kick=STEP, noise=1e-9, engine="ocelot", progress=False, seed=4
+    ).measured
+    response = wandering_gradients(small_ring, rng)
+    response += rng.normal(0, 1e-9, response.shape)
+    drift = HYPOTHESES["gradient_drift"]
+
+    def scrambled(state):
+        own, draw = drift(state), np.random.default_rng(17)
+        by = draw.integers(8, 27, len(own.patterns))
+        rows = [np.roll(row, n, axis=1) for row, n in zip(own.patterns, by, strict=True)]
+        return replace(own, patterns=np.array(rows))
+
+    monkeypatch.setitem(HYPOTHESES, "scrambled", scrambled)
+    state = fitted(small_ring, replace(measured, response=response))
+    _, own, other = weigh(state, ["gradient_drift", "scrambled"])
+    assert [own.judgement, other.judgement] == ["helps", "excluded"]
+    assert own.evidence > 100 + other.evidence
 
 
 def test_two_effects_are_named_and_families_are_none_of_them(small_ring):

@@ -63,16 +63,8 @@ def known(value: float) -> str:
 OUT = "excluded"
 """Of a hypothesis without evidence."""
 HYPOTHESIS = (
-    "hypothesis",
-    "amounts",
-    "amount",
-    "unit",
-    "sensible",
-    "in-plane",
-    "evidence",
-    "on top",
-    "so",
-)
+    "hypothesis", "amounts", "amount", "unit", "sensible", "in-plane", "evidence", "on top", "so",
+)  # fmt: skip
 
 
 def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:

@@ -24,6 +24,7 @@ from tmlattice.diagnosis.families.fields import QuadrupoleGradient
 from tmlattice.diagnosis.response.linear import Linear, linear, with_numbers
 from tmlattice.diagnosis.response.rounds import REQUIRED, relearnt
 from tmlattice.diagnosis.response.state import State, amplitudes, rms_of
+from tmlattice.diagnosis.response.validation import held_out
 from tmlattice.diagnosis.response.weights import weight
 from tmlattice.effects import apply
 from tmlattice.inference.judgement import ENOUGH
@@ -368,12 +369,9 @@ def weigh(
         own = found[name].most * fit.values[there.where[PRIOR + name]]
         return float(own[0]) if len(own) == 1 else rms(own)
 
-    def sensible(fit: Posterior, name: str) -> bool:
-        return abs(amount(fit, name)) < found[name].most
-
     without, fit = with_these()
     first = Weighed("none", "", "", 0, 0.0, 0.0, _heldout(state, there, fit), 0.0, 0.0, "")
-    alone, on_top, plausible = dict[str, Weighed](), dict[str, float](), set[str]()
+    alone, on_top = dict[str, Weighed](), dict[str, float]()
     for name, own in found.items():
         progress(own.effect)
         evidence, fit = with_these(name)
@@ -383,8 +381,8 @@ def weigh(
             own.effect, own.unit, own.expected, len(sigma), amount(fit, name),
             float(np.median(sigma)), _heldout(state, there, fit), on_top[name], on_top[name], "",
         )  # fmt: skip
-        plausible |= {name} if sensible(fit, name) else set()
-    physical, chosen, together = frozenset(plausible), list[str](), without
+    physical = {name for name, row in alone.items() if abs(row.amount) < found[name].most}
+    plausible, chosen, together = physical, list[str](), without
     for _ in found:
         best = max(plausible - {*chosen}, key=on_top.__getitem__, default=None)
         if best is None or on_top[best] <= REQUIRED:
@@ -405,7 +403,8 @@ def weigh(
             progress(found[name].effect)
             evidence, fit = with_these(*chosen, name)
             on_top[name] = evidence - together
-            plausible |= {name} if sensible(fit, name) else set()
+            if abs(amount(fit, name)) < found[name].most:
+                plausible.add(name)
     out = [replace(first, evidence_on_top=together - without)]
     for name, row in alone.items():
         judgement = "excluded"
@@ -421,11 +420,8 @@ def weigh(
 
 def _heldout(state: State, there: Linear, fit: Posterior) -> float:
     """The rms residual of held-out correctors in plane, m, see `validation.score`."""
-    split, data = state.split, state.data
-    columns = np.flatnonzero(split.held)
-    orbits = data.pick(data.orbits)[columns]
-    seen = np.isfinite(orbits) & state.good
-    near, far = seen & split.half[columns], seen & ~split.half[columns]
-    far &= near.any(axis=1, keepdims=True)
+    data = state.data
+    columns, near, far = held_out(state)
     read = data.pick(state.at.read) + there.readings(data.plane, fit.values - there.start)
+    orbits = data.pick(data.orbits)[columns]
     return rms_of(amplitudes(read[columns, :, None], orbits, near)[1][far])

@@ -72,6 +72,16 @@ class Step:
         return f"{'without' if self.kept else 'with'} {with_labels(self.effect)}"
 
 
+def held_out(state: State) -> tuple[Indices, Flags, Flags]:
+    """Return the held-out correctors that are read in both halves of the BPMs, and the BPMs that
+    determine the kick of each, and those of its score, [column, monitor]."""
+    half = state.split.half
+    seen = np.isfinite(state.data.pick(state.data.orbits)) & state.good
+    both_halves = (seen & half).any(axis=1) & (seen & ~half).any(axis=1)
+    columns = np.flatnonzero(state.split.held & both_halves)
+    return columns, seen[columns] & half[columns], seen[columns] & ~half[columns]
+
+
 def score(state: State, effect: str, parameters: int = 0) -> Step:
     """Return the validation scores; each corrector's kick is estimated from its near BPMs.
 
@@ -81,10 +91,7 @@ def score(state: State, effect: str, parameters: int = 0) -> Step:
     """
     data, at, half = state.data, state.at, state.split.half
     orbits = data.pick(data.orbits)
-    seen = np.isfinite(orbits) & state.good
-    both_halves = (seen & half).any(axis=1) & (seen & ~half).any(axis=1)
-    columns = np.flatnonzero(state.split.held & both_halves)
-    near, far = seen[columns] & half[columns], seen[columns] & ~half[columns]
+    columns, near, far = held_out(state)
 
     def picked(readings: Array, block: int = 0) -> Array:
         return data.pick(readings, block)[columns]
