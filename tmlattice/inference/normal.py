@@ -121,19 +121,21 @@ def whole(ring: Sequence[Slopes], shape: tuple[int, ...]) -> Array:
 
 # `reassoc`: the sum may follow the vector unit's order.
 @jit_sums
-def _weigh(rows, root, by_monitor, by_column, plane, weighed, monitors, columns):  # type: ignore[no-untyped-def]
+def _weigh(rows, some, root, by_monitor, by_column, plane, weighed, monitors, columns):  # type: ignore[no-untyped-def]
     """Sum over the derivatives of one family in one pass; adds to `monitors`.
 
     Args:
         rows: [error, column, monitor].
+        some: the columns of the sum, [some].
         root, by_monitor, by_column: factors of the derivatives, [column, monitor].
         plane: [column].
-        weighed: result, root times rows, [error, column, monitor].
+        weighed: result, root times rows, [error, some, monitor].
         monitors, columns: sums, [error, plane, monitor] and [error, column].
     """
     for i in range(rows.shape[0]):
-        for c in range(rows.shape[1]):
-            own, into = rows[i, c], weighed[i, c]
+        for j in range(some.shape[0]):
+            c = some[j]
+            own, into = rows[i, c], weighed[i, j]
             added, total = monitors[i, plane[c]], 0.0
             for m in range(rows.shape[2]):
                 slope = own[m]
@@ -193,17 +195,16 @@ def normal_equations(
         [np.ascontiguousarray(a if own.now is None else a * own.now) for a in (root, wu, wv)]
         for own in ring
     ]
+    read = np.flatnonzero(weight.any(axis=1))  # not the held-out columns
     step = min(max(AT_ONCE // monitors, 1), columns)
     buffer = np.empty(errors * step * monitors)
-    for low in range(0, columns, step) if errors else ():
-        some = slice(low, min(low + step, columns))
-        count = some.stop - low
-        weighed = buffer[: errors * count * monitors].reshape(errors, count, monitors)
-        for own, scale, begin, last in zip(ring, scales, ends, ends[1:], strict=False):
+    for low in range(0, len(read), step) if errors else ():
+        some = read[low : low + step]
+        weighed = buffer[: errors * len(some) * monitors].reshape(errors, len(some), monitors)
+        for own, factors, begin, last in zip(ring, scales, ends, ends[1:], strict=False):
             mine = slice(begin, last)
-            weights, u, v = (factor[some] for factor in scale)
-            _weigh(own.rows[:, some], weights, u, v, plane[some], weighed[mine],
-                   of_monitors[mine], of_columns[mine, some])  # fmt: skip
+            _weigh(own.rows, some, *factors, plane, weighed[mine], of_monitors[mine],
+                   of_columns[mine])  # fmt: skip
         flat = weighed.reshape(errors, -1)
         square = dsyrk(1.0, flat.T, beta=1.0, c=square, trans=1, lower=0, overwrite_c=1)
         b[end:] += flat @ (root[some] * y[some]).ravel()
