@@ -78,8 +78,7 @@ def hypothesis_rows(result: Diagnosis) -> list[tuple[str, ...]]:
             row.unit,
             row.expected,
             f"{1e6 * row.heldout_rms_in_plane:.3g}",
-            f"{row.evidence:.1f}",
-            f"{row.evidence_on_top:.1f}",
+            *(f"{round(own, 1) + 0.0:.1f}" for own in (row.evidence, row.evidence_on_top)),
             row.judgement,
         )
         for row in result.hypotheses or ()
