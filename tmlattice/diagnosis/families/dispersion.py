@@ -248,9 +248,10 @@ def orbit_patterns(model: ResponseModel, plane: int, effects: Sequence[str]) -> 
 
 
 class OrbitFamily(RingFamily):
-    """Amplitudes of orbit patterns, in units of usual errors."""
+    """Amplitudes of orbit patterns, in units of usual errors. With kicks they can make up for an
+    energy offset while gradients are far from the ring."""
 
-    single = False
+    single, late = False, True
     trust, rms = 1.0, 1.0
     plane: ClassVar[int]
 
