@@ -6,6 +6,7 @@ death becomes a sentence. Which pass methods are loaded at all is a fixed list: 
 """
 
 import atexit
+import hashlib
 import os
 import pickle
 import struct
@@ -65,9 +66,12 @@ def map_of(element: Any, energy: float) -> tuple[NDArray[np.float64], NDArray[np
         LatticeError: AT cannot track it, dies over it, or does not come back.
     """
     check_methods([element])
+    own = {k: v for k, v in vars(element).items() if k == "PassMethod" or type(v) is not str}
+    key = hashlib.sha256(pickle.dumps((type(element).__name__, own, energy))).digest()
     with _ONE_AT_A_TIME:
-        reply = _asked(pickle.dumps((element, energy)))
+        reply = _replies.get(key) or _asked(pickle.dumps((element, energy)))
     if len(reply) == 42 * 8:
+        _replies[key] = reply
         numbers = np.frombuffer(reply, "<f8").reshape(7, 6)
         return numbers[:6], numbers[6]
     why = reply.decode("utf-8", "replace") or "its tracking does not come back"
@@ -77,6 +81,8 @@ def map_of(element: Any, energy: float) -> tuple[NDArray[np.float64], NDArray[np
 
 
 _ONE_AT_A_TIME = threading.Lock()
+_replies: dict[bytes, bytes] = {}
+"""By the numbers of an element, whatever its name: a ring has most magnets many times."""
 _children: dict[int, subprocess.Popen[bytes]] = {}
 """By the process that asks: a fork has one of its own."""
 

@@ -28,7 +28,8 @@ def strengths_of(element: Any) -> NDArray[np.complex128]:
         for key in ("PolynomB", "PolynomA")
     )
     orders = max(len(B), len(A), 4)
-    total = np.pad(B, (0, orders - len(B))) + 1j * np.pad(A, (0, orders - len(A)))
+    total = np.zeros(orders, dtype=complex)
+    total.real[: len(B)], total.imag[: len(A)] = B, A
     highest = int(getattr(element, "MaxOrder", orders - 1))
     total[highest + 1 :] = 0.0
     x, y = np.sin(kicks_of(element))
@@ -43,7 +44,9 @@ def strengths_of(element: Any) -> NDArray[np.complex128]:
 def kicks_of(element: Any) -> NDArray[np.float64]:
     """`KickAngle` in x and y, rad, [2]; 0 where it is missing."""
     given = np.ravel(np.asarray(getattr(element, "KickAngle", ()), dtype=float))[:2]
-    return np.pad(given, (0, 2 - len(given)))
+    kicks = np.zeros(2)
+    kicks[: len(given)] = given
+    return kicks
 
 
 def _normal(strength: complex, order: int) -> tuple[float, float]:
