@@ -10,6 +10,7 @@ import sys
 import warnings
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NoReturn, TextIO
 
 import click
@@ -182,6 +183,7 @@ def _prepare() -> None:
     """What a command does not take from its surroundings."""
     warnings.showwarning = _show_warning
     os.environ["MPLBACKEND"] = "Agg"  # figures are files
+    sys.modules.setdefault("at.plot", ModuleType("at.plot"))  # AT's need Matplotlib, and a second
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:  # closed: no file that is opened may take its place
             null = os.open(os.devnull, os.O_RDWR)

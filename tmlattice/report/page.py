@@ -72,12 +72,15 @@ def save(
     """Figures (name, caption, figure) as PNG files in the folder, one open at a time; each with
     its caption and its `source`, see `_source`."""
     import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     pictures = []
     for name, caption, figure in figures:
         path = folder / f"{name}.png"
         _no_formulas(figure)
-        figure.savefig(path, dpi=DPI)
+        figure.set_dpi(DPI)
+        canvas = FigureCanvasAgg(figure)
+        canvas.print_png(path)  # type: ignore[no-untyped-call]  # `savefig` draws twice
         plt.close(figure)
         shrink(path, caption, source)
         pictures.append(Picture(name, caption, path))
