@@ -32,12 +32,12 @@ def problem(rng):
     J = rng.standard_normal((errors, columns, monitors))
     residual = 0.1 * rng.standard_normal((columns, monitors))
     residual[3, 4] = np.nan
-    return residual, weight, plane, u, v, J
+    return residual, weight, plane, u, v, [Slopes(J)]
 
 
-def written_out(residual, weight, plane, u, v, J):
+def written_out(residual, weight, plane, u, v, ring):
     """The whole design matrix, [reading, parameter]."""
-    columns, monitors = residual.shape
+    (columns, monitors), J = residual.shape, ring[0].rows
     rows = []
     for c in range(columns):
         for m in range(monitors):
@@ -65,7 +65,8 @@ def test_fit_vs_dense_least_squares(problem, rng):
 
 def test_normal_equations_of_several_families_in_several_pieces(problem, rng, monkeypatch):
     """Two or five columns at once, the last piece shorter; slopes of one family are old ones."""
-    residual, weight, plane, u, v, J = problem
+    residual, weight, plane, u, v, [whole] = problem
+    J = whole.rows
     X, w = written_out(*problem), weight.ravel()
     now = rng.uniform(0.5, 2, residual.shape)
     ring = (Slopes(J[:3]), Slopes(J[3:3]), Slopes(J[3:] / now, now))
@@ -109,7 +110,7 @@ def test_scale_of_the_prior_is_that_of_the_truth(rng, freedom):
     basis = np.zeros((2 * monitors + columns + errors, errors))
     basis[-errors:] = np.eye(errors)
     group = Group("ring", basis, 0.1, freedom=freedom)
-    normal = normal_equations(residual, flat, plane, nothing, nothing, J)
+    normal = normal_equations(residual, flat, plane, nothing, nothing, [Slopes(J)])
     found = solve(normal, [group], rounds=40)
     # Student's scale of normal numbers is some 0.75 of their rms
     assert_allclose(found.groups[0].rms, rms, rtol=0.35 if heavy else 0.1)

@@ -6,6 +6,7 @@ import pytest
 from tmlattice.inference.errors import LinearFit, Rows, cluster_robust_errors
 from tmlattice.inference.normal import (
     MAX_LAPACK,
+    Slopes,
     amounts,
     common,
     inverse_of_lower,
@@ -24,7 +25,7 @@ def problem():
     random = np.random.default_rng(1)
     plane = np.arange(COLUMNS) % 2
     slopes = [random.standard_normal((COLUMNS, MONITORS)) for _ in range(2)]
-    rows = Rows(plane, *slopes, random.standard_normal((ERRORS, COLUMNS, MONITORS)))
+    rows = Rows(plane, *slopes, [Slopes(random.standard_normal((ERRORS, COLUMNS, MONITORS)))])
     weight = random.uniform(0.5, 2.0, (COLUMNS, MONITORS))
     weight[0, 3] = weight[4, 0] = 0.0
     patterns = random.standard_normal((COLUMNS, PATTERNS, MONITORS))

@@ -13,7 +13,7 @@ from tmlattice.inference.errors import (
     cluster_robust_errors,
     scale_covariance,
 )
-from tmlattice.inference.normal import Normal, normal_equations, solve
+from tmlattice.inference.normal import Normal, Slopes, normal_equations, solve
 from tmlattice.inference.priors import Group
 
 READINGS = 40
@@ -132,7 +132,7 @@ def made_up(rng, lacking):
         by_ring = drives @ rng.standard_normal((ERRORS, 2, MONITORS))
         gap = drives @ rng.standard_normal((2, MONITORS))
     noise = rng.standard_normal(own.shape)
-    return Rows(plane, own, own, by_ring), NOISE * (noise + 3 * gap / np.sqrt(2))
+    return Rows(plane, own, own, [Slopes(by_ring)]), NOISE * (noise + 3 * gap / np.sqrt(2))
 
 
 def solved(rows, residual, weight):

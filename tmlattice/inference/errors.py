@@ -57,22 +57,25 @@ class Rows(NamedTuple):
     Attributes:
         plane: in which each column is read, [column].
         by_monitor, by_column: [column, monitor].
-        by_ring: [error, column, monitor].
+        by_ring: of each family of errors.
     """
 
     plane: Indices
     by_monitor: Array
     by_column: Array
-    by_ring: Array
+    by_ring: Sequence[Slopes]
 
     def times(self, column: Indices, monitor: Indices, other: Array) -> Array:
         """Return rows of some readings times [parameter, any], [reading, any]."""
         columns, monitors = self.by_monitor.shape
         ring = 2 * monitors + columns
-        out = self.by_ring[:, column, monitor].T @ other[ring:]
-        gain, own = self.by_monitor[column, monitor], self.by_column[column, monitor]
+        out = np.zeros((len(column), other.shape[1]))
+        for own in self.by_ring:
+            out += own.of(column, monitor).T @ other[ring : ring + len(own.rows)]
+            ring += len(own.rows)
+        gain, scale = self.by_monitor[column, monitor], self.by_column[column, monitor]
         out += gain[:, None] * other[2 * monitor + self.plane[column]]
-        out += own[:, None] * other[2 * monitors + column]
+        out += scale[:, None] * other[2 * monitors + column]
         return np.asarray(out)
 
 
@@ -178,9 +181,7 @@ def _of_monitors(
 ) -> Iterator[_Cluster]:
     """Clusters of one monitor each: one reading per column, given the column's other readings."""
     weighted = weight * residual if taken is None else times_precision(weight, taken, residual)
-    shared = (
-        None if taken is None else (taken, shared_by(*rows[:3], (Slopes(rows.by_ring),), taken))
-    )
+    shared = None if taken is None else (taken, shared_by(*rows, taken))
     for own in _drawn(weight, axis=0):
         column = np.flatnonzero(weight[:, own])
         monitor, alone, others = np.full(len(column), own), weight[column, own], None

@@ -101,8 +101,8 @@ class Slopes(NamedTuple):
         summed = flat @ own.reshape(-1, flat.shape[1]).T
         return np.asarray(summed.reshape(len(self.rows), *readings.shape[:-2]))
 
-    def of(self, column: int, monitor: Indices) -> Array:
-        """Derivatives of some readings of a column, [error, reading]."""
+    def of(self, column: int | Indices, monitor: Indices) -> Array:
+        """Derivatives of some readings, [error, reading]."""
         own = self.rows[:, column, monitor]
         return np.asarray(own if self.now is None else own * self.now[column, monitor])
 
@@ -111,12 +111,6 @@ class Slopes(NamedTuple):
         pattern]."""
         own = patterns if self.now is None else self.now[:, :, None] * patterns
         return np.asarray((self.rows.transpose(1, 0, 2) @ own).transpose(1, 0, 2))
-
-
-def whole(ring: Sequence[Slopes], shape: tuple[int, ...]) -> Array:
-    """Return all derivatives in one array, [error, column, monitor]."""
-    parts = [own.rows if own.now is None else own.rows * own.now for own in ring]
-    return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, *shape)), *parts])
 
 
 # `reassoc`: the sum may follow the vector unit's order.
@@ -164,7 +158,7 @@ def normal_equations(
     plane: Indices,
     by_monitor: Array,
     by_column: Array,
-    by_ring: Array | Sequence[Slopes],
+    ring: Sequence[Slopes],
     taken: Array | None = None,
 ) -> Normal:
     """Return the normal equations from sums over all readings.
@@ -175,13 +169,12 @@ def normal_equations(
         plane: in which each column is read, 0 or 1, [column].
         by_monitor: d reading / d monitor's parameter, [column, monitor].
         by_column: d reading / d column's parameter, [column, monitor]; 0 where it has none.
-        by_ring: d reading / d error, [error, column, monitor], or those of each family; may be
-            empty. Memory beyond them is that of `AT_ONCE` readings.
+        ring: derivatives by the errors of each family; may be empty. Memory beyond them is that of
+            `AT_ONCE` readings.
         taken: L of `common`, the readings' common modes, [column, monitor, pattern]; None: no
             common modes.
     """
     columns, monitors = residual.shape
-    ring = (Slopes(np.asarray(by_ring)),) if isinstance(by_ring, np.ndarray) else tuple(by_ring)
     y = np.where(weight > 0, residual, 0.0)
     m, end = 2 * monitors, 2 * monitors + columns
     ends = np.cumsum([0, *(len(own.rows) for own in ring)])

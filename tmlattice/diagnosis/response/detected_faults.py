@@ -18,7 +18,7 @@ family's scatter, and above the chance level of so many causes and families.
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -409,24 +409,32 @@ def detected_faults(
         progress: called with the name of each stage.
     """
     progress("distributed errors")
-    search = _Search(small_errors(data, split, fitted), hypotheses, judgement)
+    for state in _backgrounds(data, split, fitted):
+        search = _Search(state, hypotheses, judgement)
+        message = search.discrepancy_message()
+        if message is not None:
+            return (), [], [message]
     progress("detected faults")
-    message = search.discrepancy_message()
-    if message is not None:
-        return (), [], [message]
     seen_before: list[set[Hypothesis]] = []
     while len(search.state.apart) < min(most, Search.most):
-        state = search.next()
-        if state is None:
+        further = search.next()
+        if further is None:
             break
-        search.state = state
-        chosen = {one.cause for one in state.apart}
+        search.state = further
+        chosen = {one.cause for one in further.apart}
         log.info("detected: %s", chosen)
         if chosen in seen_before:
             break
         seen_before.append(chosen)
     apart = search.state.apart
     return apart, [search.finding(search.seen(search.state), one) for one in apart], []
+
+
+def _backgrounds(data: ResponseData, split: Split, fitted: State) -> Iterator[State]:
+    """The fit, if a fit of further readings hardly changes its residual; and that fit."""
+    if data.orbits.size > ANEW:
+        yield fitted
+    yield small_errors(data, split, fitted)
 
 
 class _Search:

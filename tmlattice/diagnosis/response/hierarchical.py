@@ -141,7 +141,7 @@ def fit_families(
     state = without_readings(state, single | rejected(state, labels))
     state, notes = _plausible(
         replace(state, independent=np.ones((2, 2))), trials,
-        lambda start: taken_back(settle(bend(jump(start)))),
+        lambda start: taken_back(settle(bend(jump(start)), gain=ROUGH)),
     )  # fmt: skip
     log.info("effective sample size per reading: %s", state.independent)
     more, later = _outliers(state)  # typical residuals are smaller now
@@ -149,10 +149,12 @@ def fit_families(
     odd = single | rejected(state, labels)
     design, state = (without_readings(own, odd) for own in (design, state))
     notes = [*told_gross(data, single, "the fit"), *label_messages(labels), *notes]
-    state, moving = _with_jitter(state, progress)
     before = score(design, "design")
-    state, doubts = _plausible(allow(state, [f for own in late for f in own]), trials, settle)
+    progress("beam jitter")
+    state = allow(_with_jitter(state)[0], [family for own in late for family in own])
+    state, doubts = _plausible(state, trials, settle)
     notes += doubts
+    state, moving = _with_jitter(state)
     gone, evidence = _unneeded(state, trials, most, progress)
     progress("result")
     try:
@@ -338,14 +340,8 @@ def taken_back(state: State) -> State:
     return settle(replace(trial, good=state.good | back))
 
 
-def _with_jitter(state: State, progress: Callable[[str], Any]) -> tuple[State, Jitter | None]:
-    """The state with detected beam jitter. It is sought again given the first result, because
-    errors of the ring had taken a part of it, or it of them."""
-    moving = sought(state)
-    if moving is None:
-        return state, None
-    progress("beam jitter")
-    state = settle(replace(state, jitter=moving.orbits))
+def _with_jitter(state: State) -> tuple[State, Jitter | None]:
+    """The state with the beam jitter of its residual."""
     moving = sought(state)
     return replace(state, jitter=None if moving is None else moving.orbits), moving
 
@@ -382,7 +378,7 @@ def _moved_without(state: State, block: int, there: Linear, names: Collection[st
         for group in there.groups
     )
     try:
-        moved, _, after = one_step(state, block, there._replace(groups=groups))
+        moved, _, after = one_step(state, block, there._replace(groups=groups), corrected=0)
     except np.linalg.LinAlgError:
         return None
     return moved if np.isfinite(after) else None

@@ -14,7 +14,7 @@ from tmlattice.arrays import Array, Indices
 from tmlattice.diagnosis.families.family import Family
 from tmlattice.diagnosis.response.state import Kept, State
 from tmlattice.diagnosis.response.weights import taken, weighed, weight
-from tmlattice.inference.normal import Normal, Posterior, Slopes, normal_equations, solve, whole
+from tmlattice.inference.normal import Normal, Posterior, Slopes, normal_equations, solve
 from tmlattice.inference.priors import Group
 
 STILL = 0.05
@@ -80,11 +80,6 @@ class Linear(NamedTuple):
         """The solution, with the present priors."""
         return solve(self.normal, self.groups, self.start, rounds=0)
 
-    @property
-    def by_ring(self) -> Array:
-        """The ring's derivatives in one array, [error, column, monitor]: a copy of them."""
-        return whole(self.ring, self.by_monitor.shape)
-
     def readings(self, plane: Indices, values: Array) -> Array:
         """Change of the readings, m, [column, monitor], by values of all parameters."""
         columns, monitors = self.by_monitor.shape
@@ -110,7 +105,11 @@ class Linear(NamedTuple):
 
 
 def linear(state: State, block: int) -> Linear:
-    """Normal equations of a state with its parameters, priors and step bounds."""
+    """Normal equations of a state with its parameters, priors and step bounds; made once."""
+    return state.once(("linear", block), lambda: _linear(state, block))
+
+
+def _linear(state: State, block: int) -> Linear:
     data, at = state.data, state.at
     columns, monitors = data.shape
     families = state.of_block(block)

@@ -44,7 +44,7 @@ cost, which its tangent leaves."""
 
 
 def one_step(
-    state: State, block: int, there: Linear, width: float = 1.0
+    state: State, block: int, there: Linear, width: float = 1.0, corrected: int = CORRECTED
 ) -> tuple[State, float, float]:
     """Solve the readings of one block, and move. Return the state, and the cost before and after.
 
@@ -53,6 +53,7 @@ def one_step(
         block: 0 in-plane, 1 coupling.
         there: `linear` of that block at the start.
         width: factor on the step bounds; small after diverged steps.
+        corrected: largest number of corrections.
     """
     found = bounded_step(there, width)
     groups = {group.name: group for group in found.groups}
@@ -66,7 +67,7 @@ def one_step(
         return _misfit(state, at, block) + penalty
 
     best, last, aim = learnt, np.inf, found.values
-    for _ in range(CORRECTED + 1):
+    for turn in range(corrected + 1):
         values = {name: np.maximum(aim[at], there.lowest[at]) for name, at in there.where.items()}
         then = learnt.moved({**state.values, **values})
         try:
@@ -76,7 +77,7 @@ def one_step(
         gained = after <= (1 - CORRECTS) * last
         if after <= last:
             best, last = then, after
-        if not gained:
+        if not gained or turn == corrected:
             break
         # the score there, with the derivatives of the start
         moved = np.zeros_like(there.start)

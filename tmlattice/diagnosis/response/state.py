@@ -4,9 +4,9 @@ Everything that is fitted is one frozen `State`; each function returns another o
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from tmlattice.observe.orbit_response import Errors, Predicted, bent
 from tmlattice.observe.response_data import ResponseData, Split
 
 log = logging.getLogger(__name__)
+
+Made = TypeVar("Made")
 
 ALONE = 0.3
 """Ratio to which a column's misfit falls by its own number if it has no other significant error."""
@@ -93,6 +95,7 @@ class State:
             errors (for the ring's families of few numbers).
         undetermined: of a change: d reading / d undetermined error of its reference, m,
             [error, column, monitor, 2]; None: without these.
+        memory: cache of results of this state.
     """
 
     data: ResponseData
@@ -112,6 +115,14 @@ class State:
     guessed: float = SCALE_SPREAD
     unneeded: tuple[Family, ...] = ()
     undetermined: Array | None = None
+    memory: dict[Hashable, Any] = field(init=False, default_factory=dict, repr=False)
+
+    def once(self, key: Hashable, made: Callable[[], Made]) -> Made:
+        """What is made of this state, made at the first call."""
+        if key not in self.memory:
+            self.memory[key] = made()
+        result: Made = self.memory[key]
+        return result
 
     def of_block(self, block: int) -> tuple[Family, ...]:
         """Families of a block."""

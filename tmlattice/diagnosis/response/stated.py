@@ -7,7 +7,6 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -71,21 +70,20 @@ def stated(state: State, block: int, there: Linear, posterior: Posterior) -> Sta
 
 
 def of_readings(state: State, block: int, there: Linear, posterior: Posterior) -> Array:
-    """Return posterior errors, widened for columns or BPMs that contradict all others."""
-    found = LinearFit.of(there.normal.matrix, posterior.whole)
-    return _widened(state, block, there, posterior, found)
+    """Return posterior errors, widened for columns or BPMs that contradict all others; made once
+    for each state."""
+
+    def widened() -> Array:
+        found = LinearFit.of(there.normal.matrix, posterior.whole)
+        return _widened(state, block, there, posterior, found)
+
+    return state.once(("of readings", block), widened)
 
 
 def of_sizes(state: State, block: int, there: Linear) -> Array:
     """Return a root F of the covariance F F^T by unknown prior scales, those of rejected families
     included, [parameter, direction]; see `stated`. It is sampled once for each state."""
-    known = _SIZES.setdefault(state, {})
-    if block not in known:
-        known[block] = _sampled(state, block, there)
-    return known[block]
-
-
-_SIZES: WeakKeyDictionary[State, dict[int, Array]] = WeakKeyDictionary()
+    return state.once(("of sizes", block), lambda: _sampled(state, block, there))
 
 
 def _sampled(state: State, block: int, there: Linear) -> Array:
@@ -122,7 +120,7 @@ def _widened(
     state: State, block: int, there: Linear, posterior: Posterior, found: LinearFit
 ) -> Array:
     data = state.data
-    rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.by_ring)
+    rows = Rows(data.plane_of(block), there.by_monitor, there.by_column, there.ring)
     weights = weight(state, block)
     # rounds end before full precision
     moved = there.readings(rows.plane, posterior.values - there.start)
