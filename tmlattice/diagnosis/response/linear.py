@@ -7,6 +7,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
+from weakref import ref
 
 import numpy as np
 
@@ -72,7 +73,6 @@ class Linear(NamedTuple):
     ring: tuple[Slopes, ...]
     where: Mapping[str, slice]
     groups: tuple[Group, ...]
-    kept: Mapping[str, Kept]
     lowest: Array
 
     @property
@@ -105,8 +105,15 @@ class Linear(NamedTuple):
 
 
 def linear(state: State, block: int) -> Linear:
-    """Normal equations of a state with its parameters, priors and step bounds; made once."""
-    return state.once(("linear", block), lambda: _linear(state, block))
+    """Normal equations of a state with its parameters, priors and step bounds; the latest of each
+    block is cached."""
+    of, known = state.latest.get(block, (None, None))
+    if of is not None and of() is state:
+        same: Linear = known
+        return same
+    found = _linear(state, block)
+    state.latest[block] = (ref(state), found)
+    return found
 
 
 def _linear(state: State, block: int) -> Linear:
@@ -116,13 +123,12 @@ def _linear(state: State, block: int) -> Linear:
     where: dict[str, slice] = {}
     rows = {"monitor": np.zeros(data.shape), "column": np.zeros(data.shape)}
     ring: list[Slopes] = []
-    kept: dict[str, Kept] = {}
     end = 2 * monitors + columns
     start, trust = [np.zeros(end)], [np.ones(end)]
     for family in {f.variable: f for f in families}.values():
         values = state.values[family.variable]
         if family.per == "ring":
-            current = kept[family.variable] = _rows(state, family)
+            current = state.kept[family.variable] = _rows(state, family)
             share = _now(current, at.gain(block), 1 + at.errors.calibration)
             where[family.variable] = slice(end, end + len(values))
             end += len(values)
@@ -161,7 +167,7 @@ def _linear(state: State, block: int) -> Linear:
         groups.append(Group(one.name, basis, one.wide, fixed=True, largest=one.wide))
     return Linear(
         normal, begin, np.concatenate(trust), rows["monitor"], rows["column"], tuple(ring),
-        where, tuple(groups), kept, lowest,
+        where, tuple(groups), lowest,
     )  # fmt: skip
 
 

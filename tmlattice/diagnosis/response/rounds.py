@@ -172,7 +172,6 @@ def settle(
     idle = failed = 0  # steps and repetitions without progress
     for turn, block in enumerate(blocks * most):
         there = linear(state, block)
-        state = replace(state, kept={**state.kept, **there.kept})
         moved, before, after = one_step(state, block, there, width[block])
         away, idle = away + 1, idle + 1
         if after > before:
@@ -193,12 +192,11 @@ def settle(
                 gained, away = 0.0, 0
                 width[block] = min(WIDER * width[block], WIDEST)
         if away == TOGETHER * len(blocks):
-            state, gained, away = replace(best, kept=state.kept), 0.0, 0
+            state, gained, away = best, 0.0, 0
             idle, failed = 0, failed + 1
             width = {own: bound / NARROWER for own, bound in width.items()}
         if failed > REPEATED or (away == 0 and idle >= len(blocks)):
             break
-    best = replace(best, kept=state.kept)
     return looked(best) if best.values is start.values else best
 
 

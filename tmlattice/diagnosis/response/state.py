@@ -82,7 +82,8 @@ class State:
         families: that are fitted.
         values: of the numbers, by variable.
         groups: the families' priors with learnt scales, by name.
-        kept: derivatives by the ring's variables, used until the ring has moved.
+        kept: derivatives by the ring's variables, used until the ring has moved; latest:
+            linearisation of each block, and its state. Caches that all states of a fit share.
         share: factors on the weights, less for outliers, [block, column, monitor].
         robust: whether outliers among the correctors' readings have less weight, too.
         apart: detected single faults.
@@ -107,7 +108,8 @@ class State:
     families: tuple[Family, ...] = ()
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
-    kept: Mapping[str, Kept] = field(default_factory=dict)
+    kept: dict[str, Kept] = field(default_factory=dict)
+    latest: dict[int, tuple[Any, Any]] = field(default_factory=dict)
     robust: bool = False
     apart: tuple[Candidate, ...] = ()
     independent: Array | None = None
