@@ -9,7 +9,12 @@ from shared import parted
 
 from tmlattice import Cause, diagnose
 from tmlattice.diagnosis.families.dispersion import HorizontalOrbit, VerticalOrbit
-from tmlattice.diagnosis.response.detected_faults import as_turned, sizes_in, small_errors
+from tmlattice.diagnosis.response.detected_faults import (
+    as_turned,
+    sizes_in,
+    small_errors,
+    with_number,
+)
 from tmlattice.diagnosis.response.linear import linear
 from tmlattice.diagnosis.response.state import begin
 from tmlattice.diagnosis.suspects import numbers
@@ -170,6 +175,17 @@ def test_slope_of_a_cause_is_the_finite_change(small_ring, causes):
         finite = (ends[1] - ends[0]) / (2 * h)  # the residual falls as the reading grows
         slope = problem.slope(point, i)
         np.testing.assert_allclose(slope, finite, atol=1e-5 * np.abs(finite).max())
+
+
+def test_one_cause_after_another_has_derivatives_of_its_own(small_ring, measured_with):
+    """The states of a fit share those that are known."""
+    data, split = parted(small_ring, measured_with())
+    first, second = ("skew_gradient", "QF::2"), ("skew_gradient", "QD::5")
+    state = begin(data, split)
+    found = [linear(with_number(state, cause, 1), 1).ring[-1].rows for cause in (first, second)]
+    alone = linear(with_number(begin(data, split), second, 1), 1).ring[-1].rows
+    assert np.array_equal(found[1], alone)
+    assert not np.allclose(found[0], alone, atol=0.1 * np.abs(alone).max())
 
 
 def test_one_number_of_several_places_is_told_once():

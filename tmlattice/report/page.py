@@ -78,8 +78,8 @@ def save(
     for name, caption, figure in figures:
         path = folder / f"{name}.png"
         _no_formulas(figure)
-        figure.set_dpi(DPI)
         canvas = FigureCanvasAgg(figure)
+        figure.set_dpi(DPI)
         canvas.print_png(path)  # type: ignore[no-untyped-call]  # `savefig` draws twice
         plt.close(figure)
         shrink(path, caption, source)

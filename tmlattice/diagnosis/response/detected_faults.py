@@ -36,6 +36,7 @@ from tmlattice.diagnosis.families.fields import (
     SkewGradient,
 )
 from tmlattice.diagnosis.families.steps import (
+    STEPS,
     CorrectorCalibration,
     CorrectorRoll,
     MonitorGain,
@@ -43,7 +44,7 @@ from tmlattice.diagnosis.families.steps import (
 )
 from tmlattice.diagnosis.findings import finding_of
 from tmlattice.diagnosis.recommended_actions import recommended_action
-from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, fit_chi2
+from tmlattice.diagnosis.response.hierarchical import ROUGH, HierarchicalFit, fit_chi2, readable
 from tmlattice.diagnosis.response.linear import Linear, gathered, linear
 from tmlattice.diagnosis.response.rounds import LEARN, evidence_of, settle
 from tmlattice.diagnosis.response.state import Candidate, State, allow, begin, bend, jump
@@ -218,9 +219,12 @@ def with_number(state: State, cause: Hypothesis, block: int) -> State:
     )
     families = [f for f in state.families if f.variable != name]
     values = {**state.values, name: np.append(state.values.get(name, np.zeros(0)), 0.0)}
+    # other causes have other derivatives
+    kept = {variable: own for variable, own in state.kept.items() if variable != name}
     return replace(
-        state, apart=apart, families=(*families, Others(block, (*have, cause))), values=values
-    )
+        state, apart=apart, families=(*families, Others(block, (*have, cause))), values=values,
+        kept=kept,
+    )  # fmt: skip
 
 
 def suspects_of(state: State, causes: Sequence[Hypothesis]) -> list[Candidate]:
@@ -409,7 +413,7 @@ def detected_faults(
         progress: called with the name of each stage.
     """
     progress("distributed errors")
-    for state in _backgrounds(data, split, fitted):
+    for state in _backgrounds(data, split, fitted, most):
         search = _Search(state, hypotheses, judgement)
         message = search.discrepancy_message()
         if message is not None:
@@ -430,9 +434,12 @@ def detected_faults(
     return apart, [search.finding(search.seen(search.state), one) for one in apart], []
 
 
-def _backgrounds(data: ResponseData, split: Split, fitted: State) -> Iterator[State]:
-    """The fit, if a fit of further readings hardly changes its residual; and that fit."""
-    if data.orbits.size > ANEW:
+def _backgrounds(data: ResponseData, split: Split, fitted: State, most: int) -> Iterator[State]:
+    """The fit, if no family was left untried in it, so that a fit of further readings hardly
+    changes its residual; and that fit."""
+    tried = {family.name for family in (*fitted.families, *fitted.unneeded)}
+    usual = {family.name for own in readable(fitted, STEPS) for family in own}
+    if data.orbits.size > ANEW and most >= len(STEPS) and tried >= usual:
         yield fitted
     yield small_errors(data, split, fitted)
 

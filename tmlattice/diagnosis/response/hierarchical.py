@@ -30,6 +30,7 @@ from tmlattice.diagnosis.response.labels import (
 from tmlattice.diagnosis.response.linear import Linear, linear
 from tmlattice.diagnosis.response.outlier_readings import gross, told_gross
 from tmlattice.diagnosis.response.rounds import (
+    GAIN,
     REQUIRED,
     evidence_of,
     linear_evidence,
@@ -141,7 +142,7 @@ def fit_families(
     state = without_readings(state, single | rejected(state, labels))
     state, notes = _plausible(
         replace(state, independent=np.ones((2, 2))), trials,
-        lambda start: taken_back(settle(bend(jump(start)), gain=ROUGH)),
+        lambda start: taken_back(settle(bend(jump(start)), gain=ROUGH), ROUGH),
     )  # fmt: skip
     log.info("effective sample size per reading: %s", state.independent)
     more, later = _outliers(state)  # typical residuals are smaller now
@@ -314,8 +315,8 @@ def _result(state: State) -> State:
     return taken_back(settle(replace(bend(state), robust=True)))
 
 
-def taken_back(state: State) -> State:
-    """Return the converged state with the rejected neighbours that agree with the fit.
+def taken_back(state: State, gain: float = GAIN) -> State:
+    """Return the state, converged to `gain`, with the rejected neighbours that agree with the fit.
 
     Sound BPMs next to a magnet with a large error contradict all others, and without them the error
     cannot be found. A broken BPM has no rejected neighbours.
@@ -325,7 +326,7 @@ def taken_back(state: State) -> State:
     if not together.any():
         return state
     good = state.good | together
-    trial = settle(replace(state, good=good), look_at_monitors=False)
+    trial = settle(replace(state, good=good), gain=gain, look_at_monitors=False)
     sound = good_monitors(trial) & good_monitors(trial, 1)
     back = together & sound
     before, after = (evidence_of(own, state.good, state.independent) for own in (state, trial))
@@ -337,7 +338,7 @@ def taken_back(state: State) -> State:
              np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
     if not back.any() or (state.good & ~sound).any() or lost > readings / 2:
         return state
-    return settle(replace(trial, good=state.good | back))
+    return settle(replace(trial, good=state.good | back), gain=gain)
 
 
 def _with_jitter(state: State) -> tuple[State, Jitter | None]:
