@@ -227,7 +227,7 @@ def test_numbers_that_have_a_lowest_value_vs_bounded_least_squares(rng):
     start, none = np.zeros(size), np.zeros((0, 0))
     normal = Normal(jacobian.T @ jacobian, jacobian.T @ data)
     group = Group("all", np.eye(size), 1.0, fixed=True)
-    there = Linear(normal, start, np.full(size, 1e9), none, none, none, {}, (group,), {}, lowest)
+    there = Linear(normal, start, np.full(size, 1e9), none, none, none, {}, (group,), lowest)
     found = rounds.bounded_step(there, 1.0).values
     referee = lsq_linear(
         np.vstack([jacobian, np.eye(size)]), np.append(data, np.zeros(size)), (lowest, np.inf),
