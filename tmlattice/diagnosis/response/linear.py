@@ -7,7 +7,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
-from weakref import ref
 
 import numpy as np
 
@@ -105,15 +104,8 @@ class Linear(NamedTuple):
 
 
 def linear(state: State, block: int) -> Linear:
-    """Normal equations of a state with its parameters, priors and step bounds; the latest of each
-    block is cached."""
-    of, known = state.latest.get(block, (None, None))
-    if of is not None and of() is state:
-        same: Linear = known
-        return same
-    found = _linear(state, block)
-    state.latest[block] = (ref(state), found)
-    return found
+    """Normal equations of a state with its parameters, priors and step bounds."""
+    return state.once(("linear", block), lambda: _linear(state, block))
 
 
 def _linear(state: State, block: int) -> Linear:

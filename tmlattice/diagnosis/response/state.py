@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeVar
+from weakref import ref
 
 import numpy as np
 
@@ -82,8 +83,8 @@ class State:
         families: that are fitted.
         values: of the numbers, by variable.
         groups: the families' priors with learnt scales, by name.
-        kept: derivatives by the ring's variables, used until the ring has moved; latest:
-            linearisation of each block, and its state. Caches that all states of a fit share.
+        kept: derivatives by the ring's variables, used until the ring has moved; latest: other
+            results, and the state of each. Caches that all states of a fit share.
         share: factors on the weights, less for outliers, [block, column, monitor].
         robust: whether outliers among the correctors' readings have less weight, too.
         apart: detected single faults.
@@ -96,7 +97,6 @@ class State:
             errors (for the ring's families of few numbers).
         undetermined: of a change: d reading / d undetermined error of its reference, m,
             [error, column, monitor, 2]; None: without these.
-        memory: cache of results of this state.
     """
 
     data: ResponseData
@@ -109,7 +109,7 @@ class State:
     values: Mapping[str, Array] = field(default_factory=dict)
     groups: Mapping[str, Group] = field(default_factory=dict)
     kept: dict[str, Kept] = field(default_factory=dict)
-    latest: dict[int, tuple[Any, Any]] = field(default_factory=dict)
+    latest: dict[Hashable, tuple[Any, Any]] = field(default_factory=dict)
     robust: bool = False
     apart: tuple[Candidate, ...] = ()
     independent: Array | None = None
@@ -117,13 +117,12 @@ class State:
     guessed: float = SCALE_SPREAD
     unneeded: tuple[Family, ...] = ()
     undetermined: Array | None = None
-    memory: dict[Hashable, Any] = field(init=False, default_factory=dict, repr=False)
 
     def once(self, key: Hashable, made: Callable[[], Made]) -> Made:
-        """What is made of this state, made at the first call."""
-        if key not in self.memory:
-            self.memory[key] = made()
-        result: Made = self.memory[key]
+        """What is made of this state; made anew only if it was last made of another."""
+        of, known = self.latest.get(key, (None, None))
+        result: Made = known if of is not None and of() is self else made()
+        self.latest[key] = (ref(self), result)
         return result
 
     def of_block(self, block: int) -> tuple[Family, ...]:
