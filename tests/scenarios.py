@@ -15,13 +15,12 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 
+from tests.shared import valid
 from tmlattice import Cause, diagnose, load_ring, simulate
 from tmlattice.errors import TmlatticeError
 from tmlattice.files import write_json
@@ -176,15 +175,10 @@ def run(own: Scenario) -> dict[str, Any]:
     text = result.report()
     if "nan" in re.split(r"[^a-z]+", text):
         faults.append("a number of the report is nan")
-    jsonschema.validate(json.loads(json.dumps(result.as_json())), _schema())
+    valid(result.as_json(), "diagnosis")
     answer["faults"] = faults + _unsaid(own, " ".join([text, *result.warnings]))
     answer["seconds"] = [round(made - start, 1), round(time.process_time() - made, 1)]
     return answer
-
-
-@cache
-def _schema() -> Any:
-    return json.loads((files("tmlattice") / "schemas" / "diagnosis.schema.json").read_text())
 
 
 def _unsaid(own: Scenario, text: str) -> list[str]:

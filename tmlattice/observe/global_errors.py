@@ -184,6 +184,42 @@ class Split:
         return float(each.max() if worst else np.median(each / usual))
 
 
+@dataclass(frozen=True)
+class Launches:
+    """Fitted less stated launches.
+
+    Attributes:
+        miss: by plane, [shot, plane, 2].
+        spread: its covariance, [shot, plane, 2, 2].
+        stated: [shot, 4].
+        split: the same in two parts.
+    """
+
+    miss: Array
+    spread: Array
+    stated: Array
+    split: Split
+
+    def beyond_a_fault(self) -> Array:
+        """Mismatches [shot, plane, 2] less their part that is a constant and a linear map of the
+        plane's launches, as kicks and gradients make it, by least absolute values."""
+        left = self.miss.copy()
+        size = np.sqrt(np.einsum("...ii->...i", self.spread))
+        number = len(left)
+        for plane in (0, 1):
+            stated = self.stated[:, 2 * plane : 2 * plane + 2]
+            largest = np.maximum(np.abs(stated).max(axis=0), TINY)
+            made = np.column_stack([np.ones(number), stated / largest])
+            target, weight = left[:, plane] / size[:, plane], np.ones(number)
+            for _ in range(ROUNDS):
+                root = np.sqrt(weight)[:, None]
+                found = np.linalg.lstsq(root * made, root * target, rcond=None)[0]
+                rest = target - made @ found
+                weight = 1 / np.maximum(np.linalg.norm(rest, axis=1), 1.0)
+            left[:, plane] = rest * size[:, plane]
+        return np.asarray(left * np.sqrt(number / max(number - made.shape[1], 1)))
+
+
 def _robust(misfit: Array, freedom: Array, errors: float) -> Array:
     """Negative log likelihood of mean squares in units of the noise, by their degrees of freedom,
     of which a fault of the machine makes no more than some."""
@@ -267,6 +303,17 @@ class Search:
         alike = [own for own in found if own.worth > best - DEFAULT.behind]
         first = min(alike, key=lambda own: [order.index(name) for name in own.names])
         return replace(first, alike=tuple(own.names for own in alike if own is not first))
+
+
+def _believed(found: Iterable[Verdict]) -> list[Verdict]:
+    """Those with enough evidence that is not a unit's by launches alone which fit too well."""
+    return [
+        own
+        for own in found
+        if own.worth > GAIN
+        and not (own.of.endswith("launches") and own.after < TOO_WELL
+                 and any(map(is_unit, own.names)))
+    ]  # fmt: skip
 
 
 def _verdict(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict:
@@ -408,7 +455,7 @@ class OfTurns(Search):
         passes, found = self.found(data)
         sections, joints, spreads = _parts(passes, found)
         backwards = "beam-backwards" in names
-        launch, each, _, blur = self._launch(data, passes, found, square, backwards)
+        launch, blur = self._launch(data, passes, found, square, backwards)
         times = _size(data) / self.scale
         blur += sum(log_uncertainty(own / times**2) / len(own) for own in spreads)
         ratio = 1.0
@@ -421,8 +468,9 @@ class OfTurns(Search):
         parts = [own.cost(square, kicks) for own in (sections, *joints)]
         of_launch = np.full(2, np.nan)
         if launch is not None:  # in m and rad; the information of launches differs
-            parts.append(np.maximum(launch.cost(1.0, square * kicks), 0.0))
-            of_launch = np.array([np.median(each, axis=0).max(), launch.level(True)])
+            parts.append(np.maximum(launch.split.cost(1.0, square * kicks), 0.0))
+            each = np.median(distance(launch.miss, launch.spread), axis=0)
+            of_launch = np.array([each.max(), launch.split.level(True)])
         costs = np.concatenate(parts, axis=1)
         best = costs[costs.sum(axis=1).argmin()]
         unit = 1 / square if data.noise is None else ratio**2
@@ -451,15 +499,19 @@ class OfTurns(Search):
         shot to shot to those of the stated ones, [2], NaN where they are not proportional."""
         passes, found = self.found(self.data)
         first = np.flatnonzero(np.append(True, np.diff(passes.shot) != 0))
-        _, each, changes, _ = self._launch(self.data, passes, found, square, False, tolerance)
+        launch, _ = self._launch(self.data, passes, found, square, False, tolerance)
+        assert launch is not None
         fitted, stated = found.start[first, 0], self.data.launches[passes.shot[first], :4]
+        miss = launch.miss
+        several = miss, miss - np.median(miss, axis=0), launch.beyond_a_fault()
+        each, *changes = (distance(own, launch.spread) for own in several)
         size = np.maximum(np.ptp(stated, axis=0), TINY)
         a, b = ((own - np.mean(own, axis=0)) / size for own in (fitted, stated))
         a, b = (np.nan_to_num(own).reshape(-1, 2, 2) for own in (a, b))
         inner, square_a, square_b = ((u * v).sum(axis=(0, 2)) for u, v in ((a, b), (a, a), (b, b)))
         alike = (inner**2 > ALIKE**2 * square_a * square_b) & (inner != 0)
         ratio = np.where(alike, inner, np.nan) / np.maximum(square_b, TINY)
-        return each, changes, found.misfit[first, 0], ratio
+        return each, np.stack(changes), found.misfit[first, 0], ratio
 
     def _launch(
         self,
@@ -469,10 +521,9 @@ class OfTurns(Search):
         square: float,
         backwards: bool,
         tolerance: float = LAUNCH_TOLERANCE,
-    ) -> tuple[Split | None, Array, Array, float]:
-        """Fitted less stated launches by plane; their mean squares [shot, plane]; those less their
-        median, and of `_beyond_a_fault`, [2, shot, plane]; and the log of their uncertainty. None
-        if no launch is stated."""
+    ) -> tuple[Launches | None, float]:
+        """Fitted against stated launches, None if no launch is stated; and the log of their
+        uncertainty."""
         if backwards:  # the end of the last turn, against the stated launches
             last = np.flatnonzero(np.append(np.diff(passes.shot) != 0, True))
             shot, fitted = passes.shot[last], found.end[last, -1] * _TURNED
@@ -492,7 +543,7 @@ class OfTurns(Search):
             if passes.turn[first].any():
                 stated, J = self._carried(data, passes, first)
         if sigma is None or np.isinf(sigma[shot, :4]).all():
-            return None, np.zeros((0, 2)), np.zeros((2, 0, 2)), 0.0
+            return None, 0.0
         own = np.minimum(sigma[shot, :4], 1e3)
         width = tolerance * np.sqrt(np.mean(fitted**2, axis=0))
         spread = square * covariance + (J * own[:, None] ** 2) @ np.swapaxes(J, 1, 2)
@@ -506,10 +557,7 @@ class OfTurns(Search):
         free = np.full(planes.shape[:2], 2)
         every = np.ones(planes.shape, dtype=bool)
         split = Split.of(planes, spreads, kicked.reshape(2, 2, -1), every, free, np.inf)
-        unlike = [planes - np.median(planes, axis=0)]
-        unlike.append(_beyond_a_fault(planes, spreads, stated[:, :4]))
-        changes = np.stack([distance(own, spreads) for own in unlike])
-        return split, distance(planes, spreads), changes, blur
+        return Launches(planes, spreads, stated[:, :4], split), blur
 
     def _carried(
         self, data: Measurement, passes: Passes, first: NDArray[np.intp]
@@ -577,6 +625,8 @@ class OfTurns(Search):
         found = sorted(gains(several), key=lambda own: own.gain, reverse=True)
         if not found or found[0].gain < GAIN:
             return []
+        if found[0].left < LEFT:  # no two leave so much less
+            return _believed(found)
         order = list(ASSUMPTIONS).index
         alone = {own.names: own.left for own in found}
         both = gains(sorted({
@@ -588,34 +638,13 @@ class OfTurns(Search):
             for own in both  # two have to leave less than each of them
             if LEFT * own.left < min(alone.get((name,), np.inf) for name in own.names)
         ]
-        return [own for own in found if own.worth > GAIN
-                and not (own.of.endswith("launches") and own.after < TOO_WELL
-                         and any(map(is_unit, own.names)))]  # fmt: skip
+        return _believed(found)
 
     def corrected(self, names: Names) -> Self:
         """Return the search with assumptions corrected in the data."""
         data = self.assumed(names)
         sections = {1.0: self._section(self._times(data))}
         return replace(self, data=data, _sections=sections, _found={}, _made={})
-
-
-def _beyond_a_fault(miss: Array, spread: Array, launches: Array) -> Array:
-    """Mismatches of launches [shot, plane, 2] less their part that is a constant and a linear map
-    of the plane's launches [shot, 4], as kicks and gradients make it, by least absolute values."""
-    left = miss.copy()
-    size = np.sqrt(np.einsum("...ii->...i", spread))
-    number = len(miss)
-    for plane in (0, 1):
-        stated = launches[:, 2 * plane : 2 * plane + 2]
-        made = np.column_stack([np.ones(number), stated / np.maximum(np.abs(stated).max(0), TINY)])
-        target, weight = miss[:, plane] / size[:, plane], np.ones(number)
-        for _ in range(ROUNDS):
-            root = np.sqrt(weight)[:, None]
-            found = np.linalg.lstsq(root * made, root * target, rcond=None)[0]
-            rest = target - made @ found
-            weight = 1 / np.maximum(np.linalg.norm(rest, axis=1), 1.0)
-        left[:, plane] = rest * size[:, plane]
-    return np.asarray(left * np.sqrt(number / max(number - made.shape[1], 1)))
 
 
 def _same_part(one: str, other: str) -> bool:
