@@ -560,13 +560,13 @@ def most_probable(
         """
         inner, point, near = linearise(part, known, near, near, causes, begun)
         for _ in range(ROUNDS):
-            found = solved(inner, point, near)
+            found, last_near = solved(inner, point, near), near
             inner, point, near = linearise(
                 part, known, found.amounts, near, causes, found.nuisances
             )
             cost = point.chi2 + known.square(near)
-            if abs(cost - found.cost) < LINEAR * (1.0 if whole else cost):
-                break
+            if near is last_near or abs(cost - found.cost) < LINEAR * (1.0 if whole else cost):
+                break  # no step stores a beam, or the errors are linear
         return found._replace(amounts=near), abs(cost - found.cost) < LINEAR * cost
 
     way, done, step = problem.way(), 0.0, 1.0

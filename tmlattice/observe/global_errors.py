@@ -69,6 +69,8 @@ measurement of `benchmarks/data_checks.py` gains as much."""
 LEFT, TOO_WELL = 4.0, 0.1
 """Ratio of what each of two corrections leaves to what both do, at least; and chi-square of
 launches below which they are no evidence of a unit: readings next to zero fit any."""
+TOGETHER = 10_000
+"""BPMs of passes that are fitted at once: their maps fit into a processor's cache."""
 ROUNDS = 20
 """Reweighted least squares."""
 ALIKE = 0.95
@@ -370,7 +372,7 @@ class OfTurns(Search):
     data: Measurement
     known: Sequence[Cause] = ()
     _sections: dict[float, Sections] = field(default_factory=dict, repr=False)
-    _found: dict[object, tuple[object, Passes, SectionFits]] = field(
+    _found: dict[tuple[int, float], tuple[Measurement, Passes, SectionFits]] = field(
         default_factory=dict, repr=False
     )
     _made: dict[Names, Measurement] = field(default_factory=dict, repr=False)
@@ -397,11 +399,11 @@ class OfTurns(Search):
     # --- one assumption -------------------------------------------------------------------------
     def found(self, data: Measurement) -> tuple[Passes, SectionFits]:
         """Return the trajectories of the sections of a measurement."""
-        factor = self._times(data)
-        key = (id(data.readings), factor)
-        if key not in self._found:
-            self._found[key] = (data, *self._fit(data, factor))  # keeps the data, and so their id
-        return self._found[key][1:]
+        self._fit([data])
+        return self._found[self._key(data)][1:]
+
+    def _key(self, data: Measurement) -> tuple[int, float]:
+        return id(data.readings), self._times(data)
 
     def _times(self, data: Measurement) -> float:
         """Common factor of the shots' kicks."""
@@ -409,7 +411,23 @@ class OfTurns(Search):
             return 1.0
         return float(_kicks(data.settings) @ self.kicks / (self.kicks @ self.kicks))
 
-    def _fit(self, data: Measurement, times: float) -> tuple[Passes, SectionFits]:
+    def _fit(self, several: Iterable[Measurement]) -> None:
+        """Find the trajectories of several measurements, those of equally many passes at once."""
+        new = {self._key(data): data for data in several}
+        alike: dict[tuple[float, int], dict[tuple[int, float], tuple[Measurement, Passes]]] = {}
+        for key in new.keys() - self._found.keys():
+            passes = self._passes(new[key])
+            alike.setdefault((key[1], len(passes.shot)), {})[key] = new[key], passes
+        for (times, count), own in alike.items():
+            most = max(TOGETHER // max(count * len(self.data.monitors), 1), 1)
+            keys = list(own)
+            for first in range(0, len(keys), most):
+                some = keys[first : first + most]
+                fits = self._section(times).fit_each([own[key][1] for key in some])
+                # with the data, whose id is the key
+                self._found.update((k, (*own[k], fit)) for k, fit in zip(some, fits, strict=True))
+
+    def _passes(self, data: Measurement) -> Passes:
         shots, turns = data.readings.shape[:2]
         readings = data.readings.reshape(shots * turns, -1, 2)
         read = np.isfinite(readings).any(axis=(1, 2))
@@ -421,8 +439,7 @@ class OfTurns(Search):
         factor = _size(data) / self.scale if self.scale > 0 else 1.0
         sigma = data.launch_sigma
         alone = sigma is not None and bool(sigma[:, 4].any())
-        passes = Passes(readings[read], factor * noise, data.launches[shot, 4], shot, turn, alone)
-        return passes, self._section(times).fit(passes)
+        return Passes(readings[read], factor * noise, data.launches[shot, 4], shot, turn, alone)
 
     def _section(self, times: float) -> Sections:
         """Sections with the shots' kicks multiplied."""
@@ -601,7 +618,8 @@ class OfTurns(Search):
     def square(self, several: Iterable[Names]) -> float:
         """Variance of the readings in units of the stated one, from the best of several
         assumptions."""
-        found = []
+        found, several = [], list(several)
+        self._fit(map(self.assumed, several))
         for names in several:
             passes, own = self.found(self.assumed(names))
             found += [own.level, _parts(passes, own)[0].level()]
@@ -614,8 +632,9 @@ class OfTurns(Search):
         stated = self.terms((), square)
 
         def gains(some: Iterable[Names]) -> list[Verdict]:
-            found = []
-            for names in filter(self._possible, some):
+            found, some = [], list(filter(self._possible, some))
+            self._fit(map(self.assumed, some))
+            for names in some:
                 other = self.terms(names, square)
                 gain = float(stated.cost.sum() - other.cost.sum())
                 gain -= max(other.blur - stated.blur, 0.0)

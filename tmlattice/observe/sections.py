@@ -271,81 +271,99 @@ class Sections:
 
     def fit(self, passes: Passes) -> SectionFits:
         """Fit the trajectory of each section to its own readings."""
+        return self.fit_each([passes])[0]
+
+    def fit_each(self, several: Sequence[Passes]) -> list[SectionFits]:
+        """Fit several measurements of equally many passes, each as `fit` does; at once, which takes
+        less time."""
         seen, way, kicks = self._made
-        group = self.group[passes.shot]
         width = max(len(own) for own in self._members)
         owner = np.full((len(self._members), width), -1, dtype=np.int64)
         for w, members in enumerate(self._members):
             owner[w, : len(members)] = members
         padded = owner >= 0
-        P, W = len(passes.readings), len(owner)
-        maps = seen[group[:, None, None], np.where(padded, owner, 0)]
-        data = passes.readings[:, owner]
-        there = np.isfinite(data) & padded[None, :, :, None]
-        sigma = np.where(there, passes.sigma[owner], np.inf)
-        count = np.asarray(there.sum(axis=2), dtype=np.int64)  # [pass, section, plane]
-        freedom = np.maximum(count - TWO, 0).sum(axis=2)
-        prior = _prior_precision(passes, maps.R, padded, count)
-        x = np.zeros((P, W, 5))
-        x[..., 4] = passes.delta[:, None]
-        moved, by_energy = np.inf, np.zeros((P, W, 4))
+        read, delta, shot = (
+            np.stack([getattr(own, name) for own in several])
+            for name in ("readings", "delta", "shot")
+        )
+        noise = np.stack([own.sigma for own in several])[:, None]
+        group = self.group[shot]
+        shape = *group.shape, (W := len(owner))  # [measurement, pass, section]
+        maps = seen[group[..., None, None], np.where(padded, owner, 0)]
+        data = read[:, :, owner]
+        there = np.isfinite(data) & padded[..., None]
+        sigma = np.where(there, noise[:, :, owner], np.inf)
+        count = np.asarray(there.sum(axis=-2), dtype=np.int64)  # [..., plane]
+        freedom = np.maximum(count - TWO, 0).sum(axis=-1)
+        prior = _prior_precision(read, maps.R, padded, count)
+        x = np.zeros((*shape, 5))
+        x[..., 4] = delta[..., None]
+        moved, by_energy = np.full(len(several), np.inf), np.zeros((*shape, 4))
         with np.errstate(all="ignore"):
             for step in range(ROUNDS):
-                image, slope = maps(x[:, :, None])
-                left = np.where(there, (data - image) / sigma, 0.0).reshape(P, W, -1)
-                A = (slope[..., :4] / sigma[..., None]).reshape(P, W, -1, 4)
+                image, slope = maps(x[..., None, :])
+                left = np.where(there, (data - image) / sigma, 0.0).reshape(*shape, -1)
+                A = (slope[..., :4] / sigma[..., None]).reshape(*shape, -1, 4)
                 curvature = _regularised(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
-                if step == ROUNDS - 1 or not moved > SETTLED:
+                if step == ROUNDS - 1 or not (moved > SETTLED).any():
                     break
-                own = (slope[..., 4] / sigma).reshape(P, W, -1)  # by the energy
+                own = (slope[..., 4] / sigma).reshape(*shape, -1)  # by the energy
                 back: Array = np.linalg.solve(curvature, np.swapaxes(A, -1, -2)).astype(float)
                 pull = np.linalg.solve(curvature, (prior * x[..., :4])[..., None])
                 step_4 = (back @ left[..., None] - pull)[..., 0]
                 fitted = (A @ step_4[..., None])[..., 0]
                 drift = -(back @ own[..., None])[..., 0]  # of the trajectories, by the energy
                 inner = _energy_terms(left - fitted, own + (A @ drift[..., None])[..., 0], freedom)
-                ends = way[group[:, None], np.arange(W)](x)
+                ends = way[group[..., None], np.arange(W)](x)
                 outer = _joints(x[..., :4], ends, step_4, drift, _inverse(curvature))
                 change, known = _common_energy(
-                    inner, outer, passes.delta - x[:, 0, 4], passes.alone
+                    inner, outer, delta - x[..., 0, 4], np.array([own.alone for own in several])
                 )
-                by_energy = drift / np.sqrt(known)[:, None, None]
-                moved = float(np.nanmedian(np.abs(fitted)))
-                moved = max(moved, float(np.nanmax(np.abs(change) * np.sqrt(known))))
-                moved /= max(1.0, float(np.nanmedian(np.abs(left - fitted))))
-                step_4 = step_4 + drift * change[:, None, None]
+                error = np.sqrt(known)
+                by_energy = drift / error[..., None, None]
+                moved = np.maximum(_median(np.abs(fitted)), np.nanmax(np.abs(change) * error, 1))
+                moved /= np.maximum(1.0, _median(np.abs(left - fitted)))
+                step_4 = step_4 + drift * change[..., None, None]
                 x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -FARTHEST, FARTHEST)
-                x[..., 4] += change[:, None]
+                x[..., 4] += change[..., None]
         whole: Array = np.nan_to_num(
-            (left**2).sum(axis=2), nan=DIVERGED_SIGMA**2, posinf=DIVERGED_SIGMA**2
+            (left**2).sum(axis=-1), nan=DIVERGED_SIGMA**2, posinf=DIVERGED_SIGMA**2
         )
         covariance = _inverse(curvature)
-        end, slope = way[group[:, None], np.arange(W)](x)
+        end, slope = way[group[..., None], np.arange(W)](x)
         J = slope[..., :4, :4]
-        most = there.sum(axis=(2, 3)).argmax(axis=0), np.arange(W)  # the pass of each section
+        # the pass of each section
+        most = (
+            np.arange(len(several))[:, None], there.sum(axis=(-2, -1)).argmax(axis=1), np.arange(W)
+        )  # fmt: skip
         own = np.where(padded[:, :, None, None], kicks[np.where(padded, owner, 0)], 0.0)
         behind = np.tril(np.ones((width, width)), -1)[:, None, :, None]  # reading, kick
-        kicked = np.einsum("wkpi,wmiq->wkpmq", maps.R[most][..., :4], own) * behind
-        kicked = kicked.reshape(W, 2 * width, -1) / sigma[most].reshape(W, -1, 1)
+        kicked = np.einsum("swkpi,wmiq->swkpmq", maps.R[most][..., :4], own) * behind
+        kicked = kicked.reshape(len(several), W, 2 * width, -1)
+        kicked /= sigma[most].reshape(len(several), W, -1, 1)
         moved_start = covariance[most] @ np.swapaxes(A[most], -1, -2) @ kicked
         carried_back = np.moveaxis(own, 1, 2).reshape(W, 4, -1)
-        return SectionFits(
-            left=left,
-            owner=np.repeat(owner, 2, axis=1),
-            there=there.reshape(P, W, -1),
-            free=1 - np.einsum("pwri,pwij,pwrj->pwr", A, covariance, A),
-            freedom=freedom,
-            misfit=whole / np.maximum(freedom, 1),
-            delta=x[:, 0, 4],
-            start=x[..., :4],
-            covariance=covariance,
-            energy=np.nan_to_num(by_energy),
-            end=end[..., :4],
-            carried=J @ covariance @ np.swapaxes(J, -1, -2),
-            kicked=kicked - A[most] @ moved_start,
-            start_kicked=moved_start,
-            end_kicked=J[most] @ (moved_start - carried_back),
-        )
+        fits = {
+            "left": left,
+            "there": there.reshape(*shape, -1),
+            "free": 1 - np.einsum("...ri,...ij,...rj->...r", A, covariance, A),
+            "freedom": freedom,
+            "misfit": whole / np.maximum(freedom, 1),
+            "delta": x[..., 0, 4],
+            "start": x[..., :4],
+            "covariance": covariance,
+            "energy": np.nan_to_num(by_energy),
+            "end": end[..., :4],
+            "carried": J @ covariance @ np.swapaxes(J, -1, -2),
+            "kicked": kicked - A[most] @ moved_start,
+            "start_kicked": moved_start,
+            "end_kicked": J[most] @ (moved_start - carried_back),
+        }
+        of_reading = np.repeat(owner, 2, axis=1)
+        return [
+            SectionFits(owner=of_reading, **{name: own[i] for name, own in fits.items()})
+            for i in range(len(several))
+        ]
 
     def predicted(self, launches: Array, shot: Places) -> Array:
         """Readings of one turn [pass, monitor, 2] by launches [pass, 5] of shots, m."""
@@ -370,14 +388,24 @@ class Sections:
         return x, J
 
 
+def _median(values: Array) -> Array:
+    """Median of the numbers of each measurement, [measurement]; 0 if there are none."""
+    flat = values.reshape(len(values), -1)
+    some = ~np.isnan(flat).all(axis=1)
+    found = np.zeros(len(values))
+    if some.any():
+        found[some] = np.nanmedian(flat[some], axis=1)
+    return found
+
+
 EnergyTerms = tuple[Array, Array, Array]
-"""Terms [pass, term] of the energy's equation: their misfit, right side and left side."""
+"""Terms [measurement, pass, term] of the energy's equation: misfit, right side and left side."""
 
 
 def _energy_terms(left: Array, slope: Array, freedom: Indices) -> EnergyTerms:
     """Terms of readings, projected off the trajectories of their sections."""
-    misfit = np.where(freedom > 0, (left**2).sum(axis=2) / np.maximum(freedom, 1), np.inf)
-    return misfit, (left * slope).sum(axis=2), (slope**2).sum(axis=2)
+    misfit = np.where(freedom > 0, (left**2).sum(axis=-1) / np.maximum(freedom, 1), np.inf)
+    return misfit, (left * slope).sum(axis=-1), (slope**2).sum(axis=-1)
 
 
 def _joints(
@@ -387,10 +415,10 @@ def _joints(
     J = ends[1][..., :4, :4]
     end = ends[0][..., :4] + (J @ step[..., None])[..., 0]
     pushed = (J @ drift[..., None])[..., 0] + ends[1][..., :4, 4]
-    miss = np.nan_to_num((start + step)[:, 1:] - end[:, :-1])
-    slope = np.nan_to_num(drift[:, 1:] - pushed[:, :-1])
+    miss = np.nan_to_num((start + step)[..., 1:, :] - end[..., :-1, :])
+    slope = np.nan_to_num(drift[..., 1:, :] - pushed[..., :-1, :])
     carried = J @ covariance @ np.swapaxes(J, -1, -2)
-    spread = np.nan_to_num(covariance[:, 1:] + carried[:, :-1])
+    spread = np.nan_to_num(covariance[..., 1:, :, :] + carried[..., :-1, :, :])
     size, even = scaled(spread)
     right = np.stack([miss / size, slope / size], axis=-1)
     both = np.linalg.solve(even + INVISIBLE * np.eye(4), right)
@@ -403,49 +431,46 @@ def _joints(
 
 
 def _common_energy(
-    inner: EnergyTerms, outer: EnergyTerms, prior: Array, alone: bool
+    inner: EnergyTerms, outer: EnergyTerms, prior: Array, alone: Flags
 ) -> tuple[Array, Array]:
-    """Common energy of the sections and joints of a pass, or of all passes, [pass], and its inverse
-    variance; terms spoilt by a fault have little weight.
+    """Common energy of the sections and joints of a pass, or of all passes, [measurement, pass],
+    and its inverse variance; terms spoilt by a fault have little weight.
 
     Args:
         inner, outer: of sections, of joints.
-        prior: expected energy, [pass].
-        alone: see `Passes`.
+        prior: expected energy, [measurement, pass].
+        alone: see `Passes`, [measurement].
     """
-    asked, known = prior / ENERGY**2, np.full(len(prior), 1 / ENERGY**2)
+    asked, known = prior / ENERGY**2, np.full(prior.shape, 1 / ENERGY**2)
     for misfit, right, left in (inner, outer):
         there = np.isfinite(misfit)
-        if not there.any():
-            continue
-        level = float(np.median(misfit[there]))
-        weight = np.where(there, 1 / np.maximum(misfit, max(level, 1.0)), 0.0)
-        asked = asked + np.nan_to_num(weight * right).sum(axis=1)
-        known = known + np.nan_to_num(weight * left).sum(axis=1)
-    if alone:
-        return asked / known, known
-    count = len(prior)
-    return np.full(count, asked.sum() / known.sum()), np.full(count, known.sum())
+        level = np.maximum(_median(np.where(there, misfit, np.nan)), 1.0)
+        weight = np.where(there, 1 / np.maximum(misfit, level[:, None, None]), 0.0)
+        asked = asked + np.nan_to_num(weight * right).sum(axis=-1)
+        known = known + np.nan_to_num(weight * left).sum(axis=-1)
+    sums = (np.where(alone[:, None], v, v.sum(axis=1, keepdims=True)) for v in (asked, known))
+    asked, known = sums
+    return asked / known, known
 
 
-def _prior_precision(passes: Passes, slopes: Array, members: Flags, count: Indices) -> Array:
-    """Prior precision of each coordinate, [pass, section, 4]; 0 in a plane with readings.
+def _prior_precision(readings: Array, slopes: Array, members: Flags, count: Indices) -> Array:
+    """Prior precision of each coordinate, [..., section, 4]; 0 in a plane with readings.
 
     With fewer than two readings in a plane the prior is as large as the turn's readings. Without it
     sextupoles would let the trajectory diverge to fit the other plane.
 
     Args:
-        passes: the readings.
-        slopes: d readings / d coordinate of the design, [pass, section, monitor, 2, 5].
+        readings: [..., monitor, 2], m.
+        slopes: d readings / d coordinate of the design, [..., section, monitor, 2, 5].
         members: which monitors exist, [section, monitor].
-        count: of the readings, [pass, section, 2].
+        count: of the readings, [..., section, 2].
     """
-    size = np.sqrt(np.nanmean(passes.readings**2, axis=(1, 2)))[:, None, None, None]
+    size = np.sqrt(np.nanmean(readings**2, axis=(-2, -1)))[..., None, None, None]
     own = np.stack([slopes[..., 0, 0:2], slopes[..., 1, 2:4]], axis=-2)  # [..., plane, coordinate]
-    square = np.where(members[..., None, None], own**2, 0.0).sum(axis=2)
+    square = np.where(members[..., None, None], own**2, 0.0).sum(axis=-3)
     square = square / members.sum(axis=1)[:, None, None]
     precision = square / np.maximum(size, TINY) ** 2
-    return np.where((count < TWO)[..., None], precision, 0.0).reshape(*count.shape[:2], 4)
+    return np.where((count < TWO)[..., None], precision, 0.0).reshape(*count.shape[:-1], 4)
 
 
 def _inverse(curvature: Array) -> Array:
