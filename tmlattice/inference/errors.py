@@ -398,6 +398,10 @@ def scale_covariance(
     return np.asarray(moved @ (directions * np.sqrt(np.maximum(variance, 0))))
 
 
+Chosen = tuple[int, ...]
+"""Which of its scales each group has."""
+
+
 class _Scales:
     """Scales of some groups, and their members' amounts in units of the present scales.
 
@@ -413,7 +417,7 @@ class _Scales:
         absent: Flags,
     ) -> None:  # fmt: skip
         self.information, self.score, self.group = information, score, group
-        self.known: dict[bytes, float] = {}
+        self.known: dict[Chosen, float] = {}
         self.now = np.where(absent, -np.inf, 0.0)
         self.choices, self.chances = [], []
         self.pairs = list(combinations(np.flatnonzero(absent).tolist(), 2))
@@ -435,29 +439,32 @@ class _Scales:
         inside = scale[..., :, None] * self.information * scale[..., None, :]
         return scale, inside + np.eye(len(self.group))
 
-    def log_evidence(self, sizes: Array) -> Array:
-        """Log marginal likelihoods with all members integrated out, [set], of sets of scales,
-        [set, group]; a chain comes back to the same ones, which are computed once."""
-        keys = [own.tobytes() for own in sizes]
-        new = [i for i, key in enumerate(keys) if key not in self.known]
+    def sizes(self, chosen: Chosen) -> Array:
+        """The scales of choices, [group]."""
+        return np.array([own[k] for own, k in zip(self.choices, chosen, strict=True)])
+
+    def log_evidence(self, several: Sequence[Chosen]) -> Array:
+        """Log marginal likelihoods of several choices with all members integrated out; a chain
+        comes back to the same ones, which are computed once."""
+        new = [chosen for chosen in several if chosen not in self.known]
         if new:
-            scale, inside = self._inside(sizes[new])
+            scale, inside = self._inside(np.array([self.sizes(chosen) for chosen in new]))
             root = np.linalg.cholesky(inside)
             pull = np.linalg.solve(root, (scale * self.score)[..., None])
             log_volume = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
             found = 0.5 * np.sum(pull**2, axis=(-2, -1)) - log_volume
-            self.known.update(zip([keys[i] for i in new], found.tolist(), strict=True))
-        return np.array([self.known[key] for key in keys])
+            self.known.update(zip(new, found.tolist(), strict=True))
+        return np.array([self.known[chosen] for chosen in several])
 
-    def _chance(self, sizes: Array) -> float:
-        """Log probability of scales; -inf outside their support."""
-        chance = 0.0
-        for size, choices, chances in zip(sizes, self.choices, self.chances, strict=True):
-            (at,) = np.nonzero(choices == size)
-            if not len(at):
-                return -np.inf
-            chance += float(chances[at[0]])
-        return chance + float(self.log_evidence(sizes[None])[0])
+    def _exchanged(self, chosen: Chosen, a: int, b: int) -> Chosen | None:
+        """The choice with the scales of two groups exchanged; None outside their support."""
+        found = list(chosen)
+        for to, of in ((a, b), (b, a)):
+            there = np.flatnonzero(self.choices[to] == self.choices[of][chosen[of]])
+            if not len(there):
+                return None
+            found[to] = int(there[0])
+        return tuple(found)
 
     def amounts(self, sizes: Array) -> tuple[Array, Array]:
         """Most probable amounts, and their covariance."""
@@ -469,26 +476,28 @@ class _Scales:
         """Covariance that sampled scales add to that at the present ones, [member, member], by
         Gibbs sampling."""
         random = np.random.default_rng(0)
-        here = np.where(np.isinf(self.now), 0.0, self.now)
         mean, stated = self.amounts(self.now)
-        visits: Counter[tuple[float, ...]] = Counter()
+        here: Chosen = tuple(int(np.flatnonzero(own == 0)[0]) for own in self.choices)
+        visits: Counter[Chosen] = Counter()
         for draw in range(DRAWS):
-            for i, (choices, chances) in enumerate(zip(self.choices, self.chances, strict=True)):
-                tried = np.repeat(here[None], len(choices), axis=0)
-                tried[:, i] = choices
+            for i, chances in enumerate(self.chances):
+                tried = [(*here[:i], k, *here[i + 1 :]) for k in range(len(chances))]
                 values = chances + self.log_evidence(tried)
                 weights = np.exp(values - values.max())
                 here = tried[random.choice(len(tried), p=weights / weights.sum())]
             for a, b in self.pairs:  # swap two groups that compensate each other
-                other = here.copy()
-                other[[a, b]] = here[[b, a]]
-                both = self._chance(other) - self._chance(here)
-                if np.log(random.random()) < both:
+                other = self._exchanged(here, a, b)
+                limit = np.log(random.random())
+                if other is None or other == here:
+                    continue
+                (there, now) = self.log_evidence([other, here])
+                own = ((self.chances[i][other[i]], self.chances[i][here[i]]) for i in (a, b))
+                if limit < there - now + sum(new - old for new, old in own):
                     here = other
             if draw >= BURN_IN:
-                visits[tuple(here.tolist())] += 1
+                visits[here] += 1
         total = np.zeros_like(stated)
-        for sizes, times in visits.items():
-            then, spread = self.amounts(np.array(sizes))
+        for chosen, times in visits.items():
+            then, spread = self.amounts(self.sizes(chosen))
             total += times * (spread + np.outer(then - mean, then - mean))
         return np.asarray(total / (DRAWS - BURN_IN) - stated)

@@ -392,8 +392,9 @@ class OfLines(Compared):
         """
         return self.first or self._lines(self.data)
 
-    def _lines(self, data: TurnByTurn) -> ManyTurns:
-        return many_turns(self.ring, data, dict.fromkeys(modelled(turns=True), 1.0))
+    def _lines(self, data: TurnByTurn, shifted: bool = True) -> ManyTurns:
+        places = dict.fromkeys(modelled(turns=True), 1.0)
+        return many_turns(self.ring, data, places, shifted=shifted)
 
     @property
     def warnings(self) -> Sequence[str]:
@@ -430,7 +431,7 @@ class OfLines(Compared):
         [shot, mode, monitor, plane]."""
         problem, change = self.problem, self._changed(names)
         if "planes-swapped" in names:
-            problem, change = self._lines(self.assumed(names)), self._changed(())
+            problem, change = self._lines(self.assumed(names), False), self._changed(())
         both = np.where(problem.used[:, :LINES], problem.values[:, :LINES], np.nan)
         own = both.reshape(len(both), -1, 2, 2, 2)  # [shot, monitor, plane, mode, re and im]
         read = np.moveaxis(own[..., 0] + 1j * own[..., 1], -1, 1)[:, :, change, [0, 1]]

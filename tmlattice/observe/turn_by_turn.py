@@ -475,8 +475,9 @@ def _chromatic(beam: StoredBeam, at: Array) -> tuple[Array, ComplexArray]:
 
 
 def many_turns(
-    ring: Ring, measured: TurnByTurn, places: Mapping[str, float], spectrum: Lines | None = None
-) -> ManyTurns:
+    ring: Ring, measured: TurnByTurn, places: Mapping[str, float], spectrum: Lines | None = None,
+    shifted: bool = True,
+) -> ManyTurns:  # fmt: skip
     """Return the problem of the turns of a stored beam.
 
     A real signal does not distinguish Q from 1 - Q: lines are sought near the design's tunes.
@@ -485,7 +486,8 @@ def many_turns(
         ring: the design.
         measured: readings.
         places: of each effect, for the prior.
-        spectrum: their lines, if known.
+        spectrum: their lines, if known; then without shifts.
+        shifted: lines shift with the amplitude, for which the design is tracked.
 
     Raises:
         MeasurementError: no line can be used.
@@ -508,7 +510,7 @@ def many_turns(
             own = of_modes[0, 0, :, mode, mode] / beams[0].modes[:, mode, mode]
             share[:, mode, mode] = own + 2j * np.pi * at * of_tunes[0, 0, mode]
         found = lines(measured.in_order_of(names), near=design[0], at=at, chromatic=share)
-        shift = shift_of(ring, beams, found, at)
+        shift = shift_of(ring, beams, found, at) if shifted else shift
     # the model's error is proportional to the line of the mode in its own plane
     size = np.nan_to_num(np.abs(found.amplitude)).max(axis=2, keepdims=True)
     error = np.sqrt(found.error**2 + (FLOOR * size) ** 2).reshape(shots, -1)
