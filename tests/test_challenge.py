@@ -300,6 +300,7 @@ def scored(folder, tier, cases, lattice=LATTICE, **options):
     return found
 
 
+@pytest.mark.slow
 def test_a_fixed_set_of_single_faults_keeps_its_rates(tmp_path):
     """Bounds leave room for one case of chance: a loss of a tenth of the rates breaks them."""
     found = scored(tmp_path, "A", 16, signal=(20.0, 100.0))
@@ -313,6 +314,7 @@ def test_a_fixed_set_of_single_faults_keeps_its_rates(tmp_path):
     assert abs(found["pulls"]["mean"]) < 0.8  # three standard errors of fourteen
 
 
+@pytest.mark.slow
 def test_a_fixed_set_without_a_fault_stays_silent(tmp_path):
     # 1 expected at a rate of 5 %; four or more have 2 % there, and 59 % at a rate of 20 %
     assert scored(tmp_path, "E", 20)["false_alarms"]["share"] <= 3 / 20

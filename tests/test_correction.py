@@ -266,6 +266,7 @@ def posterior(names, rms, mean=None):
     return replace(known, amounts=amounts)
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_they_state(small_ring, quadrupoles):
     """Machines drawn from the posterior, corrected alike: 68 % of their beta beating within."""
     rng = np.random.default_rng(7)

@@ -113,10 +113,23 @@ def test_y_of_wrong_sign_is_named_with_its_mirror(small_ring, healthy):
     assert "--assume launches-y-reversed" in check.sentence
 
 
-def test_two_global_errors_are_named_together(small_ring, machine):
+@pytest.mark.parametrize("stated", [True, False])
+def test_two_global_errors_are_named_together(small_ring, machine, stated):
     data = replace(machine, readings=machine.readings * [-1e3, 1e3])
+    data = data if stated else replace(data, noise=None)
     found = {name for check in reported(check_data(small_ring, data)) for name in check.assume}
     assert found == {"readings-in-mm", "x-reversed"}
+
+
+def test_energies_in_per_cent_are_named(small_ring):
+    """They are those of the shots; as stated right nothing is said."""
+    made = simulate(small_ring, shots=4, seed=1, launch_sigma=(1e-5, 2e-6, 1e-5, 2e-6, 2e-3))
+    data = made.measurement()
+    launches, sigma = data.launches.copy(), data.launch_sigma.copy()
+    launches[:, 4], sigma[:, 4] = made.shots.launches[:, 5], 1e-5
+    for factor, wrong in ((1, []), (100, [("energies-in-percent",)])):
+        stated = replace(data, launches=launches * [1, 1, 1, 1, factor], launch_sigma=sigma)
+        assert [check.assume for check in reported(check_data(small_ring, stated))] == wrong
 
 
 def test_a_beam_that_runs_backwards_is_told(small_ring, healthy):

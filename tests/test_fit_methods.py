@@ -175,6 +175,7 @@ def test_map_with_tails_gives_one_magnet_the_fault(small_ring, small_network):
     assert away["faults"] < 0.3 * away["strengths"]
 
 
+@pytest.mark.slow
 def test_map_states_its_error_where_its_prior_is_true(small_ring, small_network):
     """Faults drawn from the prior itself: the pulls have the width 1."""
     rng = np.random.default_rng(3)

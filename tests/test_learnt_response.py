@@ -38,6 +38,7 @@ def known(monday):
     return known_of(monday)
 
 
+@pytest.mark.slow
 def test_what_a_response_leaves_open_holds(small_ring, monday, known):
     """Skew gradients held for certain made pulls of 5 along what is known best."""
     truth = {(c.effect, c.element): c.amount for c in draw_background(small_ring, USUAL, SEED)}

@@ -16,7 +16,7 @@ rule.
 
 import numpy as np
 
-from tmlattice.beam.sweeps import _polynomial, _pull
+from tmlattice.beam.sweeps import _polynomial, _pull, put
 from tmlattice.compiled import jit
 
 _ITERATIONS = 60
@@ -140,11 +140,11 @@ def forward(first, last, size, W0, W1, c, A, Q, moves, flat, states, middles):  
     work = _scratch(size)
     x, m = _part(size, work, 0), _part(size, work, 2)
     for block in range(first, last):
-        x[:] = states[block, 0]
+        put(states[block, 0], x)
         for k in range(W0.shape[0]):
             _layer(size, k, W0, W1, c, A, Q, moves, flat, work)
-            states[block, k + 1] = x
-            middles[block, k] = m
+            put(x, states[block, k + 1])
+            put(m, middles[block, k])
 
 
 @jit
@@ -153,11 +153,11 @@ def track(first, last, size, W0, W1, c, A, Q, moves, flat, turns):  # type: igno
     work = _scratch(size)
     x = _part(size, work, 0)
     for block in range(first, last):
-        x[:] = turns[block, 0]
+        put(turns[block, 0], x)
         for turn in range(1, turns.shape[1]):
             for k in range(W0.shape[0]):
                 _layer(size, k, W0, W1, c, A, Q, moves, flat, work)
-            turns[block, turn] = x
+            put(x, turns[block, turn])
 
 
 @jit

@@ -69,7 +69,8 @@ def settle(  # type: ignore[no-untyped-def]
                 paths[orbit, 0, a] += change[a]
                 if not abs(change[a]) <= largest:  # true for NaN
                     largest = abs(change[a]) if abs(change[a]) < 1.0 else np.inf
-            before[:] = miss
+            for i in range(free):
+                before[i] = miss[i]
             if not largest < 1.0:
                 break
             if largest < tolerance:

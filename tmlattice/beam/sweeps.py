@@ -50,6 +50,14 @@ _PLANES = (None, None)
 
 
 @jit
+def put(x, y):  # type: ignore[no-untyped-def]
+    """y [n, lane] = x; an assignment of slices takes seconds to compile, for its messages."""
+    for a in range(x.shape[0]):
+        for v in range(x.shape[1]):
+            y[a, v] = x[a, v]
+
+
+@jit
 def _polynomial(size, k, W0, W1, W2, curved, x, y):  # type: ignore[no-untyped-def]
     """y [., lane] = polynomial k of x [n, lane], in Horner's form: few and short chains."""
     n, lanes = len(size[0]), len(size[1])
@@ -135,14 +143,14 @@ def track(first, last, size, W0, W1, W2, curved, turns):  # type: ignore[no-unty
     x = np.empty((n, lanes))
     y = np.empty((n, lanes))
     for block in range(first, last):
-        x[:] = turns[block, 0]
+        put(turns[block, 0], x)
         for turn in range(1, turns.shape[1]):
             for k in range(W0.shape[0]):
                 _polynomial(size, k, W0, W1, W2, curved, x, y)
                 for a in range(n):
                     for v in range(lanes):
                         x[a, v] = y[a, v]
-            turns[block, turn] = x
+            put(x, turns[block, turn])
 
 
 @jit

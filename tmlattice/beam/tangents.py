@@ -78,7 +78,9 @@ def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
     n, k = steps.shape[1], 0
     row = np.empty(n)
     for e in range(len(ends)):
-        whole[e] = steps[k]
+        for a in range(n):
+            for j in range(n):
+                whole[e, a, j] = steps[k, a, j]
         for s in range(k + 1, ends[e] + 1):
             for j in range(n):
                 for a in range(n):

@@ -346,7 +346,7 @@ KNOWN_MEMBERS = 6.0
 """Members determined by the data above which the scale is known to 30 %."""
 MAX_MEMBERS = 128
 """Members above which a scale is not sampled: each draw costs the third power."""
-FACTORS = np.log(np.geomspace(1 / 32, 32, 11))
+FACTORS = np.log(2) * np.arange(-5, 6)
 """Log factors of the present scales, the support of the samples."""
 DRAWS, BURN_IN = 420, 20
 """Gibbs samples, and those of them that are discarded as burn-in."""
@@ -490,7 +490,7 @@ class _Scales:
                 limit = np.log(random.random())
                 if other is None or other == here:
                     continue
-                (there, now) = self.log_evidence([other, here])
+                there, now = self.log_evidence([other, here])
                 own = ((self.chances[i][other[i]], self.chances[i][here[i]]) for i in (a, b))
                 if limit < there - now + sum(new - old for new, old in own):
                     here = other

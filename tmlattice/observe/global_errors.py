@@ -70,7 +70,7 @@ LEFT, TOO_WELL = 4.0, 0.1
 """Ratio of what each of two corrections leaves to what both do, at least; and chi-square of
 launches below which they are no evidence of a unit: readings next to zero fit any."""
 TOGETHER = 10_000
-"""BPMs of passes that are fitted at once: their maps fit into a processor's cache."""
+"""BPMs times passes that are fitted at once: their maps fit into a processor's cache."""
 ROUNDS = 20
 """Reweighted least squares."""
 ALIKE = 0.95
@@ -361,6 +361,15 @@ def _scattered(readings: Array) -> float:
     return math.lgamma(len(read) + 1) - math.lgamma(ends + 1) - math.lgamma(len(read) - ends + 1)
 
 
+Key = tuple[int, float, bytes, bool]
+"""What a fit of first turns depends on: readings, factor of the kicks, energies."""
+
+
+def _alone(data: Measurement) -> bool:
+    """Whether each shot has its own energy."""
+    return data.launch_sigma is not None and bool(data.launch_sigma[:, 4].any())
+
+
 @dataclass(frozen=True)
 class OfTurns(Search):
     """Search for global errors of first turns, of which some shots and turns are used.
@@ -372,7 +381,7 @@ class OfTurns(Search):
     data: Measurement
     known: Sequence[Cause] = ()
     _sections: dict[float, Sections] = field(default_factory=dict, repr=False)
-    _found: dict[tuple[int, float], tuple[Measurement, Passes, SectionFits]] = field(
+    _found: dict[Key, tuple[Measurement, Passes, SectionFits]] = field(
         default_factory=dict, repr=False
     )
     _made: dict[Names, Measurement] = field(default_factory=dict, repr=False)
@@ -402,8 +411,10 @@ class OfTurns(Search):
         self._fit([data])
         return self._found[self._key(data)][1:]
 
-    def _key(self, data: Measurement) -> tuple[int, float]:
-        return id(data.readings), self._times(data)
+    def _key(self, data: Measurement) -> Key:
+        """Of launches a fit knows the energies alone."""
+        energies = data.launches[:, 4].tobytes()
+        return id(data.readings), self._times(data), energies, _alone(data)
 
     def _times(self, data: Measurement) -> float:
         """Common factor of the shots' kicks."""
@@ -413,11 +424,11 @@ class OfTurns(Search):
 
     def _fit(self, several: Iterable[Measurement]) -> None:
         """Find the trajectories of several measurements, those of equally many passes at once."""
-        new = {self._key(data): data for data in several}
-        alike: dict[tuple[float, int], dict[tuple[int, float], tuple[Measurement, Passes]]] = {}
-        for key in new.keys() - self._found.keys():
-            passes = self._passes(new[key])
-            alike.setdefault((key[1], len(passes.shot)), {})[key] = new[key], passes
+        alike: dict[tuple[float, int], dict[Key, tuple[Measurement, Passes]]] = {}
+        for data in several:
+            if (key := self._key(data)) not in self._found:
+                passes = self._passes(data)
+                alike.setdefault((key[1], len(passes.shot)), {})[key] = data, passes
         for (times, count), own in alike.items():
             most = max(TOGETHER // max(count * len(self.data.monitors), 1), 1)
             keys = list(own)
@@ -437,9 +448,8 @@ class OfTurns(Search):
             own = self._noise(data)
             noise = np.where(np.isfinite(own), own, np.nanmedian(own))
         factor = _size(data) / self.scale if self.scale > 0 else 1.0
-        sigma = data.launch_sigma
-        alone = sigma is not None and bool(sigma[:, 4].any())
-        return Passes(readings[read], factor * noise, data.launches[shot, 4], shot, turn, alone)
+        energies = data.launches[shot, 4]
+        return Passes(readings[read], factor * noise, energies, shot, turn, _alone(data))
 
     def _section(self, times: float) -> Sections:
         """Sections with the shots' kicks multiplied."""
@@ -626,7 +636,8 @@ class OfTurns(Search):
         return max(float(np.nanmin(found)), 1e-12) if np.isfinite(found).any() else 1.0
 
     def improving(self) -> list[Verdict]:
-        """Return the assumptions that improve the data far, and the best of them with others."""
+        """Return the assumptions that improve the data far; and the best of them with others, if it
+        leaves more than noise."""
         several = self.candidates()
         square = self.square([(), *several])
         stated = self.terms((), square)
@@ -644,8 +655,9 @@ class OfTurns(Search):
         found = sorted(gains(several), key=lambda own: own.gain, reverse=True)
         if not found or found[0].gain < GAIN:
             return []
-        if found[0].left < LEFT:  # no two leave so much less
-            return _believed(found)
+        believed = _believed(found)
+        if believed and believed[0].left < LEFT and self.data.noise is not None:
+            return believed  # no two leave so much less
         order = list(ASSUMPTIONS).index
         alone = {own.names: own.left for own in found}
         both = gains(sorted({

@@ -299,13 +299,15 @@ class Sections:
         x = np.zeros((*shape, 5))
         x[..., 4] = delta[..., None]
         moved, by_energy = np.full(len(several), np.inf), np.zeros((*shape, 4))
+        alone = np.array([own.alone for own in several])
         with np.errstate(all="ignore"):
             for step in range(ROUNDS):
                 image, slope = maps(x[..., None, :])
                 left = np.where(there, (data - image) / sigma, 0.0).reshape(*shape, -1)
                 A = (slope[..., :4] / sigma[..., None]).reshape(*shape, -1, 4)
                 curvature = _regularised(np.swapaxes(A, -1, -2) @ A + prior[..., None] * np.eye(4))
-                if step == ROUNDS - 1 or not (moved > SETTLED).any():
+                going = moved > SETTLED  # the others stay as they are
+                if step == ROUNDS - 1 or not going.any():
                     break
                 own = (slope[..., 4] / sigma).reshape(*shape, -1)  # by the energy
                 back: Array = np.linalg.solve(curvature, np.swapaxes(A, -1, -2)).astype(float)
@@ -316,16 +318,16 @@ class Sections:
                 inner = _energy_terms(left - fitted, own + (A @ drift[..., None])[..., 0], freedom)
                 ends = way[group[..., None], np.arange(W)](x)
                 outer = _joints(x[..., :4], ends, step_4, drift, _inverse(curvature))
-                change, known = _common_energy(
-                    inner, outer, delta - x[..., 0, 4], np.array([own.alone for own in several])
-                )
+                change, known = _common_energy(inner, outer, delta - x[..., 0, 4], alone)
                 error = np.sqrt(known)
-                by_energy = drift / error[..., None, None]
-                moved = np.maximum(_median(np.abs(fitted)), np.nanmax(np.abs(change) * error, 1))
-                moved /= np.maximum(1.0, _median(np.abs(left - fitted)))
+                by_energy[going] = (drift / error[..., None, None])[going]
+                now = np.maximum(_median(np.abs(fitted)), np.nanmax(np.abs(change) * error, 1))
+                now /= np.maximum(1.0, _median(np.abs(left - fitted)))
+                moved[going] = now[going]
                 step_4 = step_4 + drift * change[..., None, None]
-                x[..., :4] = np.clip(x[..., :4] + np.nan_to_num(step_4), -FARTHEST, FARTHEST)
-                x[..., 4] += change[..., None]
+                ahead = np.clip(x[..., :4] + np.nan_to_num(step_4), -FARTHEST, FARTHEST)
+                x[going, ..., :4] = ahead[going]
+                x[going, ..., 4] += change[going, :, None]
         whole: Array = np.nan_to_num(
             (left**2).sum(axis=-1), nan=DIVERGED_SIGMA**2, posinf=DIVERGED_SIGMA**2
         )
@@ -448,8 +450,9 @@ def _common_energy(
         weight = np.where(there, 1 / np.maximum(misfit, level[:, None, None]), 0.0)
         asked = asked + np.nan_to_num(weight * right).sum(axis=-1)
         known = known + np.nan_to_num(weight * left).sum(axis=-1)
-    sums = (np.where(alone[:, None], v, v.sum(axis=1, keepdims=True)) for v in (asked, known))
-    asked, known = sums
+    asked, known = (
+        np.where(alone[:, None], own, own.sum(axis=1, keepdims=True)) for own in (asked, known)
+    )
     return asked / known, known
 
 

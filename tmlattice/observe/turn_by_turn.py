@@ -487,7 +487,8 @@ def many_turns(
         measured: readings.
         places: of each effect, for the prior.
         spectrum: their lines, if known; then without shifts.
-        shifted: lines shift with the amplitude, for which the design is tracked.
+        shifted: lines shift with the amplitude, for which the design is tracked; else no amplitude
+            is too large.
 
     Raises:
         MeasurementError: no line can be used.
