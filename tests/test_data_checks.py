@@ -122,7 +122,7 @@ def test_two_global_errors_are_named_together(small_ring, machine, stated):
 
 
 def test_energies_in_per_cent_are_named(small_ring):
-    """They are those of the shots; as stated right nothing is said."""
+    """Each shot has its own. Correct ones are not reported."""
     made = simulate(small_ring, shots=4, seed=1, launch_sigma=(1e-5, 2e-6, 1e-5, 2e-6, 2e-3))
     data = made.measurement()
     launches, sigma = data.launches.copy(), data.launch_sigma.copy()
@@ -477,7 +477,7 @@ def test_sections_follow_a_trajectory_that_the_machine_made(small_ring):
     sections = Sections(small_ring, data.settings, np.arange(count))
     sigma = np.full((count, 2), 1e-7)
     passes = Passes(data.readings[:, 0], sigma, np.zeros(4), np.arange(4), np.zeros(4, dtype=int))
-    found = sections.fit(passes)
+    (found,) = sections.fit([passes])
     assert np.abs(found.left).max() < 1
     assert np.abs(found.start[:, 0] - data.launches[:, :4]).max() < 2e-7
 

@@ -147,9 +147,7 @@ def track(first, last, size, W0, W1, W2, curved, turns):  # type: ignore[no-unty
         for turn in range(1, turns.shape[1]):
             for k in range(W0.shape[0]):
                 _polynomial(size, k, W0, W1, W2, curved, x, y)
-                for a in range(n):
-                    for v in range(lanes):
-                        x[a, v] = y[a, v]
+                put(y, x)
             put(x, turns[block, turn])
 
 

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from tmlattice.beam.nonlinear import bend_tangent
+from tmlattice.beam.sweeps import put
 from tmlattice.compiled import jit
 
 
@@ -78,9 +79,7 @@ def merge(steps, ends, whole):  # type: ignore[no-untyped-def]
     n, k = steps.shape[1], 0
     row = np.empty(n)
     for e in range(len(ends)):
-        for a in range(n):
-            for j in range(n):
-                whole[e, a, j] = steps[k, a, j]
+        put(steps[k], whole[e])
         for s in range(k + 1, ends[e] + 1):
             for j in range(n):
                 for a in range(n):

@@ -433,31 +433,33 @@ class _Scales:
             self.choices.append(factors)
             self.chances.append(np.log(chances))
 
-    def _inside(self, sizes: Array) -> tuple[Array, Array]:
+    def _inside(self, scales: Array) -> tuple[Array, Array]:
         """Prior rms of the members, and their posterior precision in these units."""
-        scale = np.exp(sizes)[..., self.group]
+        scale = np.exp(scales)[..., self.group]
         inside = scale[..., :, None] * self.information * scale[..., None, :]
         return scale, inside + np.eye(len(self.group))
 
-    def sizes(self, chosen: Chosen) -> Array:
-        """The scales of choices, [group]."""
+    def scales(self, chosen: Chosen) -> Array:
+        """Log factors of the present scales, [group]."""
         return np.array([own[k] for own, k in zip(self.choices, chosen, strict=True)])
 
-    def log_evidence(self, several: Sequence[Chosen]) -> Array:
-        """Log marginal likelihoods of several choices with all members integrated out; a chain
-        comes back to the same ones, which are computed once."""
+    def log_posterior(self, several: Sequence[Chosen]) -> Array:
+        """Log posterior densities of several choices, all members integrated out; a chain returns
+        to the same ones, which are computed once."""
         new = [chosen for chosen in several if chosen not in self.known]
         if new:
-            scale, inside = self._inside(np.array([self.sizes(chosen) for chosen in new]))
+            scale, inside = self._inside(np.array([self.scales(chosen) for chosen in new]))
             root = np.linalg.cholesky(inside)
             pull = np.linalg.solve(root, (scale * self.score)[..., None])
             log_volume = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
             found = 0.5 * np.sum(pull**2, axis=(-2, -1)) - log_volume
-            self.known.update(zip(new, found.tolist(), strict=True))
+            for chosen, evidence in zip(new, found.tolist(), strict=True):
+                own = zip(self.chances, chosen, strict=True)
+                self.known[chosen] = evidence + sum(chances[k] for chances, k in own)
         return np.array([self.known[chosen] for chosen in several])
 
-    def _exchanged(self, chosen: Chosen, a: int, b: int) -> Chosen | None:
-        """The choice with the scales of two groups exchanged; None outside their support."""
+    def _swapped(self, chosen: Chosen, a: int, b: int) -> Chosen | None:
+        """The choice with the scales of two groups swapped; None outside their support."""
         found = list(chosen)
         for to, of in ((a, b), (b, a)):
             there = np.flatnonzero(self.choices[to] == self.choices[of][chosen[of]])
@@ -466,9 +468,9 @@ class _Scales:
             found[to] = int(there[0])
         return tuple(found)
 
-    def amounts(self, sizes: Array) -> tuple[Array, Array]:
+    def amounts(self, scales: Array) -> tuple[Array, Array]:
         """Most probable amounts, and their covariance."""
-        scale, inside = self._inside(sizes)
+        scale, inside = self._inside(scales)
         covariance = scale[:, None] * np.linalg.inv(inside) * scale
         return covariance @ self.score, covariance
 
@@ -480,24 +482,20 @@ class _Scales:
         here: Chosen = tuple(int(np.flatnonzero(own == 0)[0]) for own in self.choices)
         visits: Counter[Chosen] = Counter()
         for draw in range(DRAWS):
-            for i, chances in enumerate(self.chances):
-                tried = [(*here[:i], k, *here[i + 1 :]) for k in range(len(chances))]
-                values = chances + self.log_evidence(tried)
+            for i, choices in enumerate(self.choices):
+                tried = [(*here[:i], k, *here[i + 1 :]) for k in range(len(choices))]
+                values = self.log_posterior(tried)
                 weights = np.exp(values - values.max())
                 here = tried[random.choice(len(tried), p=weights / weights.sum())]
-            for a, b in self.pairs:  # swap two groups that compensate each other
-                other = self._exchanged(here, a, b)
+            for a, b in self.pairs:  # two groups that compensate each other
                 limit = np.log(random.random())
-                if other is None or other == here:
-                    continue
-                there, now = self.log_evidence([other, here])
-                own = ((self.chances[i][other[i]], self.chances[i][here[i]]) for i in (a, b))
-                if limit < there - now + sum(new - old for new, old in own):
-                    here = other
+                if other := self._swapped(here, a, b):
+                    there, now = self.log_posterior([other, here])
+                    here = other if limit < there - now else here
             if draw >= BURN_IN:
                 visits[here] += 1
         total = np.zeros_like(stated)
         for chosen, times in visits.items():
-            then, spread = self.amounts(self.sizes(chosen))
+            then, spread = self.amounts(self.scales(chosen))
             total += times * (spread + np.outer(then - mean, then - mean))
         return np.asarray(total / (DRAWS - BURN_IN) - stated)

@@ -308,14 +308,10 @@ class Search:
 
 
 def _believed(found: Iterable[Verdict]) -> list[Verdict]:
-    """Those with enough evidence that is not a unit's by launches alone which fit too well."""
-    return [
-        own
-        for own in found
-        if own.worth > GAIN
-        and not (own.of.endswith("launches") and own.after < TOO_WELL
-                 and any(map(is_unit, own.names)))
-    ]  # fmt: skip
+    """Return those with enough evidence; not units by launches that fit any, see `TOO_WELL`."""
+    return [own for own in found if own.worth > GAIN
+            and not (own.of.endswith("launches") and own.after < TOO_WELL
+                     and any(map(is_unit, own.names)))]  # fmt: skip
 
 
 def _verdict(stated: Terms, other: Terms, names: Names, gain: float) -> Verdict:
@@ -361,13 +357,8 @@ def _scattered(readings: Array) -> float:
     return math.lgamma(len(read) + 1) - math.lgamma(ends + 1) - math.lgamma(len(read) - ends + 1)
 
 
-Key = tuple[int, float, bytes, bool]
-"""What a fit of first turns depends on: readings, factor of the kicks, energies."""
-
-
-def _alone(data: Measurement) -> bool:
-    """Whether each shot has its own energy."""
-    return data.launch_sigma is not None and bool(data.launch_sigma[:, 4].any())
+Key = tuple[int, float, bytes]
+"""What a fit of first turns depends on: readings, factor of the kicks, energies of the launches."""
 
 
 @dataclass(frozen=True)
@@ -412,9 +403,7 @@ class OfTurns(Search):
         return self._found[self._key(data)][1:]
 
     def _key(self, data: Measurement) -> Key:
-        """Of launches a fit knows the energies alone."""
-        energies = data.launches[:, 4].tobytes()
-        return id(data.readings), self._times(data), energies, _alone(data)
+        return id(data.readings), self._times(data), data.launches[:, 4].tobytes()
 
     def _times(self, data: Measurement) -> float:
         """Common factor of the shots' kicks."""
@@ -424,19 +413,17 @@ class OfTurns(Search):
 
     def _fit(self, several: Iterable[Measurement]) -> None:
         """Find the trajectories of several measurements, those of equally many passes at once."""
-        alike: dict[tuple[float, int], dict[Key, tuple[Measurement, Passes]]] = {}
-        for data in several:
-            if (key := self._key(data)) not in self._found:
-                passes = self._passes(data)
-                alike.setdefault((key[1], len(passes.shot)), {})[key] = data, passes
-        for (times, count), own in alike.items():
+        new = {self._key(data): (data, self._passes(data)) for data in several
+               if self._key(data) not in self._found}  # fmt: skip
+        alike: dict[tuple[float, int], list[Key]] = {}
+        for key, (_, passes) in new.items():
+            alike.setdefault((key[1], len(passes.shot)), []).append(key)
+        for (times, count), keys in alike.items():
             most = max(TOGETHER // max(count * len(self.data.monitors), 1), 1)
-            keys = list(own)
-            for first in range(0, len(keys), most):
-                some = keys[first : first + most]
-                fits = self._section(times).fit_each([own[key][1] for key in some])
-                # with the data, whose id is the key
-                self._found.update((k, (*own[k], fit)) for k, fit in zip(some, fits, strict=True))
+            for some in (keys[i : i + most] for i in range(0, len(keys), most)):
+                fits = self._section(times).fit([new[key][1] for key in some])
+                # with the data, whose id is in the key
+                self._found.update((k, (*new[k], fit)) for k, fit in zip(some, fits, strict=True))
 
     def _passes(self, data: Measurement) -> Passes:
         shots, turns = data.readings.shape[:2]
@@ -448,8 +435,9 @@ class OfTurns(Search):
             own = self._noise(data)
             noise = np.where(np.isfinite(own), own, np.nanmedian(own))
         factor = _size(data) / self.scale if self.scale > 0 else 1.0
-        energies = data.launches[shot, 4]
-        return Passes(readings[read], factor * noise, energies, shot, turn, _alone(data))
+        sigma = self.data.launch_sigma
+        alone = sigma is not None and bool(sigma[:, 4].any())
+        return Passes(readings[read], factor * noise, data.launches[shot, 4], shot, turn, alone)
 
     def _section(self, times: float) -> Sections:
         """Sections with the shots' kicks multiplied."""
@@ -628,8 +616,7 @@ class OfTurns(Search):
     def square(self, several: Iterable[Names]) -> float:
         """Variance of the readings in units of the stated one, from the best of several
         assumptions."""
-        found, several = [], list(several)
-        self._fit(map(self.assumed, several))
+        found = []
         for names in several:
             passes, own = self.found(self.assumed(names))
             found += [own.level, _parts(passes, own)[0].level()]
@@ -639,6 +626,7 @@ class OfTurns(Search):
         """Return the assumptions that improve the data far; and the best of them with others, if it
         leaves more than noise."""
         several = self.candidates()
+        self._fit(map(self.assumed, [(), *several]))
         square = self.square([(), *several])
         stated = self.terms((), square)
 

@@ -1,7 +1,7 @@
 """Sections of a turn, each with its own trajectory, which isolate a fault.
 
 >>> sections = Sections(ring, measurement)
->>> found = sections.fit(passes)
+>>> (found,) = sections.fit([passes])
 >>> found.misfit                                  # chi-square of each section over its freedom
 
 A single fault spoils its section and the joint behind it; a wrong sign, unit or order spoils all.
@@ -269,13 +269,9 @@ class Sections:
                     getattr(way, name)[:, go] = getattr(moved, name)
         return seen, way, np.asarray(np.linalg.inv(before)[..., 1::2], dtype=float)
 
-    def fit(self, passes: Passes) -> SectionFits:
-        """Fit the trajectory of each section to its own readings."""
-        return self.fit_each([passes])[0]
-
-    def fit_each(self, several: Sequence[Passes]) -> list[SectionFits]:
-        """Fit several measurements of equally many passes, each as `fit` does; at once, which takes
-        less time."""
+    def fit(self, several: Sequence[Passes]) -> list[SectionFits]:
+        """Fit the trajectory of each section to its own readings, of each of several measurements
+        of equally many passes; together, which takes less time."""
         seen, way, kicks = self._made
         width = max(len(own) for own in self._members)
         owner = np.full((len(self._members), width), -1, dtype=np.int64)
@@ -334,10 +330,8 @@ class Sections:
         covariance = _inverse(curvature)
         end, slope = way[group[..., None], np.arange(W)](x)
         J = slope[..., :4, :4]
-        # the pass of each section
-        most = (
-            np.arange(len(several))[:, None], there.sum(axis=(-2, -1)).argmax(axis=1), np.arange(W)
-        )  # fmt: skip
+        fullest = there.sum(axis=(-2, -1)).argmax(axis=1)  # the pass of each section
+        most = np.arange(len(several))[:, None], fullest, np.arange(W)
         own = np.where(padded[:, :, None, None], kicks[np.where(padded, owner, 0)], 0.0)
         behind = np.tril(np.ones((width, width)), -1)[:, None, :, None]  # reading, kick
         kicked = np.einsum("swkpi,wmiq->swkpmq", maps.R[most][..., :4], own) * behind
