@@ -482,6 +482,24 @@ def test_sections_follow_a_trajectory_that_the_machine_made(small_ring):
     assert np.abs(found.start[:, 0] - data.launches[:, :4]).max() < 2e-7
 
 
+def test_measurements_fitted_together_are_those_of_each_alone(small_ring, machine):
+    """Some follow no trajectory, and take more steps."""
+    count = len(machine.monitors)
+    sections = Sections(small_ring, machine.settings, np.arange(count))
+    shots, order = np.arange(len(machine.shots)), np.random.default_rng(1).permutation(count)
+    read = machine.readings[:, 0]
+    several = [
+        Passes(own, machine.noise, machine.launches[:, 4], shots, 0 * shots, alone)
+        for own in (read, read * [-1, 1], read[:, order], 1e3 * read) for alone in (True, False)
+    ]  # fmt: skip
+    for together, own in zip(sections.fit(several), several, strict=True):
+        (alone,) = sections.fit([own])
+        for name in ("start", "delta", "misfit", "energy", "kicked"):
+            np.testing.assert_allclose(
+                getattr(together, name), getattr(alone, name), rtol=1e-9, atol=1e-12
+            )
+
+
 def test_check_prints_a_table_and_writes_its_schema(tmp_path, machine):
     write_measurement(tmp_path / "good", machine)
     write_measurement(tmp_path / "bad", replace(machine, readings=machine.readings * [-1, 1]))
