@@ -37,6 +37,7 @@ from tmlattice.inference.normal import (
     Normal,
     Slopes,
     inverse_by_factor,
+    inverse_of_lower,
     lower_factor,
     shared_by,
     times_precision,
@@ -317,8 +318,8 @@ def _sites(A: Array, b: Array, priors: _Mixtures) -> tuple[Array, Array]:
     """Precisions and shifts of the Gaussians in place of the priors."""
     precision, pull = np.ones(len(A)), np.zeros(len(A))
     for _ in range(ITERATIONS):
-        mean, covariance = _gaussian(A, b, precision, pull)
-        variance = np.diag(covariance)
+        half = inverse_of_lower(lower_factor(A + np.diag(precision)))
+        mean, variance = half.T @ (half @ (b + pull)), np.einsum("ij,ij->j", half, half)
         rest = np.maximum(1 / variance - precision, 0.0)
         others = mean / variance - pull
         center, spread = priors.times(rest, others)

@@ -329,14 +329,14 @@ def taken_back(state: State, gain: float = GAIN) -> State:
     trial = settle(replace(state, good=good), gain=gain, look_at_monitors=False)
     sound = good_monitors(trial) & good_monitors(trial, 1)
     back = together & sound
+    log.info("rejected neighbours: %s, sound: %s", *map(np.flatnonzero, (together, back)))
+    if not back.any() or (state.good & ~sound).any():
+        return state
     before, after = (evidence_of(own, state.good, state.independent) for own in (state, trial))
-    lost = before - after
     orbits = state.data.pick(state.data.orbits)[state.fitted]
     readings = int(np.isfinite(orbits[:, back]).sum())
-    # each regained reading may cost a standard error
-    log.info("rejected neighbours: %s, sound: %s; evidence of the others falls by %.1f",
-             np.flatnonzero(together), np.flatnonzero(back), lost)  # fmt: skip
-    if not back.any() or (state.good & ~sound).any() or lost > readings / 2:
+    log.info("evidence of the other BPMs falls by %.1f", before - after)
+    if before - after > readings / 2:  # each regained reading may cost a standard error
         return state
     return settle(replace(trial, good=state.good | back), gain=gain)
 

@@ -31,11 +31,12 @@ def _rows(state: State, family: Family) -> Kept:
     """The derivatives by a variable of the ring, renewed if the ring has moved."""
     ring, gain = _ring(state), state.at.gain(family.block)
     scale = 1 + state.at.errors.calibration
-    kept = state.kept.get(family.variable)
+    kept = state.kept.pop(family.variable, None)
     if kept is not None and len(kept.rows) == len(ring[family.variable]):
         moved = np.concatenate([_change(kept.at, ring, name) for name in {**kept.at, **ring}])
         if np.sqrt(np.mean(moved**2)) < STILL and (kept.scale != 0).all():
             return kept
+    kept = None  # freed before the next are computed
     return Kept(family.rows(state.at, state.values[family.variable]), gain, scale, ring)
 
 

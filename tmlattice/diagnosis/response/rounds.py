@@ -147,8 +147,8 @@ def settle(
     each number. A step may increase the cost of the other block, which its derivatives omit,
     because the next steps may compensate. Where they do not, the fit returns to the lowest cost,
     and goes on from there with smaller bounds. Weights and bad BPMs are updated at a new lowest
-    cost only, so that costs in between are comparable. The fit ends when a step of each block from
-    there was no progress, or after `REPEATED` further returns.
+    cost only, so that costs in between are comparable. The fit ends when a step of each block
+    changed the cost by less than progress, or after `REPEATED` further returns.
 
     Args:
         state: the start.
@@ -171,9 +171,8 @@ def settle(
     gained, away = 0.0, 0  # since the lowest cost
     idle = failed = 0  # steps and repetitions without progress
     for turn, block in enumerate(blocks * most):
-        there = linear(state, block)
-        moved, before, after = one_step(state, block, there, width[block])
-        away, idle = away + 1, idle + 1
+        moved, before, after = one_step(state, block, linear(state, block), width[block])
+        away, idle, settled = away + 1, idle + 1, False
         if after > before:
             width[block] /= NARROWER
         else:
@@ -185,6 +184,7 @@ def settle(
             state = moved
             log.info("step %d, block %d: cost %.3g less, model discrepancy %s m", turn, block,
                      gained / cost, np.median(best.lacking, axis=1))  # fmt: skip
+            settled = abs(gained) <= gain * cost and idle >= len(blocks)
             if gained > gain * cost:
                 idle = failed = 0
             if gained >= 0:
@@ -195,7 +195,7 @@ def settle(
             state, gained, away = best, 0.0, 0
             idle, failed = 0, failed + 1
             width = {own: bound / NARROWER for own, bound in width.items()}
-        if failed > REPEATED or (away == 0 and idle >= len(blocks)):
+        if settled or failed > REPEATED:
             break
     return looked(best) if best.values is start.values else best
 

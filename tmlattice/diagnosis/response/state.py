@@ -119,10 +119,11 @@ class State:
     undetermined: Array | None = None
 
     def once(self, key: Hashable, made: Callable[[], Made]) -> Made:
-        """What is made of this state; made anew only if it was last made of another."""
-        of, known = self.latest.get(key, (None, None))
-        result: Made = known if of is not None and of() is self else made()
-        self.latest[key] = (ref(self), result)
+        """What is made of this state; made anew, the last one freed, if that was of another."""
+        if key not in self.latest or self.latest[key][0]() is not self:
+            self.latest.pop(key, None)
+            self.latest[key] = (ref(self), made())
+        result: Made = self.latest[key][1]
         return result
 
     def of_block(self, block: int) -> tuple[Family, ...]:
