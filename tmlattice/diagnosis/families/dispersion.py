@@ -95,13 +95,13 @@ class _Kicks(Family):
         dispersion = model.rf_response()[data.at] / model.rf_start[5]
         dispersion = dispersion + at.errors.dispersion / data.energy_of_rf
         kicks = data.kicks[:-1] * (1 + at.errors.calibration[:-1])
-        out = np.zeros((len(values), *data.shape))
+        out = np.empty((len(values), *data.shape))
         out[:, -1] = patterns.rf
-        own = np.flatnonzero(read == self.plane)  # their orbit is read in the plane of the kicks
-        by_monitors = kicks[own] * energy[own]
-        out[:, own] = by_monitors[:, None] * (patterns.rf / data.energy_of_rf)[:, None]
         by_correctors = more * kicks * patterns.at_correctors
-        out[:, :-1] += by_correctors[:, :, None] * dispersion.T[read]
+        np.multiply(by_correctors[:, :, None], dispersion.T[read], out=out[:, :-1])
+        by_monitors = kicks * energy * (read == self.plane) / data.energy_of_rf
+        for column in np.flatnonzero(by_monitors):  # their orbit is read in the plane of the kicks
+            out[:, column] += by_monitors[column] * patterns.rf
         out *= at.gain(self.block)
         return out
 
